@@ -22,9 +22,8 @@ import numpy as np
 from scipy.signal import lfilter, lsim
 
 import ftlm
-from ftlm.base.statistics import NORMAL_95
-from ftlm.fit.profile import bent_numbers
-from ftlm.identification.intervals import valley_of
+from ftlm.estimation.confidence_intervals import bent_numbers, valley_of
+from ftlm.utils.statistics import NORMAL_95
 from results import append, heading
 
 Floats = np.ndarray[Any, np.dtype[np.float64]]

@@ -23,7 +23,7 @@ import numpy as np
 
 import ftlm
 import plants
-from ftlm.paper.arm import demo_plant
+from ftlm.reproduction.simulated_arm import demo_plant
 from results import append, commit, heading, machine
 
 LEVEL = 40.0

@@ -21,10 +21,10 @@ from scipy.special import binom, gamma
 sys.path.insert(0, str(Path(__file__).resolve().parents[1] / "tests" / "python"))
 
 import plants
-from ftlm.fit.grid import Attempt, descend, experiment
-from ftlm.fit.joint import fit_output_error
-from ftlm.fit.problem import FreeProblem
-from ftlm.solve.records import record
+from ftlm.estimation.free_parameters import FreeProblem
+from ftlm.estimation.objective import Attempt, descend, experiment
+from ftlm.estimation.output_error import fit_output_error
+from ftlm.simulation.discretization import record
 from laws import laws
 from results import append, heading
 

@@ -24,9 +24,9 @@ import numpy as np
 
 import ftlm
 from ftlm import _core
-from ftlm.base.checks import available_threads
-from ftlm.data.settings import REFINEMENTS
-from ftlm.solve.records import record
+from ftlm.order_search.options import REFINEMENTS
+from ftlm.simulation.discretization import record
+from ftlm.utils.validation import available_threads
 from results import append, commit, heading
 from search import fft_time, plant_a_run
 

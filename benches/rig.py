@@ -20,11 +20,11 @@ import numpy as np
 
 import ftlm
 from ftlm import rig
-from ftlm.paper.arm import demo_plant
+from ftlm.reproduction.simulated_arm import demo_plant
 from ftlm.rig import watchdog
-from ftlm.rig.parameters import SUBSTEP
+from ftlm.rig.arm_parameters import SUBSTEP
 from ftlm.rig.rig import Limits, Rig
-from ftlm.rig.virtual import VirtualBoard
+from ftlm.rig.virtual_board import VirtualBoard
 
 PATIENT = Limits(late=60.0, missed=10**9, standstill=1e9)
 CHILD = """

@@ -13,9 +13,9 @@ import numpy as np
 
 import ftlm
 import literal
-from ftlm.base.checks import available_threads
-from ftlm.paper.arm import demo_plant
-from ftlm.solve.records import record
+from ftlm.reproduction.simulated_arm import demo_plant
+from ftlm.simulation.discretization import record
+from ftlm.utils.validation import available_threads
 from results import append, heading
 
 #: Candidates that the literal algorithm is timed on; each takes seconds.

@@ -16,8 +16,10 @@ from scipy.signal import lsim
 
 import ftlm
 import results
-from ftlm.identification import estimate, identify, offsets
-from ftlm.solve.refined import refined
+from ftlm.estimation import estimators as estimate
+from ftlm.estimation import identify
+from ftlm.estimation import identify as offsets
+from ftlm.simulation.step_refinement import refined
 
 ROWS, STEP = 2300, 0.01
 #: Words, and state space of y from u where orders are whole.

@@ -24,8 +24,8 @@ from pathlib import Path
 import numpy as np
 
 import ftlm
-from ftlm.paper.arm import demo_plant
-from ftlm.search.contents import read_store
+from ftlm.order_search.checkpoint import read_store
+from ftlm.reproduction.simulated_arm import demo_plant
 
 EQUATION = "D^alpha y = a D^beta y + c D^mu y + b D^nu u"
 

@@ -26,8 +26,8 @@ sys.path.insert(0, str(Path(__file__).resolve().parents[1] / "tests" / "python")
 
 import ftlm
 from arm_measured import arm_run
-from ftlm.selection.candidates import Inside, Variant, signature, worded
-from ftlm.selection.trial import Folds, criterion, fit, judged, spread
+from ftlm.structure_selection.candidates import Inside, Variant, signature, worded
+from ftlm.structure_selection.cross_validation import Folds, criterion, fit, judged, spread
 from oracles import held_response
 from results import Kept, append, heading
 

@@ -26,10 +26,10 @@ sys.path.insert(0, str(Path(__file__).resolve().parents[1] / "tests" / "python")
 import arm_measured
 import ftlm
 import plants
-from ftlm.fit.grid import Attempt, descend, experiment
-from ftlm.fit.joint import fit_output_error
-from ftlm.fit.problem import FreeProblem
-from ftlm.paper.arm import demo_plant
+from ftlm.estimation.free_parameters import FreeProblem
+from ftlm.estimation.objective import Attempt, descend, experiment
+from ftlm.estimation.output_error import fit_output_error
+from ftlm.reproduction.simulated_arm import demo_plant
 from results import Kept, append, heading
 
 if TYPE_CHECKING:

@@ -17,8 +17,8 @@ import numpy as np
 from scipy import signal
 
 import ftlm
-from ftlm.arm.parameters import PARAMETERS
-from ftlm.rig.experiment import STOCK_FILTER
+from ftlm.arm.flexible_link import PARAMETERS
+from ftlm.rig.recording import STOCK_FILTER
 
 sys.path.insert(0, str(Path(__file__).resolve().parents[1] / "tests" / "python"))
 

@@ -11,7 +11,7 @@ import numpy as np
 
 import ftlm
 from ftlm import control
-from ftlm.demo import demo_run
+from ftlm.reproduction import demo_run
 
 if TYPE_CHECKING:
     from matplotlib.axes import Axes

@@ -193,6 +193,6 @@ def calls(r, count, only=()):
 
 def shown_all(given):
     """Arguments as they can be shown."""
-    from ftlm.base.checks import shown
+    from ftlm.utils.validation import shown
 
     return {name: shown(value, 100) for name, value in given.items()}

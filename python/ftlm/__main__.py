@@ -4,6 +4,8 @@ import os
 import signal
 import threading
 
+from ftlm.cli import main
+
 
 def _leave(*_: object) -> None:
     os.write(2, b"ftlm: interrupted; nothing was written\n")
@@ -17,7 +19,6 @@ _OURS = (
 )
 if _OURS:
     signal.signal(signal.SIGINT, _leave)
-from ftlm.cli import main  # noqa: E402
 
 if _OURS:
     signal.signal(signal.SIGINT, signal.default_int_handler)

@@ -12,10 +12,11 @@ import msgspec
 import numpy as np
 
 import ftlm
-from ftlm.data.orders import Order, parse_values
-from ftlm.files import apart, reader
-from ftlm.files.layout import Layout
-from ftlm.search import frames
+from ftlm.io import binary_reader as reader
+from ftlm.io import isolated_reader as apart
+from ftlm.io.dialect import Layout
+from ftlm.order_search import checkpoint as frames
+from ftlm.structure.order import Order, parse_values
 
 #: Files of the fuzzers live in memory where there is such a place.
 FOLDER = Path("/dev/shm") if Path("/dev/shm").is_dir() else Path(tempfile.gettempdir())

@@ -10,10 +10,9 @@ from pathlib import Path
 import numpy as np
 
 import ftlm
-from ftlm.data.settings import Settings
-from ftlm.search.frames import Rounds
-from ftlm.search.orders import make_job
-from ftlm.search.store import Store
+from ftlm.order_search.checkpoint import Rounds, Store
+from ftlm.order_search.options import Settings
+from ftlm.order_search.search import make_job
 
 HERE = Path(__file__).resolve().parent
 

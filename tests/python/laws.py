@@ -4,8 +4,8 @@ from __future__ import annotations
 
 from typing import Any
 
-from ftlm.fit.problem import FreeProblem
-from ftlm.solve.records import affine
+from ftlm.estimation.free_parameters import FreeProblem
+from ftlm.simulation.discretization import affine
 
 
 def laws(problem: FreeProblem) -> list[Any]:

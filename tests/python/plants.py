@@ -8,7 +8,7 @@ from dataclasses import replace
 import numpy as np
 
 import ftlm
-from ftlm.paper.arm import demo_plant
+from ftlm.reproduction.simulated_arm import demo_plant
 
 #: Cramer-Rao standard deviations at 40 dB, as printed to one to three digits.
 CRAMER_RAO_40_DB = {

@@ -11,7 +11,7 @@ from scipy import signal
 
 import ftlm
 from ftlm import rig
-from ftlm.rig.experiment import STOCK_FILTER
+from ftlm.rig.recording import STOCK_FILTER
 from measured import DATA
 
 ANGLES = ("theta11", "theta12", "theta21", "theta22")

@@ -6,7 +6,7 @@ import numpy as np
 import pytest
 
 import ftlm
-from ftlm.data.advice import spectral_lines
+from ftlm.validation.data_advice import spectral_lines
 from measured import DATA, needs_data
 
 ARM = {

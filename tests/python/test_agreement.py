@@ -10,8 +10,8 @@ from scipy import signal
 from typer.testing import CliRunner
 
 import ftlm
-from ftlm.cli.app import app
-from ftlm.identification.agreement import differences, together
+from ftlm.cli.main import app
+from ftlm.estimation.consistency import differences, together
 
 SECOND = ftlm.equation("D^2 y = d D y + a y + b u")
 

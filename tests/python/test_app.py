@@ -18,15 +18,14 @@ from typer.testing import CliRunner
 
 import ftlm
 import plants
-from ftlm.app import desk as desks
-from ftlm.app import serve, view
-from ftlm.app.child import Task, TaskError
-from ftlm.app.connection import PATIENCE, patient
-from ftlm.app.desk import Desk, safe_name
-from ftlm.app.fields import asked_of
-from ftlm.app.recipe import NAMED, Reading, Recipe, checked_structures, cut_at
-from ftlm.app.web import Door
-from ftlm.cli.app import app
+from ftlm.app import server as serve
+from ftlm.app import session as desks
+from ftlm.app import views as view
+from ftlm.app.forms import NAMED, Reading, Recipe, asked_of, checked_structures, cut_at
+from ftlm.app.server import PATIENCE, Door, patient
+from ftlm.app.session import Desk, safe_name
+from ftlm.app.subprocess_task import Task, TaskError
+from ftlm.cli.main import app
 from ftlm.errors import DataError, FtlmError, ModelError
 
 TOKEN, HOST = "0123456789abcdef", "127.0.0.1:8347"

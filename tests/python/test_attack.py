@@ -12,7 +12,7 @@ import numpy as np
 import pytest
 
 import ftlm
-import house
+import crate_structure
 from ftlm import _core
 
 TESTS = Path(__file__).resolve().parents[1]
@@ -23,7 +23,7 @@ import strange  # noqa: E402
 
 
 def test_every_entry_of_the_bindings_is_attacked():
-    bodies, _ = house.entries(TESTS.parent / "rust" / "python")
+    bodies, _ = crate_structure.entries(TESTS.parent / "rust" / "python")
     bound = {name.rpartition("::")[2].replace(".new", ".__new__") for name in bodies} | {"portable"}
     # VirtualArm and Guard have private helpers that are no entries.
     assert set(HOSTILE["entries"]()) | {HOSTILE["PANICS"]} == bound

@@ -7,10 +7,10 @@ import numpy as np
 import pytest
 
 import ftlm
-from ftlm.fit import genetic
-from ftlm.fit.genetic import Genetic, genetic_search, polynomial, simulated_binary
-from ftlm.judge.comparison import compare_means
-from ftlm.solve.records import prepare
+from ftlm.estimation import genetic
+from ftlm.estimation.genetic import Genetic, genetic_search, polynomial, simulated_binary
+from ftlm.simulation.discretization import prepare
+from ftlm.validation.comparison import compare_means
 
 EQUATION = "D^alpha y = a D^nu y + c y + b u"
 BOUNDS = {"a": (-10.0, 0.0), "c": (-20.0, 0.0), "b": (0.0, 10.0)}

@@ -4,8 +4,8 @@ import numpy as np
 import pytest
 
 import ftlm
-from ftlm.paint.text import number
-from ftlm.search.result import search_summary
+from ftlm.order_search.result import search_summary
+from ftlm.utils.formatting import number
 from test_store import EQUATION, bytes_of
 
 #: From this many candidates on boxes screen.

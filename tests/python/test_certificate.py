@@ -8,7 +8,7 @@ import pytest
 from typer.testing import CliRunner
 
 import ftlm
-from ftlm.cli.app import app
+from ftlm.cli.main import app
 from ftlm.errors import ModelError
 
 WORDS = "D^alpha y = a D^beta y + c y + b u"

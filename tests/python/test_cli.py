@@ -18,8 +18,8 @@ import pytest
 from typer.testing import CliRunner
 
 import ftlm
-from ftlm.cli.app import app
-from ftlm.cli.command import broken_line, say
+from ftlm.cli.framework import broken_line, say
+from ftlm.cli.main import app
 from measured import DATA, needs_data
 
 

@@ -5,9 +5,9 @@ import pytest
 from scipy import signal
 
 import ftlm
-from ftlm.fit.clock import clock as clock_of
-from ftlm.fit.grid import Attempt, Grid, descend
-from ftlm.fit.problem import FreeProblem
+from ftlm.estimation.free_parameters import FreeProblem
+from ftlm.estimation.free_parameters import clock as clock_of
+from ftlm.estimation.objective import Attempt, Grid, descend
 
 #: Of a lag of first order two orders and an own term too many: along the bottom of a valley nothing tells them.
 FLAT = "D^alpha y = d D^mu y + a y + b u"

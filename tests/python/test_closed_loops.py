@@ -10,8 +10,8 @@ from typer.testing import CliRunner
 import ftlm
 import loops
 from ftlm import cli
-from ftlm.identification.reference import driven_by
-from ftlm.judge.feedback import feedback_test, past_columns
+from ftlm.estimation.closed_loop import driven_by
+from ftlm.validation.residual_tests import feedback_test, past_columns
 
 STRUCTURE = ftlm.equation("D^alpha y = -a y + b u", initial="rest")
 

@@ -8,7 +8,7 @@ from typer.testing import CliRunner
 
 import ftlm
 from ftlm import control
-from ftlm.cli.app import app
+from ftlm.cli.main import app
 from test_control import PID
 from test_quadratic import BROKEN, designed, model
 

@@ -13,9 +13,9 @@ from typer.testing import CliRunner
 import ftlm
 import plants
 from ftlm import _core, cli
-from ftlm.fit.grid import Attempt, descend, experiment
-from ftlm.fit.joint import fit_output_error
-from ftlm.fit.problem import FreeProblem
+from ftlm.estimation.free_parameters import FreeProblem
+from ftlm.estimation.objective import Attempt, descend, experiment
+from ftlm.estimation.output_error import fit_output_error
 from laws import laws
 
 WORDS = "D^alpha y = a1 D^nu y + a0 y + b0 u"

@@ -2,9 +2,9 @@
 
 import pytest
 
-from ftlm.cli.command import broken_line
-from ftlm.paper.demo import run_demo
-from ftlm.paper.demo_page import demo_details, demo_page, demo_text
+from ftlm.cli.framework import broken_line
+from ftlm.reproduction.demo import run_demo
+from ftlm.reproduction.report import demo_details, demo_page, demo_text
 
 
 @pytest.mark.slow

@@ -6,8 +6,8 @@ import numpy as np
 import pytest
 
 import ftlm
-from ftlm.arm.energies import power
-from ftlm.arm.parameters import PARAMETERS
+from ftlm.arm.energy_balance import power
+from ftlm.arm.flexible_link import PARAMETERS
 
 FRACTIONAL = {"gamma1": 0.95, "beta2": 0.1, "mu2": 0.85}
 LINK = replace(PARAMETERS["effective"][1], link_friction=0.4)

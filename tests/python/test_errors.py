@@ -9,7 +9,7 @@ from hypothesis import strategies as st
 
 import ftlm
 from ftlm import _core
-from ftlm.base.checks import real_number, shown, whole_number, words_of
+from ftlm.utils.validation import real_number, shown, whole_number, words_of
 
 N = 65
 U = np.where(np.arange(N) % 20 < 10, 1.0, -1.0)

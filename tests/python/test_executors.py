@@ -15,7 +15,7 @@ import pytest
 
 import ftlm
 from ftlm.errors import ConvergenceError, DataError, ModelError
-from ftlm.search import work as rounds
+from ftlm.order_search import schedule as rounds
 
 EQUATION = "D^alpha y = a D^beta y + c D^mu y + b D^nu u"
 

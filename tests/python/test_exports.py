@@ -9,9 +9,9 @@ import numpy as np
 import pytest
 
 import ftlm
-from ftlm import exports
-from ftlm.paper.arm import demo_plant
-from ftlm.solve.approximation import oustaloup
+from ftlm import analysis as exports
+from ftlm.analysis.rational_approximation import oustaloup
+from ftlm.reproduction.simulated_arm import demo_plant
 
 control = pytest.importorskip("control")
 ONE = "D^1.6 y = -3 D^0.6 y - 8 y + 5 u"

@@ -5,7 +5,7 @@ from __future__ import annotations
 import numpy as np
 
 import ftlm
-from ftlm.fit.problem import FreeProblem
+from ftlm.estimation.free_parameters import FreeProblem
 from measured import DATA, needs_data
 
 #: What stays between the highest order of an equation and those of its own terms.

@@ -14,10 +14,10 @@ from scipy.special import gamma
 
 import ftlm
 import loops
-from ftlm.fit.grid import Attempt, Grid
-from ftlm.fit.joint import JointFit, fit_output_error
-from ftlm.fit.problem import FreeProblem
-from ftlm.solve.sampled import sampled as one_grid
+from ftlm.estimation.free_parameters import FreeProblem
+from ftlm.estimation.objective import Attempt, Grid
+from ftlm.estimation.output_error import JointFit, fit_output_error
+from ftlm.simulation.output_samples import sampled as one_grid
 
 STEP = 0.1
 #: (0.5 s + 1)/(s + 1): y' = 0.5 u' + u - y.

@@ -20,10 +20,10 @@ from hypothesis import strategies as st
 
 from ftlm.data.run import Run
 from ftlm.errors import DataError
-from ftlm.files import apart
-from ftlm.files.columns import FileTable
-from ftlm.files.layout import Layout
-from ftlm.files.load import Options, load, run_from, wanted_of
+from ftlm.io import isolated_reader as apart
+from ftlm.io.dialect import Layout
+from ftlm.io.load import Options, load, run_from, wanted_of
+from ftlm.io.table import FileTable
 from measured import DATA, needs_data
 
 PSF = DATA / "two_link_psf"
@@ -98,7 +98,7 @@ def test_any_file_that_is_text_is_read_as_text(tmp_path, name):
 def test_a_file_of_many_blocks_is_read_whole(tmp_path, monkeypatch):
     path = write(tmp_path, "# note\nt,u,y\n" + rows(500))
     whole = load(path, **HEADED)
-    monkeypatch.setattr("ftlm.files.text._BLOCK", 97)
+    monkeypatch.setattr("ftlm.io.delimited_text._BLOCK", 97)
     pieces = load(path, **HEADED)
     assert pieces["u"].tobytes() == whole["u"].tobytes()
     text = ("t,u,y\n" + rows(500)).replace("\n1.50,", "\n1.50,oops").replace("\n3.50,", "\n3.50,oops")
@@ -311,7 +311,7 @@ def test_bad_paths_are_refused(tmp_path, monkeypatch):
     for name in ("x.parquet", "x.PQ"):
         pytest.importorskip("pyarrow", reason="pyarrow is not here; pip install -r requirements-test.txt")
         messages(["damaged", "intact copy"], lambda name=name: load(write(tmp_path, b"PAR1", name)))
-    monkeypatch.setattr("ftlm.files.load._SIZE_LIMIT", 100)
+    monkeypatch.setattr("ftlm.io.load._SIZE_LIMIT", 100)
     messages(["square.csv", "more than the limit of 100"], lambda: load(path, **HEADED))
 
 

@@ -13,13 +13,13 @@ from scipy.signal import lsim
 
 import friction
 import ftlm
-from ftlm.base.arrays import Floats
 from ftlm.cli.options import StructureOptions
-from ftlm.fit.grid import Attempt, Grid
-from ftlm.fit.joint import fit_output_error
-from ftlm.fit.problem import FreeProblem
-from ftlm.judge.comparison import compare_means
-from ftlm.solve.held import answers, exponential, without_held
+from ftlm.estimation.free_parameters import FreeProblem
+from ftlm.estimation.objective import Attempt, Grid
+from ftlm.estimation.output_error import fit_output_error
+from ftlm.simulation.initial_conditions import answers, exponential, without_held
+from ftlm.utils.validation import Floats
+from ftlm.validation.comparison import compare_means
 
 STEP, COUNT, FINE = 1e-3, 6001, 4
 OMEGA, ZETA = 2 * np.pi * 1.0, 0.9

@@ -8,7 +8,7 @@ import pytest
 from msgspec import UNSET
 
 import ftlm
-from ftlm.search.orders import make_job
+from ftlm.order_search.search import make_job
 
 FREE = {1: ("alpha1", "beta2", "alpha2", "gamma1", "mu2"), 2: ("alpha3", "beta4", "alpha4", "gamma3", "mu4")}
 
@@ -303,7 +303,7 @@ def test_both_stages_simulate_as_each_alone(plant, drive):
 
 def arm_in_motion(rows, noise=0.0):
     """Both stages under one square current; they do not drive each other in the model."""
-    from ftlm.paper.arm import demo_plant
+    from ftlm.reproduction.simulated_arm import demo_plant
 
     step = 0.002
     current = np.where((np.arange(rows) * step + step / 2) % 2 < 1, 0.3, -0.3)
@@ -357,7 +357,7 @@ def test_the_whole_arm_is_searched_stage_by_stage():
 
 @pytest.mark.slow
 def test_the_whole_arm_is_one_joint_fit():
-    from ftlm.paper.arm import demo_plant
+    from ftlm.reproduction.simulated_arm import demo_plant
 
     found = ftlm.identify(
         arm_in_motion(5000, 0.01), replace(ftlm.flexible_link(form="published", stage="both"), initial="rest")

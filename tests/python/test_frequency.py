@@ -7,10 +7,10 @@ import numpy as np
 import pytest
 
 import ftlm
-from ftlm import frequency
-from ftlm.paper.arm import demo_plant
-from ftlm.solve.frequency import model_numbers
-from ftlm.solve.stability import right_zeros, roots_in_base
+from ftlm import analysis
+from ftlm.analysis.frequency_response import model_numbers
+from ftlm.analysis.poles import right_zeros, roots_in_base
+from ftlm.reproduction.simulated_arm import demo_plant
 
 TWO = "D^1.7 y = -20 y - 2 D^0.7 y + 15 z + 10 u; D^1.2 z = -5 z + 3 D^0.4 y + 2 D^0.3 u + v"
 
@@ -46,7 +46,7 @@ def test_coupled_equations_together_and_alone():
     np.testing.assert_allclose(together[1, 1], a / determinant, rtol=1e-12)
     np.testing.assert_allclose(alone[0, 1], 15 / a, rtol=1e-12)
     assert np.all(alone[0, 0] == 0)
-    quotients = frequency.transfer_functions(model(TWO))
+    quotients = analysis.transfer_functions(model(TWO))
     for i, output in enumerate(quotients.outputs):
         for j, signal in enumerate(quotients.inputs):
             top, bottom = (
@@ -121,7 +121,7 @@ def test_poles_are_zeros_of_the_characteristic_function():
     for plant in (demo_plant(1, form="published"), model("D^1.5 y = -2 D^0.5 y - 4 y + u"), model(TWO)):
         found = plant.poles()
         assert found.size
-        quotients = frequency.transfer_functions(plant)
+        quotients = analysis.transfer_functions(plant)
         pairs = quotients.denominator[plant.outputs[0]]
         for s in found:
             terms = [c * s**p for c, p in pairs]
@@ -239,7 +239,7 @@ def test_the_uncertainty_is_the_scatter_of_repeated_fits(fits, small_model):
     truth = small_model.frequency_response(w)
     z = []
     for fit in fits:
-        gain, phase = frequency.response_deviation(fit.model, w)
+        gain, phase = analysis.response_deviation(fit.model, w)
         ratio = fit.model.frequency_response(w) / truth
         z += [np.log(np.abs(ratio)) / gain, np.angle(ratio) / phase]
     spread = float(np.sqrt(np.mean(np.square(z))))
@@ -279,12 +279,10 @@ def test_what_is_known_of_a_fit_stays_with_the_saved_model(fits, tmp_path):
     assert loaded.estimate == fit.model.estimate
     assert loaded.estimate.fit == fit.fit_percent
     w = [1.0, 3.0]
-    for one, two in zip(
-        frequency.response_deviation(loaded, w), frequency.response_deviation(fit.model, w), strict=True
-    ):
+    for one, two in zip(analysis.response_deviation(loaded, w), analysis.response_deviation(fit.model, w), strict=True):
         np.testing.assert_array_equal(one, two)
     with pytest.raises(ftlm.ModelError, match="has no covariance"):
-        frequency.response_deviation(model("D y = -y + u"), w)
+        analysis.response_deviation(model("D y = -y + u"), w)
 
 
 def test_coefficients_that_ran_away_have_a_stability_that_cannot_be_told_not_an_overflow():

@@ -15,9 +15,9 @@ from typer.testing import CliRunner
 import circuits
 import ftlm
 import ftlm.plot
-from ftlm.cli.app import app
-from ftlm.fit.damped import damped
-from ftlm.fit.response import ResponseProblem
+from ftlm.cli.main import app
+from ftlm.estimation.frequency_domain import ResponseProblem
+from ftlm.estimation.levenberg_marquardt import damped
 
 ARC = "D^alpha U = a U + r D^alpha I + b I"
 W = np.geomspace(0.06, 6e4, 60)

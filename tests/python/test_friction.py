@@ -12,8 +12,8 @@ import friction
 import ftlm
 from ftlm import _core
 from ftlm.errors import DataError, ModelError
-from ftlm.fit.problem import FreeProblem
-from ftlm.fit.streaming import Streaming
+from ftlm.estimation.free_parameters import FreeProblem
+from ftlm.estimation.linear import Streaming
 
 BLOCK = "D^2 y = u - fc*sign(D y)"
 CART = "D^2 y = - v D y + g u - fc*sign(D y)"
@@ -285,7 +285,7 @@ def test_what_is_linear_refuses_it() -> None:
     for linear in (model.stability, model.poles, lambda: model.frequency_response([1.0])):
         with pytest.raises(ModelError, match="has friction"):
             linear()
-    for export in (lambda: model.to_control(band=(0.1, 10.0)), lambda: ftlm.frequency.transfer_functions(model)):
+    for export in (lambda: model.to_control(band=(0.1, 10.0)), lambda: ftlm.analysis.transfer_functions(model)):
         with pytest.raises(ModelError, match="has friction"):
             export()
     free = ftlm.equation("D^alpha y = - v D y + g u - fc*sign(D y)")

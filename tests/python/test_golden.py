@@ -9,7 +9,7 @@ import pytest
 
 import ftlm
 from conftest import ROOT
-from ftlm.search import frames
+from ftlm.order_search import checkpoint as frames
 
 GOLDEN = ROOT / "tests" / "golden"
 RELEASES = sorted(path.name for path in GOLDEN.iterdir() if path.is_dir() and path.name[0].isdigit())
@@ -98,7 +98,7 @@ def payloads(path):
 @pytest.mark.parametrize("name", ["search", "law"])
 def test_a_store_is_written_as_it_was_then(folder, tmp_path, monkeypatch, name):
     """Keys, tags, order and numbers of the request; of the rest all but the last places, which are the processor's."""
-    monkeypatch.setattr("ftlm.search.store.INTERVAL", math.inf)
+    monkeypatch.setattr("ftlm.order_search.checkpoint.INTERVAL", math.inf)
     # Made anew, exponentials of another processor would end in another last place.
     run = ftlm.load(folder / "run.csv")
     path = tmp_path / "now.ftlm"

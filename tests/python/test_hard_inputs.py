@@ -8,10 +8,10 @@ import numpy as np
 import pytest
 
 import ftlm
-from ftlm.identification.warnings import INSEPARABLE, VAGUE
-from ftlm.selection.automatic import automatic
-from ftlm.selection.candidates import Inside
-from ftlm.selection.trial import fit
+from ftlm.estimation.model_checks import INSEPARABLE, VAGUE
+from ftlm.structure_selection.candidates import Inside
+from ftlm.structure_selection.cross_validation import fit
+from ftlm.structure_selection.select import automatic
 
 WORDS = "D^alpha y = a1 D^nu y + a0 y + b0 u"
 TRUTH = {"alpha": 1.8, "nu": 0.8, "a1": -2.0, "a0": -25.0, "b0": 25.0}

@@ -9,8 +9,8 @@ from scipy.signal import lsim
 
 import ftlm
 from ftlm import _core
-from ftlm.data.structures import Structure
-from ftlm.fit.problem import FreeProblem
+from ftlm.estimation.free_parameters import FreeProblem
+from ftlm.structure.structure import Structure
 
 #: Natural frequency [rad/s] and damping of each mode, and the length of the run [s].
 MODES = {

@@ -7,7 +7,7 @@ import pytest
 from scipy import signal
 
 import ftlm
-from ftlm.judge.comparison import compare_means
+from ftlm.validation.comparison import compare_means
 from measured import DATA, needs_data
 from plants import resonant_plant
 

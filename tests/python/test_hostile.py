@@ -15,11 +15,11 @@ import pytest
 
 import ftlm
 from ftlm import _core, rig
-from ftlm.base import output
-from ftlm.base.output import write_atomically
-from ftlm.cli import app
-from ftlm.search import log
-from ftlm.search.contents import read_store
+from ftlm.cli import main as app
+from ftlm.order_search import checkpoint as log
+from ftlm.order_search.checkpoint import read_store
+from ftlm.utils import files as output
+from ftlm.utils.files import write_atomically
 
 
 def run_of(length=60):
@@ -129,7 +129,7 @@ def test_names_of_very_many_columns_are_compared_once_each():
 
         __hash__ = str.__hash__
 
-    from ftlm.files.sniff import check_distinct
+    from ftlm.io.dialect import check_distinct
 
     names = [Name(f"a{k}") for k in range(3000)]
     check_distinct(names, 1, "x.csv")
@@ -419,7 +419,7 @@ main()
 """
 
 
-@pytest.mark.parametrize("module", ["ftlm.cli", "numpy", "ftlm._core", "typer", "ftlm.cli.record"])
+@pytest.mark.parametrize("module", ["ftlm.cli", "numpy", "ftlm._core", "typer", "ftlm.cli.data_commands"])
 def test_an_interrupt_while_the_command_line_is_imported_is_one_line(module, root):
     done = subprocess.run([sys.executable, "-c", PRESSED_AT, module], capture_output=True, text=True, check=False)
     assert (done.returncode, done.stdout, done.stderr) == (130, "", "ftlm: interrupted; nothing was written\n")

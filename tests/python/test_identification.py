@@ -9,8 +9,8 @@ import pytest
 import ftlm
 import oracles
 from ftlm import _core
-from ftlm.judge.comparison import compare_means
-from ftlm.solve.records import record, structure_tuple
+from ftlm.simulation.discretization import record, structure_tuple
+from ftlm.validation.comparison import compare_means
 
 METHODS = ("least-squares", "multi-innovation")
 WORDS = "D^1.6 y = a D^0.6 y + c y + b u"

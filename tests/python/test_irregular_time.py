@@ -6,7 +6,7 @@ import numpy as np
 import pytest
 
 import ftlm
-from ftlm.data.samples import interpolated
+from ftlm.data.sampling import interpolated
 
 PLANT = "D^0.8 y = -1.5 y + 1.5 u"
 STEP, ROWS, FINE = 0.05, 600, 20

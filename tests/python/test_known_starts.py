@@ -7,9 +7,8 @@ import pytest
 from typer.testing import CliRunner
 
 import ftlm
-from ftlm.cli.app import app
-from ftlm.fit.known import known_starts, values_of_model
-from ftlm.fit.problem import FreeProblem
+from ftlm.cli.main import app
+from ftlm.estimation.free_parameters import FreeProblem, known_starts, values_of_model
 from plants import noisy_run, resonant_plant, structure
 
 RICH = "D^alpha y = d D^mu y + a y + b u"

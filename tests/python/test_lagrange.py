@@ -11,8 +11,8 @@ import sympy as sp
 
 import ftlm
 from ftlm import _core
-from ftlm.fit.grid import experiment
-from ftlm.fit.problem import FreeProblem
+from ftlm.estimation.free_parameters import FreeProblem
+from ftlm.estimation.objective import experiment
 from lagrange import INPUTS, clean_run, model, structure, truth
 from laws import laws
 from plants import with_noise

@@ -6,7 +6,8 @@ import numpy as np
 import pytest
 
 import ftlm
-from ftlm.report import correlated_orders, heat_map, output_error_landscape
+from ftlm.estimation.cost_surface import correlated_orders, output_error_landscape
+from ftlm.svg.heat_map import heat_map
 
 WORDS = "D^alpha y = a D^nu y + c y + b u"
 

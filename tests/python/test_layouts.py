@@ -12,7 +12,9 @@ import pytest
 
 import ftlm
 import strangers
-from ftlm.files import apart, reader, text
+from ftlm.io import binary_reader as reader
+from ftlm.io import delimited_text as text
+from ftlm.io import isolated_reader as apart
 from test_files import messages, rows, write
 
 SIGNALS = {"inputs": {"u": "u"}, "outputs": {"y": "y"}}

@@ -7,9 +7,8 @@ import pytest
 from scipy.signal import lsim
 
 import ftlm
-from ftlm.solve.limit import Limit, extrapolated
-from ftlm.solve.refined import refined
-from ftlm.solve.sampled import FIRST_REFINEMENT, sampled
+from ftlm.simulation.output_samples import FIRST_REFINEMENT, sampled
+from ftlm.simulation.step_refinement import Limit, extrapolated, refined
 
 TRUTH = np.random.default_rng(0).standard_normal((1, 200))
 SHAPES = list(np.random.default_rng(1).standard_normal((3, 1, 200)))

@@ -9,8 +9,8 @@ from typer.testing import CliRunner
 
 import ftlm
 from ftlm import cli
-from ftlm.data.limits import Limit
-from ftlm.model.typesetting import equation_html, parameter_table
+from ftlm.report.typesetting import equation_html, parameter_table
+from ftlm.structure.input_nonlinearity import Limit
 
 STEP = 0.05
 MATRICES = (np.array([[0.0, 1.0], [-9.0, -1.2]]), np.array([[0.0], [4.5]]), np.eye(2)[:1], np.zeros((1, 1)))

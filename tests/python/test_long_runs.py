@@ -11,11 +11,11 @@ from scipy.signal import cont2discrete, lfilter, ss2tf
 from scipy.special import erfcx
 
 import ftlm
-from ftlm.fit.asked import Asked
-from ftlm.fit.joint import Outset
-from ftlm.solve import long
-from ftlm.solve.refined import refined
-from ftlm.solve.sampled import started
+from ftlm.estimation.objective import Asked
+from ftlm.estimation.output_error import Outset
+from ftlm.simulation import step_refinement as long
+from ftlm.simulation.output_samples import started
+from ftlm.simulation.step_refinement import refined
 
 STEP = 0.02
 

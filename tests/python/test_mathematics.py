@@ -15,7 +15,7 @@ import pytest
 import ftlm
 import oracles
 from ftlm import _core
-from ftlm.solve.records import equation_tuple, record, structure_tuple
+from ftlm.simulation.discretization import equation_tuple, record, structure_tuple
 
 REST = (False, [])
 

@@ -9,8 +9,8 @@ import numpy as np
 import pytest
 
 import ftlm
-from ftlm.base.errors import ModelError
-from ftlm.base.memory import GIVEN, SHARE, UNKNOWN, available_memory, memory_limit
+from ftlm.errors import ModelError
+from ftlm.utils.resources import GIVEN, SHARE, UNKNOWN, available_memory, memory_limit
 
 REFUSED = re.compile(r"(\d+) regressors of all runs.* need (\d+) bytes, more than the (\d+) that a search may take")
 

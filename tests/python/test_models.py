@@ -13,13 +13,13 @@ from hypothesis import given, settings
 from hypothesis import strategies as st
 
 import ftlm
-from ftlm.base.output import COMMAND, PLAIN, RUN, check_free, check_new, write_atomically
-from ftlm.data.equations import numeric
-from ftlm.data.filters import SensorFilter
-from ftlm.data.language import parse_equation
-from ftlm.data.orders import grid, parse_values
-from ftlm.data.structures import check_initial
-from ftlm.model.file import ModelFile
+from ftlm.model.serialization import ModelFile
+from ftlm.structure.equation import numeric
+from ftlm.structure.order import grid, parse_values
+from ftlm.structure.parser import parse_equation
+from ftlm.structure.sensor_filter import SensorFilter
+from ftlm.structure.structure import check_initial
+from ftlm.utils.files import COMMAND, PLAIN, RUN, check_free, check_new, write_atomically
 
 # ----------------------------------------------------------------------------------------------------------------------
 # Orders

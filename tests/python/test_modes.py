@@ -8,11 +8,10 @@ import numpy as np
 import pytest
 
 import ftlm
-from ftlm.frequency import dcgain, modes, steady_states
-from ftlm.identification.first import behaviour_tables
-from ftlm.identification.summary import behaviour_in_words
-from ftlm.solve.modes import _mode, zeros_of
-from ftlm.solve.stability import characteristic, right_zeros
+from ftlm.analysis import dcgain, modes, steady_states
+from ftlm.analysis.poles import _mode, characteristic, right_zeros, zeros_of
+from ftlm.report.html_report import behaviour_tables
+from ftlm.report.text_summary import behaviour_in_words
 
 
 def model(words, covariance=None, **options):

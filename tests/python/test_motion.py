@@ -17,10 +17,10 @@ import ftlm
 import motion
 import oracles
 from ftlm import cli
-from ftlm.data.structures import History
-from ftlm.solve.motion import decided, history, misfit, misfit_of_fits
-from ftlm.solve.records import prepare, record
-from ftlm.solve.sampled import started
+from ftlm.simulation.discretization import prepare, record
+from ftlm.simulation.initial_conditions import decided, history, misfit, misfit_of_fits
+from ftlm.simulation.output_samples import started
+from ftlm.structure.structure import History
 
 WORDS = motion.PLANTS["0.7"].words
 

@@ -17,18 +17,16 @@ from typer.testing import CliRunner
 import ftlm
 import oracles
 import plants
-from ftlm.cli.app import app
-from ftlm.data.solved import Freedom
-from ftlm.excitation.criterion import Criterion
-from ftlm.excitation.exchange import exchanged, judged
-from ftlm.excitation.limits import Bounds
-from ftlm.excitation.sensitivities import Laid, Sensitivities
-from ftlm.excitation.shapes import multisine, square
-from ftlm.excitation.spectrum import Lines, best_spectrum, lines_of
-from ftlm.fit.freedom import freedom, freedom_of
-from ftlm.fit.joint import fit_output_error
-from ftlm.fit.problem import FreeProblem
-from ftlm.paper.arm import demo_plant
+from ftlm.cli.main import app
+from ftlm.estimation.free_parameters import FreeProblem
+from ftlm.estimation.output_error import fit_output_error, freedom, freedom_of
+from ftlm.experiment_design.design_input import multisine, square
+from ftlm.experiment_design.exchange import exchanged, judged
+from ftlm.experiment_design.problem import Bounds, Criterion
+from ftlm.experiment_design.sensitivity import Laid, Sensitivities
+from ftlm.experiment_design.spectrum import Lines, best_spectrum, lines_of
+from ftlm.model.model import Freedom
+from ftlm.reproduction.simulated_arm import demo_plant
 
 STEP, NOISE, ROWS = 0.05, 0.01, 201
 

@@ -15,9 +15,9 @@ import ftlm
 import loops
 import oracles
 from ftlm import cli
-from ftlm.fit.streaming import Streaming
-from ftlm.identification.local import offset_test
-from ftlm.solve.sampled import initial_exponents
+from ftlm.estimation.linear import Streaming
+from ftlm.estimation.nuisance_parameters import offset_test
+from ftlm.simulation.output_samples import initial_exponents
 from measured import DATA, needs_data
 
 WORDS = "D^0.8 y = -a y + b u + c"

@@ -8,8 +8,8 @@ import pytest
 
 import ftlm
 from ftlm.data.units import UNITS, spelled_unit
-from ftlm.files.cells import stated_unit
-from ftlm.files.roles import guessed_roles, known_unit, signal_names
+from ftlm.io.cell_parsing import stated_unit
+from ftlm.io.preview import guessed_roles, known_unit, signal_names
 from test_files import messages, rows, write
 from test_strangers import command
 

@@ -17,9 +17,9 @@ import ftlm
 import ftlm.progress
 import oracles
 from ftlm import _core
-from ftlm.base.checks import available_threads, check_threads
-from ftlm.data.settings import Settings
-from ftlm.judge.comparison import compare_means
+from ftlm.order_search.options import Settings
+from ftlm.utils.validation import available_threads, check_threads
+from ftlm.validation.comparison import compare_means
 
 EQUATION = "D^alpha y = a D^beta y + c D^mu y + b D^nu u"
 GRID = {"alpha": [1.4, 1.6, 1.8], "beta": [0.0, 0.3, 0.6, 0.9], "mu": [0.0, 0.3, 0.6, 0.9], "nu": [0.0, 0.2]}
@@ -314,7 +314,7 @@ def test_progress_shows_rate_share_pruned_and_time_left(monkeypatch, run):
     shown = io.StringIO()
     shown.isatty = lambda: True
     monkeypatch.setattr(sys, "stderr", shown)
-    monkeypatch.setattr("ftlm.base.progress.PATIENCE", 0.0)
+    monkeypatch.setattr("ftlm.progress.PATIENCE", 0.0)
     monkeypatch.setenv("TERM", "xterm")
     monkeypatch.setenv("COLUMNS", "120")
     with ftlm.progress.Progress("searching") as bar:

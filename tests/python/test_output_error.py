@@ -10,12 +10,11 @@ from scipy.optimize import least_squares
 
 import ftlm
 from ftlm import _core
-from ftlm.base.statistics import is_white
-from ftlm.fit.grid import experiment
-from ftlm.fit.joint import fit_output_error
-from ftlm.fit.problem import FreeProblem
-from ftlm.fit.twins import twin_words
-from ftlm.paper.arm import demo_plant
+from ftlm.estimation.free_parameters import FreeProblem, twin_words
+from ftlm.estimation.objective import experiment
+from ftlm.estimation.output_error import fit_output_error
+from ftlm.reproduction.simulated_arm import demo_plant
+from ftlm.utils.statistics import is_white
 from laws import laws
 
 THREE_TERMS = {"alpha": 2.2, "nu": 0.9, "a1": -0.625, "a0": -1.25, "b0": 1.25}

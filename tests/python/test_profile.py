@@ -16,12 +16,11 @@ from scipy.optimize import brentq, least_squares
 from scipy.signal import lfilter, lsim
 
 import ftlm
-from ftlm.fit import profile as profiling
-from ftlm.fit.grid import Attempt
-from ftlm.fit.profile import Valley, bent_numbers, half_width, profiled
-from ftlm.identification.intervals import valley_of
-from ftlm.identification.warnings import uncertain
-from ftlm.report.model_page import model_page
+from ftlm.estimation import confidence_intervals as profiling
+from ftlm.estimation.confidence_intervals import Valley, bent_numbers, half_width, profiled, valley_of
+from ftlm.estimation.model_checks import uncertain
+from ftlm.estimation.objective import Attempt
+from ftlm.report.html_report import model_page
 from measured import DATA, needs_data
 
 THRESHOLD = 1.959963984540054**2
@@ -279,8 +278,8 @@ def test_numbers_that_are_known_well_are_not_profiled(bent: ftlm.Run) -> None:
 def test_a_profile_that_nobody_asked_for_is_left_where_it_takes_long(
     bent: ftlm.Run, found: ftlm.Identification, monkeypatch: pytest.MonkeyPatch
 ) -> None:
-    monkeypatch.setattr("ftlm.identification.intervals.UNASKED", 0)
-    monkeypatch.setattr("ftlm.identification.intervals.FEWEST", 6)
+    monkeypatch.setattr("ftlm.estimation.confidence_intervals.UNASKED", 0)
+    monkeypatch.setattr("ftlm.estimation.confidence_intervals.FEWEST", 6)
     structure = found.task.structure
     short = ftlm.identify(bent, structure)
     assert "c" not in short.profiles
@@ -394,8 +393,8 @@ def test_identify_goes_on_from_a_lower_optimum_and_says_so(bent: ftlm.Run, monke
     assert same.joint.starts == right.joint.starts
     calls.clear()
     # As if it had been lower: of one optimum found twice rounding decides which is.
-    monkeypatch.setattr("ftlm.identification.intervals.TOLD", -1.0)
-    monkeypatch.setattr("ftlm.identification.intervals.is_lower", lambda *_: True)
+    monkeypatch.setattr("ftlm.estimation.confidence_intervals.TOLD", -1.0)
+    monkeypatch.setattr("ftlm.estimation.confidence_intervals.is_lower", lambda *_: True)
     again = ftlm.identify(run, structure, threads=1, intervals="profile")
     assert [w for w in again.warnings if "led to this optimum, but the search for intervals did" in w]
     assert "from a lower optimum" in again.details()

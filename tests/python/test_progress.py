@@ -13,18 +13,15 @@ import pytest
 from typer.testing import CliRunner
 
 import ftlm
-from ftlm.base import progress
-from ftlm.base.pace import by_output_error, expected, pace
-from ftlm.base.progress import PARTS, Course, expected_in_words, left_in_words
-from ftlm.cli import wait
-from ftlm.cli.app import app
-from ftlm.paper import unseen
-from ftlm.progress import Progress, Stoppable
-from ftlm.search.beforehand import announce, expected_seconds
-from ftlm.search.job import run_job
-from ftlm.search.orders import make_job
-from ftlm.search.store import Store
-from ftlm.search.work import EquationWork
+from ftlm import progress
+from ftlm.cli import framework as wait
+from ftlm.cli.main import app
+from ftlm.order_search.checkpoint import Store
+from ftlm.order_search.schedule import EquationWork
+from ftlm.order_search.search import announce, expected_seconds, make_job, run_job
+from ftlm.progress import PARTS, Course, Progress, Stoppable, expected_in_words, left_in_words
+from ftlm.reproduction import cross_validation as unseen
+from ftlm.utils.resources import by_output_error, expected, pace
 
 
 class Terminal(io.StringIO):

@@ -12,10 +12,18 @@ from hypothesis import strategies as st
 import ftlm
 import oracles
 from ftlm import _core
-from ftlm.data.several import MOST_KEPT, as_runs
-from ftlm.data.structures import History
-from ftlm.solve.motion import history
-from ftlm.solve.records import default_m, equation_tuple, initial_tuple, prepare, record, records, structure_tuple
+from ftlm.data.run import MOST_KEPT, as_runs
+from ftlm.simulation.discretization import (
+    default_m,
+    equation_tuple,
+    initial_tuple,
+    prepare,
+    record,
+    records,
+    structure_tuple,
+)
+from ftlm.simulation.initial_conditions import history
+from ftlm.structure.structure import History
 
 
 def make_run(outputs=None, inputs=None, step=0.1, **options):

@@ -14,11 +14,24 @@ import pytest
 
 import ftlm
 from ftlm import report
-from ftlm.paint import axes
-from ftlm.paint import text as words
-from ftlm.paint.figure import LINE
-from ftlm.paint.page import Reported
-from ftlm.paint.text import number
+from ftlm.estimation.linear import trace_chart
+from ftlm.order_search.result import search_summary, search_top
+from ftlm.order_search.search import landscape
+from ftlm.plot.comparison_charts import compared_bars, error_chart, residual_charts, residual_series
+from ftlm.plot.model_charts import bode_charts, pole_charts
+from ftlm.report.html_report import settings_table
+from ftlm.report.typesetting import equation_html, parameter_table
+from ftlm.reproduction.tables import PaperRow, paper_row, paper_table, paper_table_text
+from ftlm.svg import figure as axes
+from ftlm.svg.bar_chart import bar_chart, histogram
+from ftlm.svg.complex_plane import plane_chart
+from ftlm.svg.figure import LINE
+from ftlm.svg.heat_map import correlation_map, heat_map
+from ftlm.svg.html_page import Reported
+from ftlm.svg.line_chart import line_chart
+from ftlm.utils import formatting as words
+from ftlm.utils.formatting import number
+from ftlm.validation.comparison import errors_table
 
 HOSTILE = "</script><script>alert(1)</script>\"><svg onload=alert(1)> & 'x'"
 VOID = {"meta", "link", "br", "hr", "img", "input"}
@@ -195,7 +208,7 @@ def test_hostile_names_are_inert(tmp_path, page):
     assert "square " + HOSTILE in " ".join(Page(page).text)
     assert page.count("<script") == 1
     assert "onload=alert(1)>" not in page
-    chart = report.line_chart([0, 1], [(HOSTILE, [0, 1])], title=HOSTILE, x_label=HOSTILE, y_label=HOSTILE)
+    chart = line_chart([0, 1], [(HOSTILE, [0, 1])], title=HOSTILE, x_label=HOSTILE, y_label=HOSTILE)
     table = report.Table(HOSTILE, (HOSTILE, "n"), [(HOSTILE, 1.0)], ((HOSTILE, 2),), {0: HOSTILE}, HOSTILE)
     section = report.Section(HOSTILE, [HOSTILE], [HOSTILE], [table], [chart])
     text = written(tmp_path, section, lead=HOSTILE)
@@ -234,7 +247,7 @@ def test_intervals_that_are_none_are_said(tmp_path, small_run, with_noise):
     text = " ".join(Page(result.report(tmp_path / "p.html").read_text("utf-8")).text)
     assert text.count("undefined") >= 3 * 4
     assert "the standard errors of alpha, a, c, b are not defined" in text
-    table = report.parameter_table(found.model, found.joint)
+    table = parameter_table(found.model, found.joint)
     low, high = found.intervals["alpha"]
     assert table.rows[0][1:5] == [found.orders["alpha"], found.standard_errors["alpha"], low, high]
 
@@ -262,7 +275,7 @@ def test_the_landscape_is_the_search(small_run, with_noise):
     lattice = ftlm.lattice(0.1, alpha=(1.2, 2.0), nu="0.0:1.0:0.1")
     structure = ftlm.equation("D^alpha y = a D^nu y + c y + b u")
     found = ftlm.search_orders(run, structure, lattice, keep=10_000)
-    drawn = report.landscape(run, structure, found, lattice)
+    drawn = landscape(run, structure, found, lattice)
     assert drawn.names == ("alpha", "nu")
     assert drawn.scores.shape == (11, 9)
     for row in found.table:
@@ -271,16 +284,16 @@ def test_the_landscape_is_the_search(small_run, with_noise):
         assert drawn.scores[i, j] == row.score
     finite = np.isfinite(drawn.scores)
     assert finite.sum() == sum(np.isfinite(r.score) for r in found.table)
-    chart = report.heat_map(drawn)
+    chart = heat_map(drawn)
     Page(chart.svg)
     assert "Best: α = " in chart.caption
     with pytest.raises(ftlm.ModelError, match="two different orders"):
-        report.landscape(run, structure, found, lattice, orders=("alpha", "alpha"))
+        landscape(run, structure, found, lattice, orders=("alpha", "alpha"))
 
 
 def test_charts_of_residuals_and_frequencies_are_their_numbers(small_model, small_run, with_noise):
     tests = small_model.resid(with_noise(small_run, 0.02, 1))
-    charts = report.residual_charts(tests)
+    charts = residual_charts(tests)
     assert [c.title for c in charts] == ["Residual of y with itself", "Residual of y with u"]
     stems = re.findall(r"M(\d+) (\d+)V(-?\d+)", charts[1].svg)
     assert len(stems) == 51
@@ -289,7 +302,7 @@ def test_charts_of_residuals_and_frequencies_are_their_numbers(small_model, smal
     np.testing.assert_allclose(heights / heights[np.argmax(np.abs(values))] * values[np.argmax(np.abs(values))], values,
                                atol=0.02 * np.max(np.abs(values)))  # fmt: skip
     w = np.geomspace(0.1, 100, 50)
-    gain, phase = report.bode_charts(small_model, w)
+    gain, phase = bode_charts(small_model, w)
     (strokes,) = paths_of(gain.svg)
     drawn = np.concatenate(strokes)[:, 1]
     exact = 20 * np.log10(np.abs(small_model.frequency_response(w)[0, 0]))
@@ -379,19 +392,19 @@ def test_names_are_written_by_hand():
 
 def test_equation_reads_as_on_paper():
     model = ftlm.Model(ftlm.equation("D^1.95 theta12 = -863.3325 D^0.1 theta12 + 2 theta11 - 0.5 u"))
-    parsed = Page(str(report.equation_html(model.equations[0])))
+    parsed = Page(str(equation_html(model.equations[0])))
     assert "".join("".join(parsed.text).split()) == "D1.95θ12=−863.33D0.1θ12+2.0000θ11−0.50000u"
     assert parsed.tags.count("msup") == 2
     assert parsed.tags.count("msub") == 3
     assert parsed.tags.count("math") == 4  # it breaks between terms
-    tiny = report.equation_html(ftlm.equation("D^2 y = 1.5e-9 D^(-0.5) y_long + u").equations[0])
+    tiny = equation_html(ftlm.equation("D^2 y = 1.5e-9 D^(-0.5) y_long + u").equations[0])
     assert "<msup><mn>10</mn><mrow><mo>−</mo><mn>9</mn></mrow></msup>" in tiny
     assert "<mrow><mo>−</mo><mn>0.5</mn></mrow>" in tiny
 
 
 def test_errors_table_is_the_comparison(identified, sine):
     validation = identified.model.compare(sine)
-    table = report.errors_table([("estimation", identified.comparison), ("validation", validation)])
+    table = errors_table([("estimation", identified.comparison), ("validation", validation)])
     rows = iter(table.rows)
     for found in (identified.comparison, validation):
         for name in found.output_error:
@@ -402,19 +415,19 @@ def test_errors_table_is_the_comparison(identified, sine):
 
 def test_errors_of_several_runs_together_and_alone(identified, square, sine):
     found = identified.model.compare([square, sine])
-    table = report.errors_table([("both", found)])
+    table = errors_table([("both", found)])
     assert len(table.rows) == 2 * 3
     assert table.rows[0][5] == found.output_error["theta11"].error
     assert table.rows[4][5] == found.per_run[1][2]["theta11"].error
 
 
 def test_parameters_stand_beside_the_stated_ones(identified):
-    table = report.parameter_table(identified.model)
+    table = parameter_table(identified.model)
     values = [row[1] for row in table.rows]
     assert values == [*identified.orders.values(), *identified.coefficients.values()]
     stated = identified.model.structure.reference
     assert [row[2] for row in table.rows[-8:]] == [stated[n] for n in identified.coefficients]
-    plain = report.parameter_table(ftlm.Model(ftlm.equation("D y = a y + b u").with_coefficients({"a": -1, "b": 2})))
+    plain = parameter_table(ftlm.Model(ftlm.equation("D y = a y + b u").with_coefficients({"a": -1, "b": 2})))
     assert plain.columns == ("parameter", "value", "unit", "what it is")
     assert [row[1] for row in plain.rows] == [-1, 2]
 
@@ -424,14 +437,14 @@ def paper_rows(identified):
     infinite = ftlm.Metrics(math.inf, math.inf, math.inf, -math.inf)
     rows = []
     for output in ("theta11", "theta12"):
-        rows.append(report.paper_row("integer-order model of the maker", integer, identified.comparison, output))
-        rows += [report.paper_row(f"p = {p}", identified.model, identified.comparison, output) for p in (1, 3, 5, 7)]
-    rows.append(report.PaperRow("diverged", "theta12", {"alpha": 2.0}, {"a": -1.23456e-5, "g": 1.0}, None, infinite))
+        rows.append(paper_row("integer-order model of the maker", integer, identified.comparison, output))
+        rows += [paper_row(f"p = {p}", identified.model, identified.comparison, output) for p in (1, 3, 5, 7)]
+    rows.append(PaperRow("diverged", "theta12", {"alpha": 2.0}, {"a": -1.23456e-5, "g": 1.0}, None, infinite))
     return rows
 
 
 def test_paper_table_has_the_papers_columns(identified):
-    table = report.paper_table(paper_rows(identified))
+    table = paper_table(paper_rows(identified))
     assert [re.sub("<.*?>", "", c) for c in table.columns[:9]] == ["model", *"γαβμabdg"]
     assert [text for text, _ in table.groups][3:] == ["equation error", "output error (free run)"]
     assert sum(width for _, width in table.groups) == len(table.columns) == 15
@@ -446,11 +459,11 @@ def test_paper_table_has_the_papers_columns(identified):
     assert "∞ diverged" in html
     assert sorted(table.headings) == [0, 5]
     with pytest.raises(ftlm.ModelError, match="no output 'theta21'"):
-        report.paper_row("p = 7", identified.model, identified.comparison, "theta21")
+        paper_row("p = 7", identified.model, identified.comparison, "theta21")
 
 
 def test_paper_table_fits_a_terminal(identified):
-    lines = report.paper_table_text(paper_rows(identified)).splitlines()
+    lines = paper_table_text(paper_rows(identified)).splitlines()
     assert max(map(len, lines)) <= 120
     assert lines[-1].startswith("∞: diverged")
     assert len([line for line in lines if line.startswith("  p = ")]) == 8
@@ -462,23 +475,23 @@ def test_paper_table_fits_a_terminal(identified):
 
 def test_search_tables_account_for_every_candidate(identified):
     search = identified.searches["stage"]
-    summary = report.search_summary(identified.searches)
+    summary = search_summary(identified.searches)
     name, _, candidates, kept, *left_out = summary.rows[0]
     assert "stage" in name
     assert candidates == search.candidates == kept + sum(left_out)
-    top = report.search_top("stage", search, rows=5)
+    top = search_top("stage", search, rows=5)
     assert len(top.rows) == min(5, len(search.table))
     assert top.rows[0][1] == search.score
     assert top.rows[0][2:] == [*search.orders.values(), *search.coefficients.values()]
 
 
 def test_settings_name_what_the_result_depends_on(identified, square):
-    text = str(report.settings_table(identified).to_html())
+    text = str(settings_table(identified).to_html())
     assert str(identified.settings["m"]) in text
     assert "least-squares" in text
     at = ftlm.flexible_link(form="published").with_orders(identified.orders)
     paper = ftlm.identify(square, at, method="multi-innovation", prior_covariance=100.0)
-    rows = {str(row[0]): row[1] for row in report.settings_table(paper).rows}
+    rows = {str(row[0]): row[1] for row in settings_table(paper).rows}
     assert rows["innovation length, p"] == 7
     assert rows["prior covariance, K<sub>0</sub>"] == 100
 
@@ -546,7 +559,7 @@ def paths_of(svg):
 def test_drawn_line_is_the_data():
     x = np.linspace(0, 10, 400)
     y = np.sin(x) * np.exp(-x / 5)
-    chart = report.line_chart(x, [("y", y)], title="t", x_label="x", y_label="y")
+    chart = line_chart(x, [("y", y)], title="t", x_label="x", y_label="y")
     (strokes,) = paths_of(chart.svg)
     assert len(strokes) == 1
     drawn = strokes[0]
@@ -562,20 +575,20 @@ def test_what_is_not_finite_leaves_a_gap_and_is_said():
     y = x.copy()
     y[40:50], y[70] = np.nan, np.inf
     y[90:] = 1e305  # beyond what can be drawn
-    chart = report.line_chart(x, [("y", y)], title="t", x_label="time [s]", y_label="y", caption="Words.")
+    chart = line_chart(x, [("y", y)], title="t", x_label="time [s]", y_label="y", caption="Words.")
     (strokes,) = paths_of(chart.svg)
     assert [len(s) for s in strokes] == [40, 20, 19]
     assert chart.caption.startswith("Words. y: 21 of 100 values are not finite (first at time [s] = 40)")
     assert "nan" not in chart.svg
     assert "inf" not in chart.svg
-    nothing = report.line_chart(x, [("y", np.full(100, np.nan))], title="t", x_label="x", y_label="y")
+    nothing = line_chart(x, [("y", np.full(100, np.nan))], title="t", x_label="x", y_label="y")
     assert paths_of(nothing.svg) == []
     assert "no finite value to draw" in nothing.svg
     assert "100 of 100" in nothing.caption
 
 
 def test_a_lone_point_is_a_dot():
-    chart = report.line_chart([0, 1, 2], [("y", [np.nan, 1, np.nan])], title="t", x_label="x", y_label="y")
+    chart = line_chart([0, 1, 2], [("y", [np.nan, 1, np.nan])], title="t", x_label="x", y_label="y")
     assert [len(s) for s in paths_of(chart.svg)[0]] == [1]
 
 
@@ -595,7 +608,7 @@ def test_a_slider_has_samples_and_the_largest_difference_among_them(n):
     rng = np.random.default_rng(n)
     x = 3.0 + np.arange(n) * 0.0017
     y, z = 1e-6 * rng.standard_normal(n), 1e-6 * rng.standard_normal(n)
-    chart = report.line_chart(x, [("measured", y), ("simulated", z)], title="t", x_label="time [s]", y_label="y [m]",
+    chart = line_chart(x, [("measured", y), ("simulated", z)], title="t", x_label="time [s]", y_label="y [m]",
                               slider=True)  # fmt: skip
     assert "data-readings" not in chart.narrow
     at, lines, told = read_out(chart)
@@ -613,22 +626,20 @@ def test_a_slider_has_samples_and_the_largest_difference_among_them(n):
 def test_a_slider_has_nothing_where_there_is_nothing():
     t, gaps = np.arange(5.0), np.array([1.0, np.nan, np.inf, -1e300, 2e5])
     drawn = {"x_label": "time [s]", "y_label": "y", "title": "t", "slider": True}
-    at, lines, told = read_out(report.line_chart(t, [("measured", gaps), ("simulated", np.full(5, np.nan))], **drawn))
+    at, lines, told = read_out(line_chart(t, [("measured", gaps), ("simulated", np.full(5, np.nan))], **drawn))
     assert at.tolist() == t.tolist()
     assert np.isnan(lines["simulated"]).all()
     assert np.isnan(lines["measured"]).tolist() == [False, True, True, False, False]
     assert lines["measured"][3] == -1e300
     assert (told["apart"], told["y"]) == (False, "")
     for other in ({"log_x": True}, {"log_y": True}, {"slider": False}):
-        assert "data-readings" not in report.line_chart(t + 1, [("", t + 1)], **{**drawn, **other}).svg
+        assert "data-readings" not in line_chart(t + 1, [("", t + 1)], **{**drawn, **other}).svg
 
 
 def test_a_run_that_strays_does_not_flatten_the_measured_one():
     x = np.linspace(0, 10, 500)
     measured = np.sin(x)
-    chart = report.line_chart(
-        x, [("measured", measured), ("simulated", np.exp(3 * x))], title="t", x_label="x", y_label="y"
-    )
+    chart = line_chart(x, [("measured", measured), ("simulated", np.exp(3 * x))], title="t", x_label="x", y_label="y")
     heights = np.concatenate(paths_of(chart.svg)[0])[:, 1]
     assert np.ptp(heights) > 100  # tenths of a pixel
     assert "simulated leaves the axis (to 1.07×10¹³)" in chart.caption
@@ -639,7 +650,7 @@ def test_logarithmic_axis():
     x = np.arange(1, 1001)
     y = 1e4 / x**2.0
     y[5] = 0.0
-    chart = report.line_chart(x, [("p = 7", y)], title="t", x_label="x", y_label="y", log_y=True)
+    chart = line_chart(x, [("p = 7", y)], title="t", x_label="x", y_label="y", log_y=True)
     (strokes,) = paths_of(chart.svg)
     assert [len(s) for s in strokes] == [5, 994]
     drawn, kept = np.concatenate(strokes), np.delete(y, 5)
@@ -647,13 +658,13 @@ def test_logarithmic_axis():
     np.testing.assert_allclose(np.polyval(fitted, drawn[:, 1]), np.log10(kept), atol=0.01)
     assert "0 or less" in chart.caption
     for low, high in ((0.1, 1000.0), (3.1, 3.9), (2.0, 60.0), (1e-30, 1e40)):
-        small = report.line_chart([0, 1], [("y", [low, high])], title="t", x_label="x", y_label="y", log_y=True)
+        small = line_chart([0, 1], [("y", [low, high])], title="t", x_label="x", y_label="y", log_y=True)
         assert len(re.findall('text-anchor="end">', small.svg)) >= 3
 
 
 def test_lines_are_told_apart_without_colour():
     lines = [("measured", [0, 1])] + [(f"p = {p}", [p, p]) for p in (1, 3, 5, 7)]
-    chart = report.line_chart([0, 1], lines, title="t", x_label="x", y_label="y")
+    chart = line_chart([0, 1], lines, title="t", x_label="x", y_label="y")
     assert len(set(re.findall(r'stroke-dasharray="([\d ]+)"', chart.svg))) >= 3
     for name, _ in lines:
         assert f">{name}</text>" in chart.svg
@@ -666,18 +677,18 @@ def test_lines_are_told_apart_without_colour():
 
 def test_extreme_data_still_draw():
     for y in ([0, 0], [5, 5], [-1e299, 1e299], [1e-300, 2e-300], [1, 1 + 1e-15], [0, 5e-324]):
-        chart = report.line_chart([0, 1], [("y", y)], title="t", x_label="x", y_label="y")
+        chart = line_chart([0, 1], [("y", y)], title="t", x_label="x", y_label="y")
         assert "nan" not in chart.svg
         Page(chart.svg)
-    chart = report.line_chart([0], [("measured", [1])], title="t", x_label="x", y_label="y")
+    chart = line_chart([0], [("measured", [1])], title="t", x_label="x", y_label="y")
     Page(chart.svg)
 
 
 def test_charts_refuse_what_does_not_fit():
     with pytest.raises(ftlm.DataError, match="at least one line"):
-        report.line_chart([0, 1], [], title="t", x_label="x", y_label="y")
+        line_chart([0, 1], [], title="t", x_label="x", y_label="y")
     with pytest.raises(ftlm.DataError, match="one length"):
-        report.line_chart([0, 1], [("y", [1, 2, 3])], title="t", x_label="x", y_label="y")
+        line_chart([0, 1], [("y", [1, 2, 3])], title="t", x_label="x", y_label="y")
 
 
 def test_convergence_and_error_charts(square, identified):
@@ -689,12 +700,12 @@ def test_convergence_and_error_charts(square, identified):
         (f"p = {p}", ftlm.multi_innovation_trace(square, free.with_orders(orders), innovation_length=p, every=16))
         for p in (1, 7)
     ]
-    chart = report.trace_chart(traces, title="Convergence")
+    chart = trace_chart(traces, title="Convergence")
     assert len(paths_of(chart.svg)) == 2
     other = ftlm.multi_innovation_trace(square, free.with_orders(orders), every=32)
     with pytest.raises(ftlm.DataError, match="other steps"):
-        report.trace_chart([*traces, ("x", other)], title="t")
-    found = report.error_chart([("best", identified.comparison)], "theta12", units={"theta12": "rad"})
+        trace_chart([*traces, ("x", other)], title="t")
+    found = error_chart([("best", identified.comparison)], "theta12", units={"theta12": "rad"})
     assert "|error| [rad]" in found.svg
     assert found._repr_html_().startswith("<figure>")
 
@@ -704,58 +715,58 @@ def test_convergence_and_error_charts(square, identified):
 
 def test_a_pole_map_has_every_pole_and_its_sector():
     model = ftlm.Model(ftlm.equation("D^1.8 y = -0.6 D^0.8 y - 9 y + 4 u"))
-    (figure,) = report.pole_charts(model)
+    (figure,) = pole_charts(model)
     assert "s^0.9" in figure.title
     lam = [m.pole**0.9 for m in model.modes()]
     assert f"{lam[0].real:.3g}".replace("-", "−")[:5] in figure.svg
     assert "2 points in the plane" in figure.svg
     assert "|arg s^0.9| < 81 degrees" in figure.caption
     assert "none is in it" in figure.caption
-    (grown,) = report.pole_charts(ftlm.Model(ftlm.equation("D^2 y = 0.6 D y - 9 y + u")))
+    (grown,) = pole_charts(ftlm.Model(ftlm.equation("D^2 y = 0.6 D y - 9 y + u")))
     assert grown.title == "Poles in the plane of s"
     assert "1 of 1 modes in it: the model is not stable" in grown.caption
     assert "2 in the shaded sector" in grown.svg
     # A relaxation of fractional order stands on the negative axis.
-    (slow,) = report.pole_charts(ftlm.Model(ftlm.equation("D^0.5 y = -2 y + u")))
+    (slow,) = pole_charts(ftlm.Model(ftlm.equation("D^0.5 y = -2 y + u")))
     assert "−2.00 + 0j" in slow.svg
-    assert report.pole_charts(ftlm.Model(ftlm.equation("D^2 y = -3 D y + 6 u - 0.5*sign(D y)"))) == []
+    assert pole_charts(ftlm.Model(ftlm.equation("D^2 y = -3 D y + 6 u - 0.5*sign(D y)"))) == []
     with pytest.raises(ftlm.errors.DataError, match="point 1 of 2 is not finite"):
-        report.plane_chart([1j, complex("nan")], title="t", x_label="x", y_label="y")
+        plane_chart([1j, complex("nan")], title="t", x_label="x", y_label="y")
     for bad in (0.0, 4.0, -1.0):
         with pytest.raises(ftlm.errors.DataError, match="no angle"):
-            report.plane_chart([1j], title="t", x_label="x", y_label="y", sector=bad)
+            plane_chart([1j], title="t", x_label="x", y_label="y", sector=bad)
 
 
 def test_a_correlation_map_has_every_number():
     values = np.array([[1.0, -0.5], [-0.5, 1.0]])
-    figure = report.correlation_map(["alpha", HOSTILE], values, title="t")
+    figure = correlation_map(["alpha", HOSTILE], values, title="t")
     assert figure.svg.count("−.50") == 2
     assert HOSTILE not in figure.svg
     assert "The largest" in figure.svg
-    assert "–" in report.correlation_map(["a", "b"], [[1, np.nan], [np.nan, 1]], title="t").svg
+    assert "–" in correlation_map(["a", "b"], [[1, np.nan], [np.nan, 1]], title="t").svg
     for names, bad, message in (
         (["a"], values, "shape"),
         ([], np.zeros((0, 0)), "shape"),
         (["a", "b"], 3 * values, "beyond 1"),
     ):
         with pytest.raises(ftlm.errors.DataError, match=message):
-            report.correlation_map(names, bad, title="t")
+            correlation_map(names, bad, title="t")
 
 
 def test_a_histogram_counts_every_value():
     values = np.random.default_rng(1).standard_normal(500)
-    figure = report.histogram([*values, np.nan], title="t", x_label="x")
+    figure = histogram([*values, np.nan], title="t", x_label="x")
     heights = [float(h) for h in re.findall(r'<rect class="shade2"[^>]* height="([\d.]+)"', figure.svg)]
     reach = np.max(np.abs(values - values.mean()))
     counts, _ = np.histogram(values, values.mean() + np.linspace(-reach, reach, len(heights) + 1))
     assert np.allclose(np.array(heights) / max(heights), counts / counts.max(), atol=0.01)
     assert "1 values are not finite" in figure.caption
     assert "Histogram of 500 values" in figure.svg
-    constant = report.histogram([2.0, 2.0, 2.0], title="t", x_label="x")
+    constant = histogram([2.0, 2.0, 2.0], title="t", x_label="x")
     assert "standard deviation 0" in constant.svg
     for bad in ([], [1.0], [np.nan, np.inf, 1.0]):
         with pytest.raises(ftlm.errors.DataError, match="two finite values"):
-            report.histogram(bad, title="t", x_label="x")
+            histogram(bad, title="t", x_label="x")
 
 
 def test_models_stand_side_by_side_as_bars(identified, square, sine):
@@ -764,12 +775,12 @@ def test_models_stand_side_by_side_as_bars(identified, square, sine):
         ("one", [("estimation", own), ("validation", other)]),
         (HOSTILE, [("estimation", own), ("validation", own)]),
     ]
-    figures = report.compared_bars(both)
+    figures = compared_bars(both)
     assert [f.title for f in figures] == ["Fit of the free run of θ₁₁", "Fit of the free run of θ₁₂"]
     assert HOSTILE not in figures[0].svg
     widths = [float(w) for w in re.findall(r'<rect class="shade1"[^>]* width="([\d.]+)"', figures[1].svg)]
     assert widths[0] == widths[1] > 0
-    below = report.bar_chart(["a", "b"], [("fit", [-50.0, np.nan])], title="t", x_label="x", high=100.0)
+    below = bar_chart(["a", "b"], [("fit", [-50.0, np.nan])], title="t", x_label="x", high=100.0)
     assert "−50.00" in below.svg
     assert "–" in below.svg
     for bad, message in (
@@ -777,14 +788,14 @@ def test_models_stand_side_by_side_as_bars(identified, square, sine):
         ([("one", [("estimation", own)]), ("two", [("validation", own)])], "compare like with like"),
     ):
         with pytest.raises(ftlm.errors.DataError, match=message):
-            report.compared_bars(bad)
+            compared_bars(bad)
     for names, groups in (([], [("a", [])]), (["x"], []), (["x"], [("a", [1.0])] * 6), (["x"], [("a", [1.0, 2.0])])):
         with pytest.raises(ftlm.errors.DataError, match=r"names|shape"):
-            report.bar_chart(names, groups, title="t", x_label="x")
+            bar_chart(names, groups, title="t", x_label="x")
 
 
 def test_residuals_over_time_are_those_of_the_comparison(identified):
-    figures = report.residual_series(identified.comparison, units=identified.model.units, label="estimation")
+    figures = residual_series(identified.comparison, units=identified.model.units, label="estimation")
     assert [f.title.rpartition(": ")[2] for f in figures] == ["over time", "how often"] * 2
     missed = identified.comparison.measured["theta11"][0] - identified.comparison.simulated["theta11"][0]
     assert f"from {number(float(missed.min()), 4)} to {number(float(missed.max()), 4)}" in figures[0].svg
@@ -795,13 +806,13 @@ def test_coefficients_have_units_and_an_offset_its_number():
     model = ftlm.Model(
         ftlm.equation("D^2 y = a y + b u").with_coefficients({"a": -4.0, "b": 2.0}), units={"y": "rad", "u": "A"}
     )  # fmt: skip
-    table = report.parameter_table(model)
+    table = parameter_table(model)
     at = table.columns.index("unit")
     assert [str(row[at]) for row in table.rows] == ["s<sup>−2</sup>", "s<sup>−2</sup> rad/A"]
-    html = str(report.equation_html(model.equations[0], offset={"constant": -0.25, "ramp": 0.5}))
+    html = str(equation_html(model.equations[0], offset={"constant": -0.25, "ramp": 0.5}))
     assert "0.25000" in html
     assert html.count('class="term"') == 4
-    assert "<mi>c</mi>" in str(report.equation_html(model.equations[0], offset=" + c"))
+    assert "<mi>c</mi>" in str(equation_html(model.equations[0], offset=" + c"))
 
 
 def test_a_result_without_a_page_cannot_be_made():

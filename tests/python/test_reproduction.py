@@ -11,16 +11,14 @@ import pytest
 
 import ftlm
 from ftlm import DataError
-from ftlm.identification.page import grouped_warnings
-from ftlm.judge.comparison import compare_means
-from ftlm.paper import printed
-from ftlm.paper.arm import demo_plant, demo_run, truth_of
-from ftlm.paper.claims import claims, table_3_coefficients
-from ftlm.paper.page import reproduction_text
-from ftlm.paper.panel import Panel
-from ftlm.paper.reproduction import stages_of
-from ftlm.paper.rivalry import like_for_like
-from ftlm.paper.thinning import thinned
+from ftlm.report.html_report import grouped_warnings
+from ftlm.reproduction import published_values as printed
+from ftlm.reproduction.claims import claims, table_3_coefficients
+from ftlm.reproduction.optimizer_comparison import Panel, like_for_like
+from ftlm.reproduction.report import reproduction_text
+from ftlm.reproduction.reproduction import stages_of
+from ftlm.reproduction.simulated_arm import demo_plant, demo_run, thinned, truth_of
+from ftlm.validation.comparison import compare_means
 from lagrange import truth
 from test_cli import ftlm_command
 from test_derivation import STIFFNESS_PAIRS, TABLE_3
@@ -393,8 +391,8 @@ def test_a_long_run_that_does_not_start_at_rest(reproduction, tmp_path, monkeypa
     own = ["I2", "theta21", "theta22"]
     moving = reproduction.square.select(own).slice(1.3, 4.3)
     other = reproduction.sine.select(own).slice(0.7, 3.7)
-    monkeypatch.setattr("ftlm.paper.work.MOST_ROWS", 1000)
-    monkeypatch.setattr("ftlm.paper.work.JOINT_ROWS", 500)
+    monkeypatch.setattr("ftlm.reproduction.stage_models.MOST_ROWS", 1000)
+    monkeypatch.setattr("ftlm.reproduction.stage_models.JOINT_ROWS", 500)
     told = []
     found = ftlm.reproduce(moving, other, step=0.5, progress=lambda *share: told.append(share))
     # One share of the whole, which never falls.

@@ -10,10 +10,9 @@ import pytest
 
 import ftlm
 from ftlm import _core
-from ftlm.base.colour import autoregression, whitened
-from ftlm.base.statistics import chi_squared_99, is_white
-from ftlm.judge.charts import residual_charts
-from ftlm.judge.residuals import residual_warnings
+from ftlm.plot.comparison_charts import residual_charts
+from ftlm.utils.statistics import autoregression, chi_squared_99, is_white, whitened
+from ftlm.validation.residual_tests import residual_warnings
 
 WORDS = "D^1.6 y = a D^0.6 y + c y + b u"
 
@@ -320,7 +319,7 @@ def test_the_whitening_filter_is_that_of_yule_and_walker():
 
 def test_a_limit_that_cannot_be_exceeded_decides_nothing(small_model, monkeypatch):
     # A slow sine of a few samples: were its correlations judged as they are, the limit would be above 1.
-    monkeypatch.setattr("ftlm.judge.residuals.autoregression", lambda series, most: np.ones(1))
+    monkeypatch.setattr("ftlm.validation.residual_tests.autoregression", lambda series, most: np.ones(1))
     n = 60
     t = np.arange(n)
     u = np.sin(2 * np.pi * t / 120)

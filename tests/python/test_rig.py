@@ -11,9 +11,9 @@ from scipy.signal import cont2discrete
 import ftlm
 import lagrange
 from ftlm import _core, rig
-from ftlm.cli import app
+from ftlm.cli import main as app
 from ftlm.rig.rig import CURRENT_LIMIT, ENCODER_SCALE, STRAIN_SCALE
-from ftlm.rig.virtual import VirtualBoard
+from ftlm.rig.virtual_board import VirtualBoard
 
 
 @pytest.fixture(scope="module")

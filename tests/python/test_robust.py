@@ -12,16 +12,23 @@ from scipy.signal import lfilter, lsim
 
 import ftlm
 from ftlm import _core
-from ftlm.base.colour import colour_covariances, coloured
-from ftlm.base.statistics import BEND, MAD, NORMAL_95, autocovariances, huber_excess, is_white
-from ftlm.data.readings import Readings, bridged, places_on_grid
-from ftlm.fit.grid import Attempt, Grid
-from ftlm.fit.joint import fit_output_error
-from ftlm.fit.problem import FreeProblem
-from ftlm.fit.uncertainty import covariance_of
-from ftlm.identification.warnings import quantum
-from ftlm.judge.comparison import free_runs
-from ftlm.solve.sampled import sampled
+from ftlm.data.sampling import Readings, bridged, places_on_grid
+from ftlm.estimation.free_parameters import FreeProblem
+from ftlm.estimation.model_checks import quantum
+from ftlm.estimation.objective import Attempt, Grid, covariance_of
+from ftlm.estimation.output_error import fit_output_error
+from ftlm.simulation.output_samples import sampled
+from ftlm.utils.statistics import (
+    BEND,
+    MAD,
+    NORMAL_95,
+    autocovariances,
+    colour_covariances,
+    coloured,
+    huber_excess,
+    is_white,
+)
+from ftlm.validation.comparison import free_runs
 
 STEP, ROWS, FINE = 0.1, 400, 20
 WORDS = "D^2 y = -0.8 D y - 4 y + 4 u"

@@ -7,9 +7,9 @@ import pytest
 from scipy import signal
 
 import ftlm
-from ftlm.selection.candidates import Inside
-from ftlm.selection.screen import ALL, Column, Judge, Products, grounds, judged_subsets, screened
-from ftlm.selection.trial import Folds
+from ftlm.structure_selection.best_subset import ALL, Column, Judge, Products, grounds, judged_subsets, screened
+from ftlm.structure_selection.candidates import Inside
+from ftlm.structure_selection.cross_validation import Folds
 
 WORDS = "D^2 y = a y + d D y + c0 s + c1 D s + c2 D^2 s + c3 v"
 

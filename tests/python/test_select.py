@@ -13,15 +13,13 @@ from typer.testing import CliRunner
 
 import friction
 import ftlm
-from ftlm.base.threads import stop
-from ftlm.cli.app import app
-from ftlm.selection.automatic import automatic
-from ftlm.selection.candidates import Change, Inside, Variant, named
-from ftlm.selection.glance import contenders
-from ftlm.selection.growth import Fitted, Work, _judged, duration, listed
-from ftlm.selection.result import percent
-from ftlm.selection.select import _as_good, _ranked, _reason
-from ftlm.selection.trial import Folds, Trial, fit, judged, least_unseen, masked
+from ftlm.cli.main import app
+from ftlm.structure_selection.candidates import Change, Inside, Variant, named
+from ftlm.structure_selection.cross_validation import Folds, Trial, fit, judged, least_unseen, masked
+from ftlm.structure_selection.result import percent
+from ftlm.structure_selection.select import _as_good, _ranked, _reason, automatic
+from ftlm.structure_selection.stepwise import Fitted, Work, _judged, contenders, duration, listed
+from ftlm.utils.resources import stop
 
 RICH = "D^2 y = d D^mu y + a y + b0 u + b1 D^gamma u"
 

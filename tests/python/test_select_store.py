@@ -8,13 +8,13 @@ import pytest
 from typer.testing import CliRunner
 
 import ftlm
-from ftlm.cli.app import app
-from ftlm.fit.joint import fit_output_error
-from ftlm.search import frames
-from ftlm.selection import trial
-from ftlm.selection.candidates import named
-from ftlm.selection.store import ENCODER, SELECTION, FitFile, Kept, Refused, Request, Store
-from ftlm.selection.trial import Folds
+from ftlm.cli.main import app
+from ftlm.estimation.output_error import fit_output_error
+from ftlm.order_search import checkpoint as frames
+from ftlm.structure_selection import cross_validation as trial
+from ftlm.structure_selection.candidates import named
+from ftlm.structure_selection.checkpoint import ENCODER, SELECTION, FitFile, Kept, Refused, Request, Store
+from ftlm.structure_selection.cross_validation import Folds
 from test_select import motor
 
 SECOND = ftlm.equation("D^2 y = d D y + a y + b u")

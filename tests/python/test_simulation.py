@@ -10,8 +10,8 @@ import pytest
 import ftlm
 import oracles
 from ftlm import _core
-from ftlm.solve.free_run import compared, respond
-from ftlm.solve.records import record
+from ftlm.simulation.discretization import record
+from ftlm.simulation.simulate import compared, respond
 
 
 def zeros_run(n=301, step=0.02, inputs=None, outputs=("y",), **options):

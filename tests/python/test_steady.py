@@ -17,8 +17,8 @@ import ftlm
 import lsim_link
 from ftlm import _core
 from ftlm.cli.options import StructureOptions
-from ftlm.fit.grid import Attempt, Grid
-from ftlm.fit.problem import FreeProblem
+from ftlm.estimation.free_parameters import FreeProblem
+from ftlm.estimation.objective import Attempt, Grid
 from measured import DATA, needs_data
 
 ANGLES = {"theta11": "th11_deg", "theta12": "th12_deg", "theta21": "th21_deg", "theta22": "th22_deg"}

@@ -20,13 +20,11 @@ import pytest
 import ftlm
 import store as bench
 from ftlm import _core
-from ftlm.data.settings import Settings
 from ftlm.errors import ModelError
-from ftlm.search import frames
-from ftlm.search.contents import Section, contents_of, read_store
-from ftlm.search.frames import MAGIC, Joined, Rounds, Verdicts
-from ftlm.search.orders import make_job
-from ftlm.search.store import Store
+from ftlm.order_search import checkpoint as frames
+from ftlm.order_search.checkpoint import MAGIC, Joined, Rounds, Section, Store, Verdicts, contents_of, read_store
+from ftlm.order_search.options import Settings
+from ftlm.order_search.search import make_job
 
 EQUATION = "D^alpha y = a D^beta y + c D^mu y + b D^nu u"
 COARSE = ftlm.lattice(step=0.1)
@@ -136,7 +134,7 @@ def test_rounds_do_not_depend_on_how_they_are_cut_up(run):
 def test_several_equations_are_kept_in_one_store_by_the_command_line(tmp_path, clean_a, monkeypatch):
     from typer.testing import CliRunner
 
-    from ftlm.cli import app
+    from ftlm.cli import main as app
 
     data, path = tmp_path / "a.csv", str(tmp_path / "s.ftlm")
     clean_a.to_csv(data)
@@ -385,8 +383,8 @@ def search_stage(run, path=None, *, structure=None, lattice=None, **options):
 @pytest.fixture
 def small_pieces(monkeypatch):
     """Some candidates a frame, so that a small store has many."""
-    monkeypatch.setattr("ftlm.search.waves.FEWEST", 16)
-    monkeypatch.setattr("ftlm.search.waves.PIECE", 0.0)
+    monkeypatch.setattr("ftlm.order_search.schedule.FEWEST", 16)
+    monkeypatch.setattr("ftlm.order_search.schedule.PIECE", 0.0)
 
 
 @pytest.fixture(scope="module")
@@ -498,7 +496,7 @@ def test_a_stage_goes_on_wherever_it_was_cut(stage_run, stage_store, stage_expec
 def test_a_finished_search_of_a_stage_is_only_read(stage_run, stage_store, stage_expected, tmp_path, monkeypatch):
     path = tmp_path / "s.ftlm"
     path.write_bytes(stage_store)
-    monkeypatch.setattr("ftlm.search.work.StageWork.ready", None)
+    monkeypatch.setattr("ftlm.order_search.schedule.StageWork.ready", None)
     assert bytes_of(ftlm.resume_search(path)["stage"]) == stage_expected
     assert ftlm.search_status(path)["stage"].complete
     held = msgspec.structs.asdict(read_store(path).sections[0].joined)
@@ -644,7 +642,7 @@ def test_a_store_where_nothing_is_searched_is_refused(stage_run, tmp_path):
 def test_the_command_identify_goes_on_with_its_store(tmp_path, clean_a):
     from typer.testing import CliRunner
 
-    from ftlm.cli import app
+    from ftlm.cli import main as app
 
     data, path = tmp_path / "a.csv", tmp_path / "s.ftlm"
     clean_a.to_csv(data)
@@ -692,7 +690,7 @@ def test_a_store_of_another_algorithm_is_read_where_it_is_finished_and_refused_w
     finished, half = tmp_path / "finished.ftlm", tmp_path / "half.ftlm"
     finished.write_bytes(whole)
     half.write_bytes(whole[: len(whole) // 2])
-    monkeypatch.setattr("ftlm.search.frames.ALGORITHM", 6)
+    monkeypatch.setattr("ftlm.order_search.checkpoint.ALGORITHM", 6)
     assert bytes_of(ftlm.resume_search(finished)["y"]) == expected
     assert finished.read_bytes() == whole
     kept = read_store(half).end
@@ -709,7 +707,7 @@ def test_only_what_another_algorithm_does_otherwise_is_refused_half_done(run, tm
         expected = bytes_of(search(run, finished, **options))
         held = read_store(finished)
         with monkeypatch.context() as patch:
-            patch.setattr("ftlm.search.frames.ALGORITHM", 4)
+            patch.setattr("ftlm.order_search.checkpoint.ALGORITHM", 4)
             Store(half, held.requests).close()
         if name == "free":
             begun = half.read_bytes()
@@ -753,7 +751,7 @@ def test_a_full_disk_leaves_the_store_whole(run, expected, tmp_path, monkeypatch
         return written
 
     with monkeypatch.context() as patch:
-        patch.setattr("ftlm.search.store.os.write", full)
+        patch.setattr("ftlm.order_search.checkpoint.os.write", full)
         with pytest.raises(ftlm.DataError, match=r"cannot be written: No space left on device; what it holds is whole"):
             search(run, path)
     assert read_store(path).torn == 0

@@ -10,7 +10,7 @@ from typer.testing import CliRunner
 
 import ftlm
 import strangers
-from ftlm.cli.app import app
+from ftlm.cli.main import app
 
 
 def command(*words):

@@ -5,7 +5,7 @@ import pytest
 
 import ftlm
 from ftlm import rig
-from ftlm.fit.streaming import Streaming
+from ftlm.estimation.linear import Streaming
 
 ORDERS = {"alpha1": 2.0, "alpha2": 2.0, "gamma1": 0.95, "beta2": 0.1, "mu2": 0.85}
 

@@ -12,9 +12,9 @@ import pytest
 from typer.testing import CliRunner
 
 import ftlm
-from ftlm.base.checks import available_threads, check_threads
-from ftlm.cli.app import app
-from ftlm.data.settings import METHODS
+from ftlm.cli.main import app
+from ftlm.order_search.options import METHODS
+from ftlm.utils.validation import available_threads, check_threads
 
 WORDS = "D^1.5 y = a y + b u"
 

@@ -10,7 +10,7 @@ from pathlib import Path
 import numpy as np
 import pytest
 
-from ftlm.base.tall import dot, length, orthonormal, projections, singular, solved, triangle
+from ftlm.utils.linalg import dot, length, orthonormal, projections, singular, solved, triangle
 
 SHAPES = [(1, 1), (3, 5), (5, 5), (300, 5), (1800, 5), (1801, 5), (20_000, 5), (700, 60), (2300, 13), (40, 0)]
 

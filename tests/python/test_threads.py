@@ -8,7 +8,7 @@ import numpy as np
 import pytest
 
 from ftlm import _core
-from ftlm.base.threads import pool, stop
+from ftlm.utils.resources import pool, stop
 
 
 def step_response(m: int) -> list:

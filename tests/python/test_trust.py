@@ -60,8 +60,8 @@ def test_an_order_that_the_run_says_nothing_of_says_so(small_run, with_noise):
 def test_standard_errors_wider_than_the_bounds_say_so(noisy):
     from dataclasses import replace
 
-    from ftlm.fit.problem import FreeProblem
-    from ftlm.identification.warnings import uncertain as _uncertain
+    from ftlm.estimation.free_parameters import FreeProblem
+    from ftlm.estimation.model_checks import uncertain as _uncertain
 
     structure = ftlm.equation(WORDS, orders={"alpha": "1.5:1.7:0.1"})
     joint = ftlm.identify(noisy, structure).joint
@@ -78,7 +78,7 @@ def test_standard_errors_wider_than_the_bounds_say_so(noisy):
 def test_correlated_numbers_are_told_apart_where_each_is_known(noisy):
     from dataclasses import replace
 
-    from ftlm.identification.warnings import inseparable
+    from ftlm.estimation.model_checks import inseparable
 
     joint = ftlm.identify(noisy, ftlm.equation(WORDS)).joint
     n = len(joint.names)

@@ -8,8 +8,8 @@ import pytest
 import ftlm
 import plants
 import truth
-from ftlm.fit.joint import fit_output_error
-from ftlm.paper.arm import demo_plant
+from ftlm.estimation.output_error import fit_output_error
+from ftlm.reproduction.simulated_arm import demo_plant
 from oracles import fit_percent
 
 ARM = plants.truth("A")

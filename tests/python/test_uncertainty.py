@@ -17,10 +17,10 @@ import pytest
 from scipy.signal import lsim
 
 import ftlm
-from ftlm.fit import history
-from ftlm.fit.joint import JointFit, fit_output_error
-from ftlm.fit.uncertainty import covariance_of, deviation
-from ftlm.report.model_page import model_page
+from ftlm.estimation import nuisance_parameters as history
+from ftlm.estimation.objective import covariance_of, deviation
+from ftlm.estimation.output_error import JointFit, fit_output_error
+from ftlm.report.html_report import model_page
 
 
 def digits_of(jacobian: np.ndarray, squares: float) -> np.ndarray:

@@ -7,8 +7,8 @@ import numpy as np
 import pytest
 
 import ftlm
-from ftlm.paper.unseen import MARGIN, judged, link_structure, orders_on_unseen_runs, stages_in
-from ftlm.paper.unseen_page import places_table, sentence, unseen_page, unseen_text
+from ftlm.reproduction.cross_validation import MARGIN, judged, link_structure, orders_on_unseen_runs, stages_in
+from ftlm.reproduction.report import places_table, sentence, unseen_page, unseen_text
 from test_cli import ftlm_command
 
 ROWS, STEP = 251, 0.02

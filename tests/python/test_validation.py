@@ -9,9 +9,9 @@ import pytest
 import ftlm
 import oracles
 from ftlm import _core
-from ftlm.judge.comparison import compare_means, near_identity
-from ftlm.solve import past
-from ftlm.solve.sampled import sampled
+from ftlm.simulation import output_samples as past
+from ftlm.simulation.output_samples import sampled
+from ftlm.validation.comparison import compare_means, near_identity
 
 # ----------------------------------------------------------------------------------------------------------------------
 # The four figures

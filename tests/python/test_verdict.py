@@ -14,13 +14,12 @@ from typer.testing import CliRunner
 
 import ftlm
 from ftlm import cli
-from ftlm.fit import history
-from ftlm.fit.interval import ProfileInterval
-from ftlm.fit.joint import fit_output_error
-from ftlm.identification import estimate as estimating
-from ftlm.identification.verdict import saved_verdict
-from ftlm.judge.concerns import KINDS, OTHER, SHOWN, concerns, kind_of
-from ftlm.report import model_page
+from ftlm.estimation import estimators as estimating
+from ftlm.estimation import nuisance_parameters as history
+from ftlm.estimation.output_error import ProfileInterval, fit_output_error
+from ftlm.estimation.verdict import saved_verdict
+from ftlm.report import html_report as model_page
+from ftlm.validation.findings import KINDS, OTHER, SHOWN, concerns, kind_of
 from loops import loop
 
 SOURCE = Path(ftlm.__file__).parent

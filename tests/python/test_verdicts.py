@@ -8,20 +8,24 @@ import numpy as np
 import pytest
 
 import ftlm
-from ftlm.arm.link import flexible_link
-from ftlm.fit.differential import differential_evolution_search
-from ftlm.paper import printed
-from ftlm.paper.arm import ARMS, MAIN, demo_run
-from ftlm.paper.asprinted import SCAN, as_printed, implied_spreads, papers_record
-from ftlm.paper.claims import beats, sooner, spread_in_words
-from ftlm.paper.course import Steps, Whole, seconds_of, seconds_of_all
-from ftlm.paper.panel import arrived_at, freed_of, simulated_panel
-from ftlm.paper.ran import one_angle, papers_current, printed_numbers, ran
-from ftlm.paper.rivalry import like_for_like, rivals_lattice, seeds_for
-from ftlm.paper.verdicts import case, ruled
-from ftlm.paper.work import Preset, StageWork
-from ftlm.solve.operators import block_pulse_matrix
-from ftlm.solve.records import prepare
+from ftlm.arm.flexible_link import flexible_link
+from ftlm.estimation.genetic import differential_evolution_search
+from ftlm.fractional_calculus import block_pulse_matrix
+from ftlm.reproduction import published_values as printed
+from ftlm.reproduction.claims import beats, case, ruled, sooner, spread_in_words
+from ftlm.reproduction.optimizer_comparison import (
+    arrived_at,
+    freed_of,
+    like_for_like,
+    rivals_lattice,
+    seeds_for,
+    simulated_panel,
+)
+from ftlm.reproduction.published_models import one_angle, papers_current, printed_numbers, ran
+from ftlm.reproduction.published_values import SCAN, as_printed, implied_spreads, papers_record
+from ftlm.reproduction.simulated_arm import ARMS, MAIN, demo_run
+from ftlm.reproduction.stage_models import Preset, StageWork, Steps, Whole, seconds_of, seconds_of_all
+from ftlm.simulation.discretization import prepare
 
 # ----------------------------------------------------------------------------------------------------------------------
 # The rule
@@ -202,7 +206,7 @@ def test_the_scan_s_closed_form_is_the_recursion(tables):
         assert np.std(run[output]) == pytest.approx(implied_spreads()[output][1])
         assert scale > 0
     m, step = 2048, 10.0 / 2048
-    record = ftlm.solve.records.record(run, flexible_link(stage=2, form="published", laws=()), m)
+    record = ftlm.simulation.discretization.record(run, flexible_link(stage=2, form="published", laws=()), m)
     own, other, u = record.of("theta21"), record.of("theta22"), record.of("I2")
     assert made.reading.terms == "own angle in a"
     parts = [(own, 0.15), (other, 0.1), (other, 0.2), (u, 2.0)]
@@ -285,9 +289,9 @@ def test_rivals_have_the_same_lattice_and_as_many_seeds_on_every_arm(monkeypatch
         given.append((lattice, asked))
         raise ftlm.ModelError("enough")
 
-    monkeypatch.setattr("ftlm.paper.panel.like_for_like", like)
-    monkeypatch.setattr("ftlm.paper.work.like_for_like", like)
-    monkeypatch.setattr("ftlm.paper.panel.trials_of", lambda *_: [])
+    monkeypatch.setattr("ftlm.reproduction.optimizer_comparison.like_for_like", like)
+    monkeypatch.setattr("ftlm.reproduction.stage_models.like_for_like", like)
+    monkeypatch.setattr("ftlm.reproduction.optimizer_comparison.trials_of", lambda *_: [])
     with pytest.raises(ftlm.ModelError):
         simulated_panel(1, "whole orders", [1], 0.0, 1, lattice=rivals_lattice(step))
     preset = Preset(ftlm.Lattice(step=step), 1, 2, alike=True)
@@ -309,13 +313,14 @@ def test_seeds_are_ten_or_as_many_as_the_evaluations_allow():
 
 
 def test_a_lattice_that_no_bound_prunes_is_searched_coarsely_first(monkeypatch):
-    monkeypatch.setattr("ftlm.paper.work.COARSE", 0.4)
+    monkeypatch.setattr("ftlm.reproduction.stage_models.COARSE", 0.4)
     run, lattice = demo_run("square"), ftlm.Lattice(step=0.2)
     work = StageWork(1, run, None, Preset(lattice, 1, 2, alike=True), 1, lambda _: None, None)
     options = {"coefficients": "multi-innovation", "innovation_length": 3}
     seen = []
     monkeypatch.setattr(
-        "ftlm.paper.work.search_orders", lambda *a, **k: seen.append(a[2].step) or ftlm.search_orders(*a, **k)
+        "ftlm.reproduction.stage_models.search_orders",
+        lambda *a, **k: seen.append(a[2].step) or ftlm.search_orders(*a, **k),
     )
     found = work.searched("p = 3", lattice, **options)
     # The hub once; the deflection in steps of 0.4, then around the ten best.
@@ -337,7 +342,7 @@ def test_fits_to_simulated_arms_ask_once_not_what_was_before(monkeypatch):
         seen.append(structure.initial)
         raise ftlm.ConvergenceError("enough")
 
-    monkeypatch.setattr("ftlm.paper.panel.identify", identify)
+    monkeypatch.setattr("ftlm.reproduction.optimizer_comparison.identify", identify)
     with pytest.raises(ftlm.ConvergenceError):
         freed_of(1, demo_run("square"), "fractional", 1)
     preset = Preset(ftlm.Lattice(step=0.25), 1, 2, alike=True)

@@ -8,7 +8,7 @@ import pytest
 import ftlm
 import lagrange
 from ftlm import rig
-from ftlm.rig.experiment import STOCK_FILTER
+from ftlm.rig.recording import STOCK_FILTER
 from planar_arm import Planar
 from real_arm import correlations, filtered
 

@@ -14,12 +14,12 @@ from typer.main import get_command
 from typer.testing import CliRunner
 
 import ftlm
-from ftlm.cli.app import app
-from ftlm.cli.words import OPTIONS, in_options
-from ftlm.data.equations import numeric
-from ftlm.data.settings import METHODS, USED_BY
+from ftlm.cli.framework import OPTIONS, in_options
+from ftlm.cli.main import app
 from ftlm.data.units import TIME_UNITS
-from ftlm.report import equation_html
+from ftlm.order_search.options import METHODS, USED_BY
+from ftlm.report.typesetting import equation_html
+from ftlm.structure.equation import numeric
 
 WORDS = "D^1.6 y = a D^0.6 y + c y + b u"
 FREE = "D^alpha y = a D^0.6 y + c y + b u"

@@ -10,20 +10,19 @@ from typing import Annotated, Any, Literal
 
 from typer import Argument, Option
 
-from ftlm.arm.link import Law, flexible_link
-from ftlm.base.errors import DataError, ModelError
-from ftlm.cli.wait import expect_reading
-from ftlm.cli.words import interval, numbers, pairs, ranges
-from ftlm.data.filters import SensorFilter
-from ftlm.data.language import equation
-from ftlm.data.lattice import Lattice, lattice
+from ftlm.arm.flexible_link import Law, flexible_link
+from ftlm.cli.framework import expect_reading, interval, numbers, pairs, ranges
 from ftlm.data.run import Run
-from ftlm.data.settings import Criterion
-from ftlm.data.structures import START_WORDS, Structure, check_initial
-from ftlm.files.layout import Layout
-from ftlm.files.load import load
-from ftlm.files.opened import OpenedFile, open_file
-from ftlm.fit.genetic import Genetic
+from ftlm.errors import DataError, ModelError
+from ftlm.estimation.genetic import Genetic
+from ftlm.io.dialect import Layout
+from ftlm.io.load import load
+from ftlm.io.preview import OpenedFile, open_file
+from ftlm.order_search.options import Criterion
+from ftlm.structure.order_grid import Lattice, lattice
+from ftlm.structure.parser import equation
+from ftlm.structure.sensor_filter import SensorFilter
+from ftlm.structure.structure import START_WORDS, Structure, check_initial
 
 #: Options that may be left out.
 Text = str | None
@@ -131,11 +130,18 @@ class ReadingOptions:
     def _read(self, files: Sequence[str] | None, *, apart: bool) -> list[Run]:
         """Each file a run; .mat files that hold one signal each are one run together, unless they stand apart."""
         given: dict[str, Any] = {
-            "time": self.time, "step": self.sampling, "inputs": pairs("-u", self.inputs),
-            "outputs": pairs("-y", self.outputs), "units": pairs("--unit", self.units), "columns": self.columns,
-            "time_unit": self.time_unit, "intersample": pairs("--intersample", self.between), "resample": self.resample,
-            "missing": self.missing, "layout": layout_of(self),
-        }  # fmt: skip
+            "time": self.time,
+            "step": self.sampling,
+            "inputs": pairs("-u", self.inputs),
+            "outputs": pairs("-y", self.outputs),
+            "units": pairs("--unit", self.units),
+            "columns": self.columns,
+            "time_unit": self.time_unit,
+            "intersample": pairs("--intersample", self.between),
+            "resample": self.resample,
+            "missing": self.missing,
+            "layout": layout_of(self),
+        }
         if not files:
             return []
         expect_reading(files)
@@ -158,12 +164,20 @@ class ReadingOptions:
             raise ModelError("--detrend is not used with open; give it to the commands that open names")
         expect_reading([file])
         return open_file(
-            file, time=self.time, step=self.sampling, inputs=pairs("-u", self.inputs) or None,
-            outputs=pairs("-y", self.outputs) or None, units=pairs("--unit", self.units), columns=self.columns,
-            time_unit=self.time_unit, intersample=pairs("--intersample", self.between), layout=layout_of(self),
+            file,
+            time=self.time,
+            step=self.sampling,
+            inputs=pairs("-u", self.inputs) or None,
+            outputs=pairs("-y", self.outputs) or None,
+            units=pairs("--unit", self.units),
+            columns=self.columns,
+            time_unit=self.time_unit,
+            intersample=pairs("--intersample", self.between),
+            layout=layout_of(self),
             slice=None if self.sliced is None else interval(self.sliced, "--slice", "1.1:19.5"),
-            resample=self.resample, missing=self.missing,
-        )  # fmt: skip
+            resample=self.resample,
+            missing=self.missing,
+        )
 
 
 @dataclass(frozen=True)
@@ -270,7 +284,7 @@ class StructureOptions:
         """Refuse what only the flexible link has, for that many equations in words."""
         given = self._of_the_link() | {
             "--coupling": self.coupling is not None and count == 1,
-        }  # fmt: skip
+        }
         wrong = [option for option, is_given in given.items() if is_given]
         if wrong:
             owner = "the flexible link or of several equations" if wrong == ["--coupling"] else "the flexible link"
@@ -283,12 +297,16 @@ class StructureOptions:
     def _of_the_link(self) -> dict[str, bool]:
         """Whether options are given that only the flexible link has."""
         return {
-            "--cross-stage": self.cross_stage, "--inertial": self.inertial,
-            "--cross-sensitivity": self.cross_sensitivity, "--cross-damping": self.cross_damping,
+            "--cross-stage": self.cross_stage,
+            "--inertial": self.inertial,
+            "--cross-sensitivity": self.cross_sensitivity,
+            "--cross-damping": self.cross_damping,
             "--friction": self.friction,
-            "--laws": self.laws is not None, "--form": self.form is not None,
-            "--input-order": self.input_order is not None, "--stock-filter": self.stock_filter,
-        }  # fmt: skip
+            "--laws": self.laws is not None,
+            "--form": self.form is not None,
+            "--input-order": self.input_order is not None,
+            "--stock-filter": self.stock_filter,
+        }
 
     def _sensor(self) -> SensorFilter | None:
         """The low-pass that signals of equations in words passed."""
@@ -322,10 +340,15 @@ class StructureOptions:
         if stage is None:
             raise ModelError(f"--structure {text!r} is not known; use arm:1, :2 or :both")
         built = flexible_link(
-            stage=stage, hub=False, cross_stage=False if alone else "inertial", cross_sensitivity=True,
-            cross_damping=not alone, sensor_filter="stock",
-            laws=("orders", "coefficients", "velocities"), offset="constant",
-        )  # fmt: skip
+            stage=stage,
+            hub=False,
+            cross_stage=False if alone else "inertial",
+            cross_sensitivity=True,
+            cross_damping=not alone,
+            sensor_filter="stock",
+            laws=("orders", "coefficients", "velocities"),
+            offset="constant",
+        )
         built = replace(built, initial="caputo")
         whole = ("beta", 0.0) if alone else ("mu", 1.0)
         return built.with_orders({n: whole[1] for n in built.order_names if n.startswith(whole[0])})
@@ -342,15 +365,22 @@ class StructureOptions:
         if self.cross_stage and self.inertial:
             raise ModelError("--cross-stage adds torques, --inertial accelerations of the other stage; use one of them")
         laws: dict[str, Sequence[Law]] = {
-            "none": (), "orders": ("orders", "coefficients"), "velocities": ("orders", "coefficients", "velocities"),
-        }  # fmt: skip
+            "none": (),
+            "orders": ("orders", "coefficients"),
+            "velocities": ("orders", "coefficients", "velocities"),
+        }
         return flexible_link(
-            stage=stage, form=self.form, input_order=self.input_order, coupling=self.coupling,
-            cross_stage="inertial" if self.inertial else self.cross_stage, cross_sensitivity=self.cross_sensitivity,
-            cross_damping=self.cross_damping, friction=self.friction,
+            stage=stage,
+            form=self.form,
+            input_order=self.input_order,
+            coupling=self.coupling,
+            cross_stage="inertial" if self.inertial else self.cross_stage,
+            cross_sensitivity=self.cross_sensitivity,
+            cross_damping=self.cross_damping,
+            friction=self.friction,
             laws=laws[self.laws or "none"],
             sensor_filter="stock" if self.stock_filter else None,
-        )  # fmt: skip
+        )
 
     def _initial(self) -> Any:
         if self.initial in START_WORDS:
@@ -397,9 +427,14 @@ class SearchOptions:
     def settings(self) -> dict[str, Any]:
         """Everything that is given but the lattice, as a search takes it."""
         given = {
-            "criterion": self.criterion, "norm": self.norm, "innovation_length": self.p, "prior_covariance": self.k0,
-            "rows": self.rows, "m": self.m, "keep": self.keep,
-        }  # fmt: skip
+            "criterion": self.criterion,
+            "norm": self.norm,
+            "innovation_length": self.p,
+            "prior_covariance": self.k0,
+            "rows": self.rows,
+            "m": self.m,
+            "keep": self.keep,
+        }
         return {name: value for name, value in given.items() if value is not None}
 
 

@@ -1,16 +1,31 @@
 """Control on an identified model: shapers, fractional and linear-quadratic controllers, observers, inverse dynamics."""
 
-from ftlm.control.file import load_controller, save_controller
-from ftlm.control.fractional import FractionalPid, Realised
-from ftlm.control.hubs import HubLoops
-from ftlm.control.kalman import Observer, observer
-from ftlm.control.margins import Margins
-from ftlm.control.pid import PidDesign, fractional_pid
-from ftlm.control.planned import PlannedMove, inverse, smooth_move
-from ftlm.control.quadratic import Lqg, LqgDesign, lqg
-from ftlm.control.realisation import Realisation
-from ftlm.control.shaper import Shaper, input_shaper
+from ftlm.control.controller_file import HubLoops, load_controller, save_controller
+from ftlm.control.fractional_pid import FractionalPid, PidDesign, Realised, fractional_pid
+from ftlm.control.input_shaping import Shaper, input_shaper
+from ftlm.control.inverse_dynamics import PlannedMove, inverse, smooth_move
+from ftlm.control.lqg import Lqg, LqgDesign, Observer, lqg, observer
+from ftlm.control.realization import Realisation
+from ftlm.control.stability_margins import Margins
 
-__all__ = ["FractionalPid", "HubLoops", "Lqg", "LqgDesign", "Margins", "Observer", "PidDesign", "PlannedMove",
-           "Realisation", "Realised", "Shaper", "fractional_pid", "input_shaper", "inverse", "load_controller", "lqg",
-           "observer", "save_controller", "smooth_move"]  # fmt: skip
+__all__ = [
+    "FractionalPid",
+    "HubLoops",
+    "Lqg",
+    "LqgDesign",
+    "Margins",
+    "Observer",
+    "PidDesign",
+    "PlannedMove",
+    "Realisation",
+    "Realised",
+    "Shaper",
+    "fractional_pid",
+    "input_shaper",
+    "inverse",
+    "load_controller",
+    "lqg",
+    "observer",
+    "save_controller",
+    "smooth_move",
+]

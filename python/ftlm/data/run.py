@@ -1,29 +1,24 @@
-"""One measured experiment, checked once and never changed afterwards."""
+"""The record of one measured experiment: what verbs read of a run."""
 
 from __future__ import annotations
 
+import copy
 import html
 import os
-from collections.abc import Hashable, Iterable, Mapping, Sequence
-from dataclasses import fields
-from typing import Any, NoReturn
+from collections.abc import Callable, Hashable, Iterable, Mapping, Sequence
+from dataclasses import dataclass, field, fields
+from typing import TYPE_CHECKING, Any, NoReturn
 
 import numpy as np
+from numpy.typing import NDArray
 
-from ftlm.base.arrays import Floats
-from ftlm.base.checks import as_mapping, bad_rows, listed, names_to_columns, nearest
-from ftlm.base.errors import DataError
-from ftlm.data.advice import Advice, advise
-from ftlm.data.asked import Asked, how_read
-from ftlm.data.frames import asked_of_frame, dataset_of, frame_of
-from ftlm.data.limits import Limit
-from ftlm.data.measured import Measured
-from ftlm.data.names import check_signal_name
-from ftlm.data.picture import picture
-from ftlm.data.readings import Readings, read
-from ftlm.data.samples import (
+from ftlm.data.construction import Asked, how_read
+from ftlm.data.sampling import (
     FEWEST_ROWS,
+    Intersample,
+    Readings,
     as_vector,
+    bridged,
     check_lengths,
     check_rows,
     check_values,
@@ -33,12 +28,141 @@ from ftlm.data.samples import (
     how_interpolated,
     interpolated,
     is_constant,
+    locked,
+    read,
     trend_of,
+    unread,
     window_rows,
 )
-from ftlm.data.structures import Structure
-from ftlm.data.written import write_csv, write_parquet
-from ftlm.paint.figure import Figures
+from ftlm.errors import DataError
+from ftlm.structure.input_nonlinearity import Limit
+from ftlm.structure.structure import Structure
+from ftlm.svg.figure import Figures
+from ftlm.utils.validation import Floats, as_mapping, bad_rows, check_signal_name, listed, names_to_columns, nearest
+
+if TYPE_CHECKING:
+    from ftlm.validation.data_advice import Advice
+
+
+@dataclass(frozen=True, eq=False, repr=False)
+class Measured:
+    """Regular samples of named inputs and outputs in SI units; :class:`ftlm.Run` is what people hold.
+
+    Parameters
+    ----------
+    name
+        What reports call it.
+    step, start
+        Time between rows, and source time of the first row [s].
+    inputs, outputs
+        Names.
+    facts
+        What was done to the data, and what a rig said of them, in words.
+    readings
+        Rows at times of their own, where these are not those of the grid; on the grid stand means of the hold and
+        straight lines.
+    """
+
+    name: str
+    step: float
+    start: float
+    inputs: tuple[str, ...]
+    outputs: tuple[str, ...]
+    _data: dict[str, Floats]
+    _units: dict[str, str]
+    _intersample: dict[str, Intersample]
+    facts: tuple[str, ...] = ()
+    _about: dict[str, Any] = field(default_factory=dict)
+    readings: Readings | None = None
+
+    def __post_init__(self) -> None:
+        for name, value in (
+            ("_data", {s: locked(self._data[s]) for s in self.signals}),
+            ("_units", {s: self._units[s] for s in self.signals}),
+            ("_intersample", {s: self._intersample[s] for s in self.inputs}),
+            ("_about", copy.deepcopy(self._about)),
+        ):
+            object.__setattr__(self, name, value)
+        if self.readings is not None:
+            own = Readings(locked(self.readings.times), {s: locked(self.readings.data[s]) for s in self.signals})
+            object.__setattr__(self, "readings", own)
+
+    @property
+    def signals(self) -> tuple[str, ...]:
+        """Names of the inputs, then of the outputs."""
+        return self.inputs + self.outputs
+
+    @property
+    def units(self) -> dict[str, str]:
+        """SI unit of every signal; "" where none was given. A copy."""
+        return dict(self._units)
+
+    @property
+    def intersample(self) -> dict[str, Intersample]:
+        """Behaviour of every input between rows, "zoh" or "foh". A copy."""
+        return dict(self._intersample)
+
+    @property
+    def length(self) -> int:
+        """Number of rows N."""
+        return int(self._data[self.outputs[0]].size)
+
+    @property
+    def duration(self) -> float:
+        """Time from the first row to the last, (N − 1)·step [s]."""
+        return (self.length - 1) * self.step
+
+    @property
+    def time(self) -> Floats:
+        """Time of every row [s], from 0, shape (N,), read-only."""
+        return locked(grid_of(self.length, self.step))
+
+    @property
+    def warnings(self) -> tuple[str, ...]:
+        """What was done to the data and what is odd about them, in words."""
+        there = {name: read(self._data[name]) for name in self.outputs}
+        constant = tuple(
+            f"output {name!r} is constant ({float(values[0])!r} in all {values.size} rows): nothing can be identified "
+            "from it"
+            for name, values in there.items()
+            if values.size and is_constant(values)
+        )
+        return self.facts + constant
+
+    @property
+    def missing(self) -> dict[str, NDArray[np.bool_]]:
+        """Outputs that were not read throughout, with the rows of the run (or of its `readings`) that hold no value."""
+        data = self._data if self.readings is None else self.readings.data
+        gone = {name: unread(data[name]) for name in self.outputs}
+        return {name: rows for name, rows in gone.items() if rows.any()}
+
+    def bridged(self) -> Measured:
+        """The same with straight lines over what was not read, for a first look; nothing is fitted to these."""
+        if not any(unread(self._data[name]).any() for name in self.outputs):
+            return self
+        told = {f.name: getattr(self, f.name) for f in fields(Measured)}
+        return Measured(**{**told, "_data": {name: bridged(values) for name, values in self._data.items()}})
+
+    @property
+    def about(self) -> dict[str, Any]:
+        """How the run was made, for JSON: a rig says its name, seed, input, parameters and faults. A copy."""
+        return copy.deepcopy(self._about)
+
+    def __getitem__(self, name: str) -> Floats:
+        """Return a signal in SI units, shape (N,), read-only; `DataError` for an unknown name."""
+        try:
+            return self._data[name]
+        except (KeyError, TypeError):
+            raise self._unknown(name) from None
+
+    def __contains__(self, name: object) -> bool:
+        return name in self.signals
+
+    def _unknown(self, name: object) -> DataError:
+        return DataError(
+            f"signal {name!r} is not in run {self.name!r}{nearest(name, self.signals)}; "
+            f"its signals are {listed(self.signals)}"
+        )
 
 
 class Run(Measured):
@@ -67,11 +191,20 @@ class Run(Measured):
 
     @classmethod
     def from_arrays(
-        cls, *, step: float | None = None, time: object = None, inputs: Mapping[str, object] | None,
-        outputs: Mapping[str, object], units: Mapping[str, str] | None = None,
-        intersample: Mapping[str, str] | None = None, name: str = "run", resample: float | None = None,
-        slice: Sequence[float | None] | None = None, time_unit: str = "s", missing: str = "refuse",
-    ) -> Run:  # fmt: skip
+        cls,
+        *,
+        step: float | None = None,
+        time: object = None,
+        inputs: Mapping[str, object] | None,
+        outputs: Mapping[str, object],
+        units: Mapping[str, str] | None = None,
+        intersample: Mapping[str, str] | None = None,
+        name: str = "run",
+        resample: float | None = None,
+        slice: Sequence[float | None] | None = None,
+        time_unit: str = "s",
+        missing: str = "refuse",
+    ) -> Run:
         """Make a run from one-dimensional arrays.
 
         Parameters
@@ -120,20 +253,37 @@ class Run(Measured):
             repeated, decreasing, jittered or has a gap; if `step` is not positive.
         """
         asked = Asked(
-            as_mapping("inputs", {} if inputs is None else inputs), as_mapping("outputs", outputs), step=step,
-            time=time, units=units, intersample=intersample, name=name, resample=resample, window=slice,
-            time_unit=time_unit, missing=missing,
-        )  # fmt: skip
+            as_mapping("inputs", {} if inputs is None else inputs),
+            as_mapping("outputs", outputs),
+            step=step,
+            time=time,
+            units=units,
+            intersample=intersample,
+            name=name,
+            resample=resample,
+            window=slice,
+            time_unit=time_unit,
+            missing=missing,
+        )
         return built(asked)
 
     @classmethod
     def from_frame(
-        cls, frame: object, *, time: Hashable | None = None, step: float | None = None,
+        cls,
+        frame: object,
+        *,
+        time: Hashable | None = None,
+        step: float | None = None,
         inputs: Mapping[str, Hashable] | Sequence[str] | str | None,
-        outputs: Mapping[str, Hashable] | Sequence[str] | str, units: Mapping[str, str] | None = None,
-        intersample: Mapping[str, str] | None = None, name: str = "run", resample: float | None = None,
-        slice: Sequence[float | None] | None = None, time_unit: str | None = None, missing: str = "refuse",
-    ) -> Run:  # fmt: skip
+        outputs: Mapping[str, Hashable] | Sequence[str] | str,
+        units: Mapping[str, str] | None = None,
+        intersample: Mapping[str, str] | None = None,
+        name: str = "run",
+        resample: float | None = None,
+        slice: Sequence[float | None] | None = None,
+        time_unit: str | None = None,
+        missing: str = "refuse",
+    ) -> Run:
         """Make a run from a pandas or polars frame, an xarray dataset, a dict of arrays or a structured array.
 
         Parameters
@@ -162,10 +312,22 @@ class Run(Measured):
         DataError
             If a column is unknown or there more than once, and for everything `Run.from_arrays` refuses.
         """
+        from ftlm.data.export import asked_of_frame
+
         asked = asked_of_frame(
-            frame, time=time, step=step, inputs=inputs, outputs=outputs, units=units, intersample=intersample,
-            name=name, resample=resample, window=slice, time_unit=time_unit, missing=missing,
-        )  # fmt: skip
+            frame,
+            time=time,
+            step=step,
+            inputs=inputs,
+            outputs=outputs,
+            units=units,
+            intersample=intersample,
+            name=name,
+            resample=resample,
+            window=slice,
+            time_unit=time_unit,
+            missing=missing,
+        )
         return built(asked)
 
     def __repr__(self) -> str:
@@ -473,6 +635,8 @@ class Run(Measured):
         DataError
             A name that is no signal of the run.
         """
+        from ftlm.plot.comparison_charts import picture
+
         return picture(self, *signals)
 
     def advice(self, structure: Structure | None = None) -> Advice:
@@ -492,6 +656,8 @@ class Run(Measured):
         Advice
             Prints as sentences; empty where nothing stands out.
         """
+        from ftlm.validation.data_advice import advise
+
         return advise(self, structure)
 
     def to_csv(self, path: str | os.PathLike[str], *, force: bool = False) -> None:
@@ -514,6 +680,8 @@ class Run(Measured):
         DataError
             If the file exists and `force` is not set, or it cannot be written.
         """
+        from ftlm.data.export import write_csv
+
         write_csv(self, path, force=force)
 
     def to_parquet(self, path: str | os.PathLike[str], *, force: bool = False) -> None:
@@ -533,6 +701,8 @@ class Run(Measured):
         DataError
             If pyarrow is not installed, the file exists and `force` is not set, or it cannot be written.
         """
+        from ftlm.data.export import write_parquet
+
         write_parquet(self, path, force=force)
 
     def to_frame(self) -> Any:
@@ -550,6 +720,8 @@ class Run(Measured):
         ModelError
             If pandas is not installed.
         """
+        from ftlm.data.export import frame_of
+
         return frame_of(self)
 
     def to_xarray(self) -> Any:
@@ -564,6 +736,8 @@ class Run(Measured):
         ModelError
             If xarray is not installed.
         """
+        from ftlm.data.export import dataset_of
+
         return dataset_of(self)
 
     def _fields(self) -> dict[str, Any]:
@@ -593,3 +767,79 @@ def run_of(record: Measured) -> Run:
     run = object.__new__(Run)
     Measured.__init__(run, **{f.name: getattr(record, f.name) for f in fields(Measured)})
     return run
+
+
+#: Results that are kept with runs: those of the equations one by one and of the whole.
+MOST_KEPT = 8
+
+
+def check_compatible(runs: Iterable[Run]) -> None:
+    """Refuse runs whose inputs, outputs or units differ; steps, lengths, holds and the order of signals may."""
+    every = list(runs)
+    if not every:
+        raise DataError("runs: there is none; pass at least one run")
+    first = every[0]
+    for index, run in enumerate(every[1:], start=1):
+        who = f"run {index} ({run.name!r}) and run 0 ({first.name!r})"
+        for role, mine, other in (("inputs", first.inputs, run.inputs), ("outputs", first.outputs, run.outputs)):
+            if set(mine) != set(other):
+                raise DataError(
+                    f"{who} have different {role}: {listed(other)} and {listed(mine)}; "
+                    "use rename() and select() so that the names agree"
+                )
+        units, first_units = run.units, first.units
+        differing = [name for name in first.signals if units[name] != first_units[name]]
+        if differing:
+            name = differing[0]
+            raise DataError(
+                f"{who} have different units: signal {name!r} is in {units[name]!r} and {first_units[name]!r}, "
+                f"{len(differing)} in all; give the same units= when loading"
+            )
+
+
+class Runs(tuple[Run, ...]):
+    """Runs that fit together, checked once; see :func:`as_runs`.
+
+    What is computed from them time and again stays with them, read-only, and goes when they go.
+    """
+
+    _kept: dict[str, tuple[Any, ...]]
+
+    def __new__(cls, runs: Run | Iterable[Run]) -> Runs:
+        """Check them."""
+        try:
+            every = [runs] if isinstance(runs, Run) else list(runs)
+        except TypeError:
+            raise DataError(f"runs is {type(runs).__name__}; give a Run or a list of them") from None
+        if not every:
+            raise DataError("no run is given; give at least one")
+        for i, run in enumerate(every):
+            if not isinstance(run, Run):
+                raise DataError(f"runs[{i}] is {type(run).__name__}, not a Run; use ftlm.load or Run.from_arrays")
+        check_compatible(every)
+        checked = super().__new__(cls, every)
+        checked._kept = {}
+        return checked
+
+    def __reduce__(self) -> tuple[object, ...]:
+        return Runs, (tuple(self),)
+
+    def keep(self, key: str, make: Callable[[], Iterable[Any]]) -> tuple[Any, ...]:
+        """Return what was made under this key, or make it; the oldest goes where there are too many."""
+        made = self._kept.get(key)
+        if made is None:
+            made = self._kept[key] = tuple(make())
+            for old in list(self._kept)[:-MOST_KEPT]:
+                self._kept.pop(old, None)
+        return made
+
+
+def as_runs(runs: Run | Iterable[Run]) -> Runs:
+    """One run or several that fit together; what is checked passes untouched.
+
+    Raises
+    ------
+    DataError
+        No run, something that is no run, or runs whose names or units differ.
+    """
+    return runs if isinstance(runs, Runs) else Runs(runs)

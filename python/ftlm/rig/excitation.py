@@ -10,11 +10,10 @@ from typing import Any
 
 import numpy as np
 
-from ftlm.base.arrays import Floats
-from ftlm.base.checks import real_number, shown
-from ftlm.base.errors import DataError, ModelError
-from ftlm.files.load import column_names, load
+from ftlm.errors import DataError, ModelError
+from ftlm.io.load import column_names, load
 from ftlm.rig.rig import CURRENT_LIMIT, LONGEST
+from ftlm.utils.validation import Floats, real_number, shown
 
 SHAPES = ("square", "sine", "chirp", "multisine", "prbs", "doublet", "csv")
 INPUTS = ("I1", "I2")

@@ -17,10 +17,9 @@ from typing import Any
 import numpy as np
 
 from ftlm import _core
-from ftlm.base.arrays import Floats
-from ftlm.base.errors import RigFault
-from ftlm.rig.fault import EXPIRED, check_rate, check_watchdog, unset
-from ftlm.rig.rig import COLUMNS
+from ftlm.errors import RigFault
+from ftlm.rig.rig import COLUMNS, EXPIRED, check_rate, check_watchdog, unset
+from ftlm.utils.validation import Floats
 
 #: Up to here the board's normal update rate does [Hz]; above, the fast one.
 RATE_NORMAL = 1000.0
@@ -112,9 +111,12 @@ class QuanserBoard:
     hardware = True
 
     def __init__(
-        self, card: str = "0", *, clock: Callable[[], float] = time.perf_counter,
+        self,
+        card: str = "0",
+        *,
+        clock: Callable[[], float] = time.perf_counter,
         sleep: Callable[[float], None] = time.sleep,
-    ) -> None:  # fmt: skip
+    ) -> None:
         self.card = card
         self.clock = clock
         self._sleep = sleep
@@ -179,9 +181,16 @@ class QuanserBoard:
             hil.set_encoder_quadrature_mode(ENCODERS, len(ENCODERS), modes)
             hil.set_encoder_counts(ENCODERS, len(ENCODERS), np.zeros(len(ENCODERS), dtype=np.int32))
             self._task = hil.task_create_reader(
-                max(2, round(rate / 10.0)), ANALOG_IN, len(ANALOG_IN), ENCODERS, len(ENCODERS), SWITCHES, len(SWITCHES),
-                None, 0,
-            )  # fmt: skip
+                max(2, round(rate / 10.0)),
+                ANALOG_IN,
+                len(ANALOG_IN),
+                ENCODERS,
+                len(ENCODERS),
+                SWITCHES,
+                len(SWITCHES),
+                None,
+                0,
+            )
             hil.task_set_buffer_overflow_mode(self._task, OVERFLOW_IS_AN_ERROR)
 
     def set_expiration(self) -> None:

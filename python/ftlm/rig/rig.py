@@ -1,19 +1,95 @@
-"""One interface for both rigs: the arm's channels and limits, the order of a start, and the way out of every run."""
+"""Signals that end a program, while motors may run: they end the run, and never the way out of it."""
 
 from __future__ import annotations
 
 import contextlib
 import math
+import signal
+import threading
 import weakref
 from collections.abc import Callable
 from dataclasses import dataclass
+from types import CodeType, FrameType
 from typing import Any, Literal, NoReturn, Protocol
 
 from ftlm import _core
-from ftlm.base.arrays import Floats
-from ftlm.base.checks import real_number, words_of
-from ftlm.base.errors import FtlmError, ModelError, RigFault
-from ftlm.rig.signals import Signals
+from ftlm.errors import FtlmError, ModelError, RigFault
+from ftlm.utils.validation import Floats, real_number, words_of
+
+#: A closed terminal ends a program too.
+_ENDING = ("SIGINT", "SIGTERM", "SIGHUP", "SIGBREAK")
+
+
+class Signals:
+    """Handlers of the signals that end a program, between a start and a way out.
+
+    They are those of the main thread; elsewhere Python hands over no signal, and nothing is installed. The object
+    refers to no rig, so that the table of handlers does not keep one alive.
+
+    Parameters
+    ----------
+    deaf
+        Code that no signal may cut short: one that comes while it is at work waits.
+    """
+
+    def __init__(self, deaf: frozenset[CodeType]) -> None:
+        self._deaf = deaf
+        self._before: dict[int, Any] = {}
+        self._waiting: int | None = None
+
+    def install(self) -> None:
+        """Takes the place of the handlers that there are; a Ctrl-C that the program ignores stays ignored."""
+        if threading.current_thread() is not threading.main_thread():
+            return
+        for name in _ENDING:
+            number = getattr(signal, name, None)
+            if number is None or (name == "SIGINT" and signal.getsignal(number) in (signal.SIG_IGN, None)):
+                continue
+            # Noted before it is replaced: a signal between the two finds nothing that is not put back.
+            self._before[number] = signal.getsignal(number)
+            signal.signal(number, self._came)
+
+    def restore(self) -> None:
+        """Puts the handlers of before back, all of them: a signal that comes meanwhile waits, where the system can."""
+        if not self._before or threading.current_thread() is not threading.main_thread():
+            return
+        mask = getattr(signal, "pthread_sigmask", None)
+        kept = None if mask is None else mask(signal.SIG_BLOCK, self._before)
+        try:
+            for number, handler in self._before.items():
+                signal.signal(number, handler)
+            self._before = {}
+        finally:
+            if mask is not None:
+                mask(signal.SIG_SETMASK, kept)
+
+    def deliver(self) -> None:
+        """Raises what a signal that waited would have raised."""
+        number, self._waiting = self._waiting, None
+        if number == signal.SIGINT:
+            signal.raise_signal(number)
+        elif number is not None:
+            _end(number)
+
+    def _came(self, number: int, frame: FrameType | None) -> None:
+        at = frame
+        while at is not None:
+            if at.f_code in self._deaf:
+                self._waiting = number
+                return
+            at = at.f_back
+        before = self._before.get(number)
+        if number == signal.SIGINT and callable(before):
+            before(number, frame)
+            return
+        _end(number)
+
+
+def _end(number: int) -> None:
+    if number == signal.SIGINT:
+        raise KeyboardInterrupt
+    raise SystemExit(128 + number)
+
 
 #: Deflection per volt of strain gauge [rad/V]; the sign is reversed.
 STRAIN_SCALE = (0.013636, 0.018694)
@@ -86,13 +162,25 @@ class Limits:
         """The guard that enforces them at a sampling step [s]."""
         return _core.Guard(
             {
-                "step": step, "strain_scale": STRAIN_SCALE, "sense_scale": SENSE_SCALE, "command_scale": COMMAND_SCALE,
-                "encoder_scale": ENCODER_SCALE, "current_limit": self.current, "slew": self.slew,
-                "continuous": self.continuous, "thermal_time": self.thermal_time, "deflection_limit": self.deflection,
-                "saturation": self.saturation, "moving_current": self.moving_current, "standstill": self.standstill,
-                "fastest": self.fastest, "late_limit": self.late, "missed_limit": self.missed, "filter": sensor_filter,
+                "step": step,
+                "strain_scale": STRAIN_SCALE,
+                "sense_scale": SENSE_SCALE,
+                "command_scale": COMMAND_SCALE,
+                "encoder_scale": ENCODER_SCALE,
+                "current_limit": self.current,
+                "slew": self.slew,
+                "continuous": self.continuous,
+                "thermal_time": self.thermal_time,
+                "deflection_limit": self.deflection,
+                "saturation": self.saturation,
+                "moving_current": self.moving_current,
+                "standstill": self.standstill,
+                "fastest": self.fastest,
+                "late_limit": self.late,
+                "missed_limit": self.missed,
+                "filter": sensor_filter,
             }
-        )  # fmt: skip
+        )
 
 
 class Board(Protocol):
@@ -223,9 +311,15 @@ class Rig:
     """
 
     def __init__(
-        self, board: Board, *, rate: float = 500.0, watchdog: float = 0.1, limit: float = 30.0,
-        limits: Limits | None = None, sensor_filter: tuple[float, float] | None = None,
-    ) -> None:  # fmt: skip
+        self,
+        board: Board,
+        *,
+        rate: float = 500.0,
+        watchdog: float = 0.1,
+        limit: float = 30.0,
+        limits: Limits | None = None,
+        sensor_filter: tuple[float, float] | None = None,
+    ) -> None:
         low, high = WATCHDOG_RANGE
         watchdog = real_number("watchdog", watchdog)
         if not low <= watchdog <= high:
@@ -332,3 +426,33 @@ class Rig:
 
 #: Nothing cuts these short: a signal that comes while one of them is at work waits for its end.
 WAY_OUT = frozenset(f.__code__ for f in (Rig.__exit__, Rig._leave, _way_out, shut_down))
+
+
+#: The board's clock [Hz]: lowest, and highest in fast update.
+RATES = (1.0, 8000.0)
+EXPIRED = "the watchdog expired: the program did not answer in time, and the board put 0 V out"
+
+
+def check_rate(rate: float) -> None:
+    """Refuse samples a second that the board's clock cannot do."""
+    low, high = RATES
+    if not low <= rate <= high:
+        raise ModelError(f"rate = {rate!r} Hz cannot be done by this board; use {low:g} to {high:g} Hz")
+
+
+def check_watchdog(rate: float, seconds: float) -> None:
+    """Refuse a watchdog that would expire between one sample and the next, each of which reloads it."""
+    if seconds * rate < 2.0:
+        raise ModelError(
+            f"watchdog = {seconds:g} s is shorter than two samples at {rate:g} Hz and would expire between them; use "
+            f"at least {2.0 / rate:g} s, or a higher rate"
+        )
+
+
+def unset(*, analog: bool, digital: bool) -> str | None:
+    """What keeps the watchdog from stopping the motors, given which of its expiration states are set."""
+    if not analog:
+        return "the watchdog's expiration state of the analog outputs is not 0 V"
+    if not digital:
+        return "the watchdog's expiration state of the digital lines is not tristate, so analog outputs would stay"
+    return None

@@ -1,0 +1,275 @@
+"""Models as text for other tools: python-control, MATLAB with FOMCON, JSON."""
+
+from __future__ import annotations
+
+import json
+import re
+from collections.abc import Sequence
+from typing import Any, Literal
+
+import numpy as np
+
+from ftlm._core import __version__
+from ftlm.analysis.frequency_response import check_unlimited, transfer_functions
+from ftlm.analysis.rational_approximation import approximate, identifier
+from ftlm.errors import ModelError
+from ftlm.model.model import Solved
+from ftlm.structure.equation import numeric
+from ftlm.structure.order import MAX_ORDER
+from ftlm.structure.parser import equation
+from ftlm.structure.structure import Structure
+from ftlm.utils.validation import Floats
+
+
+def _comment(text: str, mark: str) -> str:
+    """Text as comment lines: nothing in a name can begin a line of code."""
+    lines = re.split(r"[\r\n\u2028\u2029\x0b\x0c\x85]+", text)
+    return "\n".join(f"{mark} {''.join(c if c.isprintable() else '?' for c in line)}" for line in lines)
+
+
+def json_text(model: Solved) -> str:
+    """The transfer functions of a model as JSON, exact in powers and coefficients.
+
+    Parameters
+    ----------
+    model
+        A linear model.
+
+    Raises
+    ------
+    ModelError
+        An input that saturates or has a dead zone, or friction: there is no transfer function.
+    """
+    check_unlimited(model, "a transfer function")
+    transfer = transfer_functions(model)
+    document = {
+        "format": "ftlm-transfer-functions",
+        "written_by": f"ftlm {__version__}",
+        "name": model.structure.name,
+        "outputs": list(transfer.outputs),
+        "inputs": list(transfer.inputs),
+        "units": dict(model.units),
+        "delay_s": transfer.delay,
+        "meaning": "output = sum over inputs of (sum of c s^p) / (sum of c s^p) exp(-s delay); pairs are [c, p]",
+        "denominator": {o: [list(pair) for pair in pairs] for o, pairs in transfer.denominator.items()},
+        "numerator": {
+            o: {u: [list(pair) for pair in transfer.numerators[o, u]] for u in transfer.inputs}
+            for o in transfer.outputs
+        },
+        "equations": [str(e) for e in model.equations],
+    }
+    return json.dumps(document, indent=1, ensure_ascii=False, allow_nan=False) + "\n"
+
+
+def matlab_text(model: Solved) -> str:
+    """A MATLAB script: the transfer functions as vectors, and as FOMCON's ``fotf`` objects where FOMCON is there.
+
+    Parameters
+    ----------
+    model
+        A linear model.
+
+    Raises
+    ------
+    ModelError
+        As :func:`json_text`.
+    """
+    check_unlimited(model, "a transfer function")
+    transfer = transfer_functions(model)
+
+    def vector(values: Sequence[float]) -> str:
+        return "[" + " ".join(f"{v:.17g}" for v in values) + "]"
+
+    lines = [
+        _comment(f"{model.structure.name}, written by ftlm {__version__}", "%"),
+        *(_comment(numeric(e, model.structure.acting(".6g")), "%") for e in model.equations),
+        "% G_y_u = (b(1)*s^nb(1) + ...)/(a(1)*s^na(1) + ...)*exp(-s*delay); SI units.",
+        "% FOMCON (https://fomcon.net) makes fotf objects of them; without it the vectors remain.",
+    ]
+    used: set[str] = set()
+    for output in transfer.outputs:
+        for signal in transfer.inputs:
+            top = transfer.numerators[output, signal]
+            if not top:
+                continue
+            name = f"G_{identifier(output)}_{identifier(signal)}"
+            while name in used:
+                name += "_"
+            used.add(name)
+            bottom = transfer.denominator[output]
+            lines += [
+                "",
+                _comment(f"{output} from {signal}", "%"),
+                f"{name}.b = {vector([c for c, _ in top])};",
+                f"{name}.nb = {vector([p for _, p in top])};",
+                f"{name}.a = {vector([c for c, _ in bottom])};",
+                f"{name}.na = {vector([p for _, p in bottom])};",
+                f"{name}.delay = {transfer.delay[signal]:.17g};",
+                "if exist('fotf', 'file')",
+                f"  {name} = fotf({name}.a, {name}.na, {name}.b, {name}.nb, {name}.delay);",
+                "end",
+            ]
+    return "\n".join(lines) + "\n"
+
+
+def control_text(model: Solved, *, band: tuple[float, float], order: int = 5) -> str:
+    """A Python script that makes the python-control system, without ftlm.
+
+    Parameters
+    ----------
+    model
+        A linear model.
+    band
+        Frequencies (low, high) within which it is to hold [rad/s].
+    order
+        Of Oustaloup's filter, 1 to 50.
+
+    Raises
+    ------
+    ModelError
+        As :func:`to_control`, which it does not need installed.
+    """
+    near = approximate(model, band=band, order=order)
+
+    def matrix(values: Floats) -> str:
+        rows = ",\n    ".join(repr([float(v) for v in row]) for row in values)
+        return f"np.array([\n    {rows},\n])" if values.size else f"np.zeros({values.shape})"
+
+    lines = [
+        _comment(f"{model.structure.name}, written by ftlm {__version__}", "#"),
+        *(_comment(numeric(e, model.structure.acting(".6g")), "#") for e in model.equations),
+        *(_comment(line, "#") for line in str(near).splitlines()),
+        "import control",
+        "import numpy as np",
+        "",
+        f"A = {matrix(near.a)}",
+        f"B = {matrix(near.b)}",
+        f"C = {matrix(near.c)}",
+        f"D = {matrix(near.d)}",
+        f"system = control.ss(A, B, C, D, inputs={list(near.inputs)!r}, outputs={list(near.outputs)!r}, "
+        f"name={identifier(model.structure.name)!r})",
+    ]
+    return "\n".join(lines) + "\n"
+
+
+def export_text(
+    model: Solved, to: Literal["control", "matlab", "json"], *, band: tuple[float, float] | None = None, order: int = 5
+) -> str:
+    """A model as text for another tool; refuses another one, and no band where one is needed."""
+    if to == "json":
+        return json_text(model)
+    if to == "matlab":
+        return matlab_text(model)
+    if to != "control":
+        raise ModelError(f"to = {to!r} is not known; use 'control', 'matlab' or 'json'")
+    if band is None:
+        raise ModelError("python-control has no fractional orders: give the band of frequencies, as in --band 0.1:100")
+    return control_text(model, band=band, order=order)
+
+
+#: Share of the largest number that went into it below which a Markov parameter is rounding.
+ROUNDING = 1e-12
+_LABEL = re.compile(r"([A-Za-z]+)\[(\d+)\]")
+
+
+def structure_of(system: Any, inputs: Sequence[str] | None = None, outputs: Sequence[str] | None = None) -> Structure:
+    """Return the equations of a python-control system; see :meth:`ftlm.Model.from_control`."""
+    if getattr(system, "dt", None) not in (0, None):
+        raise ModelError(
+            f"the system is sampled (dt = {system.dt}); an equation is of continuous time: design it there"
+        )
+    if hasattr(system, "A"):
+        parts = _of_states(*(np.asarray(getattr(system, n), dtype=float) for n in "ABCD"))
+    elif hasattr(system, "num") and hasattr(system, "den"):
+        parts = _of_fractions(system.num, system.den)
+    else:
+        raise ModelError(
+            f"{type(system).__name__} is no system of python-control with equations; for a measured response use "
+            "ftlm.FrequencyData.from_arrays"
+        )
+    signals = _names("inputs", inputs, getattr(system, "input_labels", None), len(parts[0][1]))
+    results = _names("outputs", outputs, getattr(system, "output_labels", None), len(parts))
+    twice = sorted(set(signals) & set(results))
+    if twice:
+        raise ModelError(f"{', '.join(twice)}: input and output at once; pass inputs= and outputs= with other names")
+    rows = zip(results, parts, strict=True)
+    return equation("\n".join(_written(name, signals, *part) for name, part in rows), coupling="measured")
+
+
+def _written(output: str, inputs: Sequence[str], bottom: Floats, tops: Sequence[Floats]) -> str:
+    """An equation in words: D^n y = … from a denominator and a numerator an input, highest powers first."""
+    order = bottom.size - 1
+    if not 0 < order <= MAX_ORDER:
+        raise ModelError(f"{output} is of order {order}; an equation has an order from 1 to {MAX_ORDER:g}")
+    terms = [(-c, output, order - k) for k, c in enumerate(bottom) if k > 0]
+    for name, top in zip(inputs, tops, strict=True):
+        if top.size > bottom.size:
+            raise ModelError(f"{output} from {name} has more zeros than poles; add a pole far out")
+        terms += [(c, name, top.size - 1 - k) for k, c in enumerate(top)]
+    words = [f"{float(c)!r} D^{k} {name}" for c, name, k in terms if c]
+    if not any(name != output for c, name, _ in terms if c):
+        raise ModelError(f"no input moves {output}; leave it out")
+    return f"D^{order} {output} = " + " + ".join(words).replace("+ -", "- ")
+
+
+def _of_fractions(tops: Any, bottoms: Any) -> list[tuple[Floats, list[Floats]]]:
+    """A common monic denominator of each output, and the numerators over it."""
+    found = []
+    for top, bottom in zip(tops, bottoms, strict=True):
+        own = [np.trim_zeros(np.atleast_1d(np.asarray(d, dtype=float)), "f") for d in bottom]
+        distinct: list[Floats] = []
+        for d in (d / d[0] for d in own):
+            if not any(d.size == known.size and np.array_equal(d, known) for known in distinct):
+                distinct.append(d)
+        common = _product(distinct)
+        over = []
+        for n, d in zip(top, own, strict=True):
+            rest = [known for known in distinct if not np.array_equal(known, d / d[0])]
+            values = np.trim_zeros(np.atleast_1d(np.asarray(n, dtype=float)), "f") / d[0]
+            over.append(_product([values, *rest]) if values.size else np.zeros(1))
+        found.append((common, over))
+    return found
+
+
+def _product(factors: Sequence[Floats]) -> Floats:
+    out: Floats = np.ones(1)
+    for factor in factors:
+        out = np.convolve(out, factor)
+    return out
+
+
+def _of_states(a: Floats, b: Floats, c: Floats, d: Floats) -> list[tuple[Floats, list[Floats]]]:
+    """By Leverrier's recursion: C adj(sI - A) B + D det(sI - A), what rounding left above the first answer dropped."""
+    count = a.shape[0]
+    bottom, powers = [1.0], [np.eye(count)]
+    for k in range(1, count + 1):
+        moved = a @ powers[-1]
+        bottom.append(-float(np.trace(moved)) / k)
+        powers.append(moved + bottom[-1] * np.eye(count))
+    scale = max(float(np.linalg.norm(a, 2)) if count else 0.0, 1e-300)
+    found = []
+    for i, row in enumerate(c):
+        tops = []
+        for j in range(b.shape[1]):
+            top = d[i, j] * np.array(bottom)
+            top[1:] += [float(row @ p @ b[:, j]) for p in powers[:count]]
+            if d[i, j] == 0.0:
+                size = float(np.linalg.norm(row) * np.linalg.norm(b[:, j]))
+                answers = [abs(float(row @ np.linalg.matrix_power(a, k) @ b[:, j])) for k in range(count)]
+                seen = [k for k, v in enumerate(answers) if v > ROUNDING * size * scale**k]
+                top[: 1 + (seen[0] if seen else count)] = 0.0
+            tops.append(top)
+        found.append((np.array(bottom), tops))
+    return found
+
+
+def _names(what: str, given: Sequence[str] | None, labels: Sequence[str] | None, count: int) -> list[str]:
+    """Names of signals: as given, or the system's own, u[0] as u0, or as u where it is the only one."""
+    if given is not None:
+        names = [given] if isinstance(given, str) else list(given)
+        if len(names) != count:
+            raise ModelError(f"{what}: {len(names)} given, the system has {count}")
+        return names
+    names = list(labels) if labels else [f"{what[0]}[{k}]" for k in range(count)]
+    plain = [_LABEL.fullmatch(n) for n in names]
+    return [n if m is None else m[1] + (m[2] if count > 1 else "") for n, m in zip(names, plain, strict=True)]

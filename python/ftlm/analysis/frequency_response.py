@@ -1,0 +1,380 @@
+"""A model in the frequency domain: transfer functions, exact response, its uncertainty, steps."""
+
+from __future__ import annotations
+
+import copy
+import itertools
+from collections.abc import Sequence
+from dataclasses import dataclass, replace
+from typing import Any, TypeAlias
+
+import numpy as np
+from numpy.typing import ArrayLike, NDArray
+
+from ftlm.data.run import Run
+from ftlm.errors import DataError, ModelError
+from ftlm.model.model import Solved
+from ftlm.simulation.discretization import check_linear
+from ftlm.simulation.simulate import simulate
+from ftlm.structure.equation import Equation, Term
+from ftlm.structure.input_nonlinearity import WORDS
+from ftlm.structure.order import Order
+from ftlm.utils.validation import Complex, Floats, check_choice
+
+#: A sum of coefficient * s^power, by power.
+Polynomial: TypeAlias = dict[float, float]
+#: Powers closer than this are one power.
+GRAIN = 1e-9
+#: A coefficient that cancels to this share of what was added is rounding.
+CANCELLED = 1e-13
+#: Relative step of the numerical derivatives of the delta method.
+DELTA = 1e-6
+
+
+def check_unlimited(model: Solved, what: str) -> None:
+    """Refuse saturations and dead zones where only what is linear is known."""
+    for limit in model.structure.limits:
+        raise ModelError(
+            f"{limit.signal} passes a {WORDS[limit.law]} before it acts, which {what} does not know; use free runs "
+            "(simulate, compare), or a model of the equation without it"
+        )
+
+
+def response_inputs(model: Solved, *, coupled: bool) -> tuple[str, ...]:
+    """Signals that drive the response: all that are not modelled; where each equation is alone, modelled ones, too."""
+    if coupled:
+        return tuple(s for s in model.structure.signals if s not in model.outputs)
+    read = [t.signal for e in model.equations for t in e.terms if t.signal != e.output]
+    return tuple(dict.fromkeys(s for s in model.structure.signals if s in read))
+
+
+def _add(into: Polynomial, other: Polynomial, factor: float = 1.0) -> None:
+    for power, value in other.items():
+        at = next((p for p in into if abs(p - power) < GRAIN), power)
+        into[at] = into.get(at, 0.0) + factor * value
+
+
+def _times(a: Polynomial, b: Polynomial) -> Polynomial:
+    out: Polynomial = {}
+    for (p, x), (q, y) in itertools.product(a.items(), b.items()):
+        _add(out, {round(p + q, 9): x * y})
+    return out
+
+
+def row_of(item: Equation, names: Sequence[str]) -> tuple[list[Polynomial], dict[str, Polynomial]]:
+    """D^alpha y - own and coupled terms, by output; every other signal's terms."""
+    check_linear([item], "a frequency response")
+    left: list[Polynomial] = [{} for _ in names]
+    right: dict[str, Polynomial] = {}
+    left[names.index(item.output)][item.order.constant] = 1.0
+    for term in item.terms:
+        value = {term.order.constant: float(term.fixed or 0.0)}
+        if term.signal in names:
+            _add(left[names.index(term.signal)], value, -1.0)
+        else:
+            _add(right.setdefault(term.signal, {}), value)
+    return left, right
+
+
+def determinant(matrix: list[list[Polynomial]]) -> Polynomial:
+    """Sum over permutations: exact in the powers, and there are never more than a few outputs."""
+    n = len(matrix)
+    out: Polynomial = {}
+    size: Polynomial = {}
+    for order in itertools.permutations(range(n)):
+        sign = 1.0
+        for i, j in itertools.combinations(range(n), 2):
+            sign = -sign if order[i] > order[j] else sign
+        product: Polynomial = {0.0: 1.0}
+        for i, j in enumerate(order):
+            product = _times(product, matrix[i][j])
+        _add(out, product, sign)
+        _add(size, {p: abs(v) for p, v in product.items()})
+    return {p: v for p, v in sorted(out.items()) if abs(v) > CANCELLED * size[p]}
+
+
+@dataclass(frozen=True)
+class TransferFunctions:
+    """Every input to every output as a quotient of sums of coefficient * s^power, exact in powers and coefficients.
+
+    Parameters
+    ----------
+    outputs, inputs
+        Names.
+    denominator
+        (coefficient, power) pairs, highest power first, of the outputs that hang together: one for each output.
+    numerators
+        The same by output and input; empty where an input does not reach an output.
+    delay
+        Delay of each input [s].
+    """
+
+    outputs: tuple[str, ...]
+    inputs: tuple[str, ...]
+    denominator: dict[str, tuple[tuple[float, float], ...]]
+    numerators: dict[tuple[str, str], tuple[tuple[float, float], ...]]
+    delay: dict[str, float]
+
+
+def systems(model: Solved, *, coupled: bool) -> list[tuple[str, ...]]:
+    """Outputs whose equations are solved together."""
+    return [model.outputs] if coupled else [(o,) for o in model.outputs]
+
+
+def transfer_functions(model: Solved, *, coupling: str = "simulated") -> TransferFunctions:
+    """Transfer functions of a model by Cramer's rule, without the sensor filter.
+
+    Parameters
+    ----------
+    model
+        The model.
+    coupling
+        ``"simulated"``: the equations together, driven by what is not modelled. ``"measured"``: each equation alone,
+        the other outputs among its inputs.
+
+    Returns
+    -------
+    TransferFunctions
+
+    Raises
+    ------
+    ModelError
+        Another coupling, or equations that cannot be solved for their outputs.
+    """
+    coupled = is_coupled(coupling)
+    inputs = response_inputs(model, coupled=coupled)
+    denominator: dict[str, tuple[tuple[float, float], ...]] = {}
+    numerators: dict[tuple[str, str], tuple[tuple[float, float], ...]] = {}
+    for names in systems(model, coupled=coupled):
+        items = [e for e in model.equations if e.output in names]
+        rows = [row_of(e, names) for e in items]
+        matrix = [left for left, _ in rows]
+        bottom = determinant(matrix)
+        if not bottom:
+            raise ModelError(f"the equations of {', '.join(names)} cannot be solved for them: their determinant is 0")
+        for j, output in enumerate(names):
+            denominator[output] = _written(bottom)
+            for signal in inputs:
+                column = [right.get(signal, {}) for _, right in rows]
+                replaced = [[*row[:j], column[i], *row[j + 1 :]] for i, row in enumerate(matrix)]
+                numerators[output, signal] = _written(determinant(replaced))
+    delay = {s: model.structure.delay.get(s, 0.0) for s in inputs}
+    return TransferFunctions(model.outputs, inputs, denominator, numerators, delay)
+
+
+def _written(polynomial: Polynomial) -> tuple[tuple[float, float], ...]:
+    return tuple((v, p) for p, v in sorted(polynomial.items(), reverse=True))
+
+
+def is_coupled(coupling: str) -> bool:
+    """Whether all equations act together; refuses what is no coupling."""
+    check_choice("coupling", coupling, ("simulated", "measured"))
+    return coupling == "simulated"
+
+
+def frequency_response(model: Solved, w: ArrayLike, *, coupling: str = "simulated", sensor: bool = True) -> Complex:
+    """Exact frequency response, orders as they are.
+
+    Parameters
+    ----------
+    model
+        The model.
+    w
+        Angular frequencies [rad/s], shape (W,), finite, >= 0.
+    coupling
+        ``"simulated"``: the equations together, from the signals that are not modelled. ``"measured"``: each equation
+        alone, the other outputs among its inputs (in the order of ``model.structure.signals``).
+    sensor
+        Whether signals are those that are measured: an output passes the sensor filter that it is measured through,
+        and the response to an input that passed it is that much larger.
+
+    Returns
+    -------
+    ndarray of complex, shape (outputs, inputs, W)
+        In SI units of output over input. Infinite where the model has a pole at that frequency. A Coulomb signal
+        counts as an input; what it does to the angle is not linear and not in here.
+
+    Raises
+    ------
+    DataError
+        Frequencies that are not finite numbers from 0.
+    ModelError
+        Another coupling, an input that saturates or has a dead zone.
+    """
+    check_unlimited(model, "a frequency response")
+    coupled = is_coupled(coupling)
+    omega = np.asarray(w, dtype=np.float64)
+    if omega.ndim != 1 or omega.size == 0:
+        raise DataError(f"w has shape {omega.shape}; give a vector of frequencies in rad/s")
+    bad = ~(np.isfinite(omega) & (omega >= 0))
+    if np.any(bad):
+        at = int(np.argmax(bad))
+        raise DataError(
+            f"w is {omega[at]} at index {at} ({int(np.sum(bad))} such values in all); give rad/s, finite, >= 0"
+        )
+    inputs = response_inputs(model, coupled=coupled)
+    out = np.zeros((len(model.outputs), len(inputs), omega.size), dtype=np.complex128)
+    s = 1j * omega
+    for names in systems(model, coupled=coupled):
+        items = [e for e in model.equations if e.output in names]
+        a = np.zeros((omega.size, len(names), len(names)), dtype=np.complex128)
+        b = np.zeros((omega.size, len(names), len(inputs)), dtype=np.complex128)
+        for i, item in enumerate(items):
+            left, right = row_of(item, names)
+            # Divided by s^alpha at high and left as it is at low frequencies, numbers keep their range.
+            scale = np.maximum(omega, 1.0) ** -item.order.constant
+            for j, polynomial in enumerate(left):
+                a[:, i, j] = scale * value_at(polynomial, s)
+            for signal, polynomial in right.items():
+                b[:, i, inputs.index(signal)] = scale * value_at(polynomial, s)
+        singular = np.abs(np.linalg.det(a)) == 0
+        a[singular] = np.eye(len(names))
+        response = np.linalg.solve(a, b)
+        response[singular] = np.where(b[singular] != 0, np.inf, 0)
+        for i, name in enumerate(names):
+            out[model.outputs.index(name)] = response[:, i, :].T
+    for k, name in enumerate(inputs):
+        delay = model.structure.delay.get(name, 0.0)
+        if delay:
+            out[:, k] *= np.exp(-s * delay)
+    filtered = model.structure.sensor_filter
+    if sensor and filtered is not None:
+        gain = value_at({o: c for c, o in filtered.numerator}, s) / value_at({o: c for c, o in filtered.denominator}, s)
+        for i, name in enumerate(model.outputs):
+            out[i] *= gain if name in filtered.signals else 1.0
+        for k, name in enumerate(inputs):
+            if name in filtered.signals:
+                with np.errstate(divide="ignore", invalid="ignore"):
+                    out[:, k] /= gain
+    return out
+
+
+def value_at(polynomial: Polynomial, s: NDArray[Any]) -> Complex:
+    """Value of a sum of powers at complex frequencies."""
+    total = np.zeros(s.shape, dtype=np.complex128)
+    for power, coefficient in polynomial.items():
+        with np.errstate(divide="ignore", invalid="ignore"):
+            total += coefficient * (np.ones_like(s) if power == 0 else s**power)
+    return total
+
+
+def response_deviation(model: Solved, w: ArrayLike, *, coupling: str = "simulated") -> tuple[Floats, Floats]:
+    """Standard deviations of the frequency response from those of the model's numbers, by the delta method.
+
+    Parameters
+    ----------
+    model
+        With the covariance of an output-error fit (``model.estimate``).
+    w, coupling
+        See :func:`frequency_response`.
+
+    Returns
+    -------
+    gain, phase
+        Standard deviation of ln|H| (times 8.686 it is dB) and of arg H [rad], each of shape (outputs, inputs, W).
+
+    Raises
+    ------
+    ModelError
+        A model without covariance.
+    """
+    covariance = None if model.estimate is None else model.estimate.covariance
+    if covariance is None:
+        raise ModelError(
+            "this model has no covariance, so its response has no uncertainty; identify it with method='output-error', "
+            "and without a term whose interval is infinite"
+        )
+    centre = frequency_response(model, w, coupling=coupling)
+    values = model_numbers(model)
+    derivative = np.zeros((values.size, *centre.shape), dtype=np.complex128)
+    for k, value in enumerate(values):
+        step = DELTA * max(abs(value), 1e-3)
+        if not np.any(covariance[k]):
+            continue
+        above, below = values.copy(), values.copy()
+        above[k], below[k] = value + step, value - step
+        higher, lower = (frequency_response(with_numbers(model, v), w, coupling=coupling) for v in (above, below))
+        with np.errstate(divide="ignore", invalid="ignore"):
+            derivative[k] = (higher - lower) / (2 * step) / centre
+    matrix = np.asarray(covariance, dtype=np.float64)
+    variances = [np.einsum("i...,ij,j...->...", part, matrix, part) for part in (derivative.real, derivative.imag)]
+    gain, phase = (np.sqrt(np.maximum(v, 0.0)) for v in variances)
+    return gain, phase
+
+
+def model_numbers(model: Solved) -> Floats:
+    """Every number of a model in one vector: of each equation alpha, then order and coefficient of each term."""
+    numbers: list[float] = []
+    for item in model.equations:
+        numbers += [item.order.constant, *(v for t in item.terms for v in (t.order.constant, float(t.fixed or 0.0)))]
+    return np.array(numbers)
+
+
+def with_numbers(model: Solved, numbers: Floats) -> Solved:
+    """Return the model with other numbers in the order of :func:`model_numbers`."""
+    at = iter(numbers.tolist())
+    equations = []
+    for item in model.equations:
+        alpha = replace(item.order, constant=next(at))
+        # Arguments are taken in this order: an order, then its coefficient.
+        terms = [
+            replace(t, order=replace(t.order, constant=next(at)), coefficient=next(at) / t.factor) for t in item.terms
+        ]
+        equations.append(_unchecked(item, alpha, tuple(terms)))
+    return replace(model, structure=replace(model.structure, equations=tuple(equations)))
+
+
+def _unchecked(item: Equation, order: Order, terms: tuple[Term, ...]) -> Equation:
+    """An equation whose orders may lie a hair outside of what a person may write, as a derivative at an edge needs."""
+    new = copy.copy(item)
+    vars(new).update(order=order, terms=terms)
+    return new
+
+
+def step_response(model: Solved, time: ArrayLike, *, tolerance: float = 1e-6) -> Floats:
+    """Response of every output to a unit step of every input that is not modelled, from rest.
+
+    Parameters
+    ----------
+    model
+        The model; its equations act together.
+    time
+        Regular instants from 0 [s], shape (N,), N >= 3.
+    tolerance
+        Of the free run; see :func:`ftlm.simulate`.
+
+    Returns
+    -------
+    ndarray, shape (outputs, inputs, N)
+        Sensor filter and delays included; the step acts just after time 0.
+
+    Raises
+    ------
+    DataError
+        Instants that are not regular from 0.
+    ModelError
+        An input that saturates or has a dead zone.
+    ConvergenceError
+        A model so unstable that the response leaves the range of numbers.
+    """
+    check_unlimited(model, "a step response")
+    t = np.asarray(time, dtype=np.float64)
+    if t.ndim != 1 or t.size < 3 or not np.all(np.isfinite(t)) or t[0] != 0:
+        raise DataError("time must be a vector of at least three instants [s] that begins with 0, such as numpy.arange")
+    step = float(t[-1]) / (t.size - 1)
+    off = np.abs(t - step * np.arange(t.size)) > 1e-6 * step
+    if step <= 0 or np.any(off):
+        raise DataError(
+            f"time is not regular, first at index {int(np.argmax(off))} ({int(np.sum(off))} in all); use numpy.arange"
+        )
+    inputs = response_inputs(model, coupled=True)
+    together = replace(model, structure=replace(model.structure, coupling="simulated", initial="rest"))
+    out = np.zeros((len(model.outputs), len(inputs), t.size))
+    for k, name in enumerate(inputs):
+        drive = {n: np.full(t.size, float(n == name)) for n in inputs}
+        rest = {n: np.zeros(t.size) for n in model.outputs}
+        run = Run.from_arrays(step=step, inputs=drive, outputs=rest, name=f"unit step of {name}")
+        stepped = simulate(together, run, tolerance=tolerance)
+        for i, output in enumerate(model.outputs):
+            out[i, k] = stepped[output]
+    return out

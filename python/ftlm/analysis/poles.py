@@ -1,0 +1,641 @@
+"""Poles of a model, and whether it is stable."""
+
+from __future__ import annotations
+
+import itertools
+import math
+from collections.abc import Sequence
+from dataclasses import dataclass
+from fractions import Fraction
+
+import numpy as np
+
+from ftlm.analysis.frequency_response import (
+    GRAIN,
+    Polynomial,
+    check_unlimited,
+    determinant,
+    is_coupled,
+    model_numbers,
+    response_inputs,
+    row_of,
+    systems,
+    transfer_functions,
+    with_numbers,
+)
+from ftlm.errors import ModelError
+from ftlm.model.model import Solved, check_solved
+from ftlm.utils.formatting import with_error
+from ftlm.utils.statistics import NORMAL_95
+from ftlm.utils.validation import Complex, Floats
+
+#: Largest degree of the polynomial in s^q whose roots double precision gives.
+LARGEST_DEGREE = 100
+#: Smallest common base of orders that is looked for.
+SMALLEST_BASE = 0.01
+#: Beyond these frequencies the lowest and the highest power decide to within this share.
+DECIDED = 1e-3
+#: Largest turn between two points of the Nyquist curve [rad], and most points.
+LARGEST_TURN = 0.2
+MOST_POINTS = 200_000
+#: Logarithm of the frequency that stands for those beyond the range of numbers.
+FARTHEST_LOG = 600.0
+#: A Nyquist curve that comes this close to 0, in units of its own terms, has a pole on the axis as far as one can tell.
+ON_AXIS = 1e-9
+
+
+@dataclass(frozen=True)
+class Stability:
+    """Whether bounded inputs give bounded outputs, and why.
+
+    Parameters
+    ----------
+    stable
+        No pole on the right of the imaginary axis or on it, the origin included.
+    unstable_poles
+        Number of poles with a positive real part; NaN where a pole on the axis leaves it open.
+    origin_order
+        Power of s by which an input that never ends is integrated: 0 for none, 1 for an integrator.
+    on_axis
+        Whether a pole lies on the imaginary axis as far as can be told (the origin not counted).
+    method
+        ``"poles"`` (Matignon's criterion) or ``"argument principle"``.
+    base
+        Common base of all orders, or None.
+    """
+
+    stable: bool
+    unstable_poles: float
+    origin_order: float
+    on_axis: bool
+    method: str
+    base: float | None
+
+    def __bool__(self) -> bool:
+        return self.stable
+
+    def __str__(self) -> str:
+        why = []
+        if self.unstable_poles > 0:
+            count = int(self.unstable_poles)
+            why.append(f"{count} pole{'s' if count > 1 else ''} with a positive real part")
+        if self.on_axis:
+            why.append("a pole on the imaginary axis")
+        if self.origin_order > 0:
+            why.append(f"it integrates its input with order {self.origin_order:g}")
+        verdict = "stable" if self.stable else f"not stable: {', '.join(why)}"
+        how = f"poles in s^{self.base:g}" if self.method == "poles" and self.base else self.method
+        return f"{verdict} ({how})"
+
+
+def characteristic(model: Solved, *, coupled: bool) -> list[Polynomial]:
+    """Characteristic sums of c s^p, one for each set of equations that act together."""
+    return [
+        determinant([row_of(e, names)[0] for e in model.equations if e.output in names])
+        for names in systems(model, coupled=coupled)
+    ]
+
+
+def common_base(powers: Sequence[float]) -> float | None:
+    """Largest q of which all powers are multiples, or None where it is below 0.01."""
+    powers = [p for p in powers if abs(p) > GRAIN]
+    fractions = [Fraction(p).limit_denominator(1000) for p in powers]
+    if any(abs(float(f) - p) > 1e-8 for f, p in zip(fractions, powers, strict=True)):
+        return None
+    common = math.lcm(*(f.denominator for f in fractions))
+    base = Fraction(math.gcd(*(int(f * common) for f in fractions)), common)
+    # Above 1 one root would stand for several poles.
+    base /= max(math.ceil(base), 1)
+    return float(base) if base * 1000 >= 999 * SMALLEST_BASE else None
+
+
+def roots_in_base(polynomial: Polynomial) -> tuple[float, Complex] | None:
+    """Base q and the roots in s^q of a commensurate polynomial freed of its lowest power; None where there are none."""
+    lowest, highest = min(polynomial), max(polynomial)
+    base = common_base([p - lowest for p in polynomial])
+    if base is None or (highest - lowest) / base > LARGEST_DEGREE:
+        return None
+    if highest - lowest < GRAIN:
+        return base or 1.0, np.empty(0, dtype=np.complex128)
+    degree = round((highest - lowest) / base)
+    # In units of the mean frequency all coefficients are of a size.
+    unit = abs(polynomial[lowest] / polynomial[highest]) ** (1 / (highest - lowest))
+    coefficients = np.zeros(degree + 1)
+    for power, value in polynomial.items():
+        at = degree - round((power - lowest) / base)
+        coefficients[at] = value / polynomial[highest] * unit ** (power - highest)
+    return base, np.asarray(np.roots(coefficients) * unit**base, dtype=np.complex128)
+
+
+def poles(model: Solved, *, coupling: str = "simulated") -> Complex:
+    """Poles of a commensurate model on the principal sheet.
+
+    Parameters
+    ----------
+    model
+        A model whose orders are multiples of one number, at least 0.01.
+    coupling
+        See :func:`frequency_response`.
+
+    Returns
+    -------
+    ndarray of complex
+        Values of s [rad/s], ``|arg s| < pi``, slowest first, without those at the origin. Roots on other sheets are no
+        poles: they only shape how a response dies away.
+
+    Raises
+    ------
+    ModelError
+        Orders without a common base, or a degree in it above 100.
+    """
+    every: list[complex] = []
+    for polynomial in characteristic(model, coupled=is_coupled(coupling)):
+        roots = roots_in_base(polynomial)
+        if roots is None:
+            raise ModelError(
+                "the orders have no common base of 0.01 or more (or a degree above 100 in it), so the model has no "
+                "polynomial whose roots could be found; use stability(), or round the orders"
+            )
+        base, values = roots
+        angle = np.angle(values)
+        kept = values[np.abs(angle) < base * math.pi - 1e-12]
+        if abs(base - 1) < GRAIN:
+            kept = values  # whole orders have one sheet, the negative real axis included
+        # Principal logarithm: arg s = arg(lambda) / q lies within (-pi, pi) by the choice above.
+        every += (np.abs(kept) ** (1 / base) * np.exp(1j * np.angle(kept) / base)).tolist()
+    return np.array(sorted(every, key=lambda s: (abs(s), s.imag)), dtype=np.complex128)
+
+
+def stability(model: Solved, *, coupling: str = "simulated") -> Stability:
+    """Whether a model is stable: by its poles where orders are commensurate, else by the argument principle.
+
+    Parameters
+    ----------
+    model
+        The model.
+    coupling
+        See :func:`frequency_response`; a model may be stable as a whole and not equation by equation, or the reverse.
+
+    Returns
+    -------
+    Stability
+        True where stable; prints why not.
+
+    Raises
+    ------
+    ModelError
+        Another coupling.
+
+    Notes
+    -----
+    Matignon (1996): roots lambda in s^q are stable where ``|arg lambda| > q pi/2``. Without a common base the number of
+    zeros of the characteristic function D(s) on the right is (p_max − p_min)/2 − Φ/π, Φ the turn of D(jω) from ω = 0 to
+    ∞ and p the powers of its highest and lowest term: the argument principle on the right half plane, where s^p has one
+    value. Delays of inputs do not matter.
+    """
+    coupled = is_coupled(coupling)
+    unstable, on_axis, method, base = 0.0, False, "poles", None
+    for polynomial in characteristic(model, coupled=coupled):
+        roots = roots_in_base(polynomial)
+        if roots is not None:
+            base, values = roots
+            margin = np.abs(np.angle(values)) - base * math.pi / 2
+            # Companion matrices give simple roots to about 1e-9; closer to the axis than that is on it.
+            on_axis |= bool(np.any(np.abs(margin) <= 1e-7))
+            unstable += float(np.sum(margin < -1e-7))
+        else:
+            count, near = right_zeros(polynomial)
+            unstable, on_axis, method = unstable + count, on_axis or near, "argument principle"
+    transfer = transfer_functions(model, coupling=coupling)
+    origin = 0.0
+    for output, pairs in transfer.denominator.items():
+        lowest = min(p for _, p in pairs)
+        for signal in transfer.inputs:
+            top = [p for _, p in transfer.numerators[output, signal]]
+            origin = max(origin, round(lowest - min(top), 9)) if top else origin
+    good = unstable == 0 and not on_axis and origin <= 0
+    return Stability(good, unstable, max(origin, 0.0), on_axis, method, base if method == "poles" else None)
+
+
+def right_zeros(polynomial: Polynomial, angle: float = math.pi / 2) -> tuple[float, bool]:
+    """Number of zeros right of the imaginary axis by the argument principle, and whether one lies on the axis.
+
+    Or, with another angle [rad], of those whose argument is smaller: on the surface of ln s it may exceed pi.
+    """
+    lowest, highest = min(polynomial), max(polynomial)
+    if highest - lowest < GRAIN:
+        return 0.0, False
+    powers = np.array(list(polynomial))
+    values = np.array(list(polynomial.values()))
+
+    def shares(at: float, omega: float) -> float:
+        """What all other terms weigh beside the term of one power."""
+        sizes = np.abs(values) * omega ** (powers - at)
+        return float((np.sum(sizes) - abs(polynomial[at])) / abs(polynomial[at]))
+
+    try:
+        centre = abs(polynomial[lowest] / polynomial[highest]) ** (1 / (highest - lowest))
+    except OverflowError:  # coefficients that ran away, over powers close to one another
+        centre = math.exp(FARTHEST_LOG)
+    low, high = centre, centre
+    while shares(lowest, low) > DECIDED and low > 1e-300:
+        low /= 10
+    while shares(highest, high) > DECIDED and high < 1e300:
+        high *= 10
+    log_omega = np.linspace(math.log(low), math.log(high), 2001)
+
+    def curve(logs: Floats) -> tuple[Complex, Floats]:
+        """D(jω) divided by the sum of its terms' sizes, which changes no angle, and that sum."""
+        exponents = np.outer(powers, logs) + np.log(np.abs(values))[:, None]
+        shift = exponents.max(axis=0)
+        sizes = np.exp(exponents - shift)
+        turns = np.exp(1j * (powers * angle + np.where(values < 0, math.pi, 0.0)))
+        total = np.sum(sizes, axis=0)
+        return np.asarray(np.einsum("j,jk->k", turns, sizes) / total), total
+
+    points, _ = curve(log_omega)
+    while log_omega.size < MOST_POINTS:
+        turn = np.abs(np.angle(points[1:] * np.conj(points[:-1])))
+        wide = np.flatnonzero(turn > LARGEST_TURN)
+        if not wide.size or float(np.min(np.abs(points))) < ON_AXIS:
+            break
+        middle = (log_omega[wide] + log_omega[wide + 1]) / 2
+        if np.any(np.diff(np.concatenate([log_omega[wide], middle]).reshape(2, -1), axis=0) <= 0):
+            break
+        log_omega = np.sort(np.concatenate([log_omega, middle]))
+        points, _ = curve(log_omega)
+    near = float(np.min(np.abs(points))) < ON_AXIS
+    turned = float(np.sum(np.angle(points[1:] * np.conj(points[:-1]))))
+    count = (highest - lowest) * angle / math.pi - turned / math.pi
+    if near or abs(count - round(count)) > 0.1:
+        return math.nan, True
+    return float(max(round(count), 0)), False
+
+
+#: A zero this close to the negative axis [rad], or within its own uncertainty of it, relaxes: it swings no more there.
+NEAR_REAL = 0.02 * math.pi
+#: Logarithms of frequencies that are numbers.
+RANGE = 700.0
+#: Orders as they are printed: below half of their last digit one is 0.
+SEEN_ORDER = 5e-5
+#: Zeros up to here are a relaxation where no pole is there at all: D^0.5 y = -a y has its own at arg s = 2 pi.
+SHEETS = 2.0 * math.pi
+#: Steps of approximate orders whose polynomials tell where zeros are to be sought.
+BASES = (0.25, 0.2, 0.1, 0.08, 0.05, 0.04, 0.03, 0.025, 0.02)
+LARGEST_SEED_DEGREE = 90
+#: Newton's steps, and the longest of them in ln s.
+NEWTON, LONGEST = 60, 0.5
+#: A zero is one where the terms cancel to this share of their sum; two closer than this in ln s are one.
+CANCELS, SAME = 1e-10, 1e-7
+#: Step of the numerical derivatives, as a share: powers are kept to nine decimals, which is a ten-thousandth of it.
+STEP = 1e-5
+
+
+@dataclass(frozen=True)
+class Mode:
+    """One way in which a model moves by itself.
+
+    Parameters
+    ----------
+    pole
+        Where it is in the plane of s [rad/s]: the upper one of two that are conjugate. Of a relaxation -1/T.
+    frequency
+        Natural frequency abs(pole) [rad/s].
+    damping
+        Damping ratio -cos(arg pole): 1 for a relaxation, negative for what grows.
+    time_constant
+        1/abs(Re pole) of a swing, 1/abs(pole) of a relaxation [s].
+    swings
+        Whether it swings; what relaxes does so exponentially for whole orders, as a power of time for others.
+    frequency_error, damping_error, time_constant_error
+        Standard errors from the covariance of the model; None where it has none.
+    """
+
+    pole: complex
+    frequency: float
+    damping: float
+    time_constant: float
+    swings: bool
+    frequency_error: float | None = None
+    damping_error: float | None = None
+    time_constant_error: float | None = None
+
+    @property
+    def grows(self) -> bool:
+        """Whether it grows instead of dying away."""
+        return self.damping < 0
+
+    def __str__(self) -> str:
+        end = ", grows" if self.grows else ""
+        if not self.swings:
+            return f"time constant {with_error(self.time_constant, self.time_constant_error)} s{end}"
+        hertz = self.frequency / (2 * math.pi)
+        return (
+            f"{with_error(self.frequency, self.frequency_error)} rad/s ({hertz:.3g} Hz), damping "
+            f"{with_error(self.damping, self.damping_error)}{end}"
+        )
+
+
+def modes(model: Solved, *, coupling: str = "simulated") -> tuple[Mode, ...]:
+    """Modes of a model, slowest first: its poles, whatever its orders, as frequency, damping and time constant.
+
+    Parameters
+    ----------
+    model
+        The model.
+    coupling
+        See :func:`ftlm.analysis.frequency_response`.
+
+    Returns
+    -------
+    tuple of Mode
+        Of each pair of conjugate poles one; those at the origin are left out. Standard errors are to first order from
+        the covariance of the fit.
+
+    Raises
+    ------
+    ModelError
+        Another coupling, or friction, with which no poles say what a body does.
+
+    Notes
+    -----
+    Poles are the zeros of D(s), a sum of c s^p, with abs(arg s) < pi. Orders need no common base: Newton's method in
+    ln s starts from the roots of D with rounded orders. A zero on the negative axis, or as close to it as its
+    uncertainty tells, is a relaxation. A model of orders below 1 may have no pole at all, and relaxes as a power of
+    time: then the zeros up to arg s = 2 pi give its time constants, as (c_0/c_p)^(-1/p) does for D^p y = -c_0/c_p y.
+    """
+    check_solved(model)
+    coupled = is_coupled(coupling)
+    found: list[Mode] = []
+    for at, polynomial in enumerate(characteristic(model, coupled=coupled)):
+        # Beyond the range of numbers a pole is one at the origin, or of nothing that ever shows.
+        sheet = [w for w in zeros_of(polynomial) or _nearest(polynomial) if abs(w.real) < RANGE]
+        spreads = _spreads(model, at, np.array(sheet), coupled=coupled)
+        found += [_mode(w, spread) for w, spread in zip(sheet, spreads, strict=True)]
+    return tuple(sorted(found, key=lambda mode: (mode.frequency, mode.pole.imag)))
+
+
+def _mode(w: complex, spread: tuple[float, float, float] | None) -> Mode:
+    """A zero in ln s with the standard deviations of its parts as a mode."""
+    size, angle = math.exp(w.real), w.imag
+    # Of a pole that hardly anything tells nobody may say that it is real, let alone that it dies away.
+    sure = min(NORMAL_95 * (0.0 if spread is None or not math.isfinite(spread[1]) else spread[1]), NEAR_REAL)
+    if angle >= math.pi - max(sure, SAME) or angle <= SAME:
+        sign = 1.0 if angle <= SAME else -1.0
+        error = None if spread is None else spread[0]
+        scaled = (None, None) if error is None else (size * error, error / size)
+        return Mode(complex(sign * size), size, -sign, 1.0 / size, False, scaled[0], None, scaled[1])
+    slow, damping = abs(size * math.cos(angle)), -math.cos(angle)
+    if abs(damping) <= SAME:
+        slow, damping = 0.0, 0.0
+    pole = size * complex(math.cos(angle), math.sin(angle))
+    constant = 1.0 / slow if slow > 0 else math.inf
+    if spread is None:
+        return Mode(pole, size, damping, constant, True)
+    radial, turn, share = spread
+    return Mode(pole, size, damping, constant, True, size * radial, abs(math.sin(angle)) * turn, constant * share)
+
+
+def _nearest(polynomial: Polynomial) -> list[complex]:
+    """Zeros beyond the negative axis up to two turns, or to the first one."""
+    powers = np.array(list(polynomial))
+    gap = float(np.min(np.diff(np.sort(powers)), initial=math.inf))
+    zeros = zeros_of(polynomial, max(SHEETS, math.pi / gap) + NEAR_REAL)
+    first = min((w.imag for w in zeros), default=0.0)
+    return [w for w in zeros if w.imag <= max(SHEETS, first) + NEAR_REAL]
+
+
+def zeros_of(polynomial: Polynomial, reach: float = math.pi + NEAR_REAL) -> list[complex]:
+    """Zeros of a sum of c s^p as ln s, slowest first, 0 <= Im <= reach; those at the origin are left out."""
+    powers = np.array(list(polynomial))
+    lowest, highest = float(powers.min()), float(powers.max())
+    if highest - lowest < GRAIN:
+        return []
+    exact = roots_in_base(polynomial)
+    if exact is not None:
+        base, roots = exact
+        w = np.log(np.abs(roots)) / base + 1j * np.abs(np.angle(roots)) / base
+        # A conjugate pair is one zero here, and so is each root on the positive axis or on the negative one.
+        kept = w[(np.angle(roots) >= -SAME) & (w.imag <= reach)]
+        if abs(base - 1) < GRAIN:
+            kept = kept[kept.imag <= math.pi + SAME]
+        return sorted(kept.tolist(), key=lambda z: (z.real, z.imag))
+    values = np.array(list(polynomial.values()))
+    found: list[complex] = []
+    seeds = [_balanced(powers, values, reach)]
+    for base in BASES:
+        if (highest - lowest) / base > LARGEST_SEED_DEGREE:
+            continue
+        seeds.append(_seeds(polynomial, base, reach))
+    for z in _descended(np.concatenate(seeds), powers, values):
+        if -SAME <= z.imag <= reach and all(abs(z - other) > SAME for other in found):
+            found.append(complex(z.real, max(z.imag, 0.0)))
+    return sorted(found, key=lambda z: (z.real, z.imag))
+
+
+def _seeds(polynomial: Polynomial, base: float, reach: float) -> Complex:
+    """Zeros of the same sum with orders rounded to a base, as ln s."""
+    rounded: Polynomial = {}
+    for power, value in polynomial.items():
+        near = round(round(power / base) * base, 9)
+        rounded[near] = rounded.get(near, 0.0) + value
+    found = roots_in_base({p: v for p, v in rounded.items() if v != 0.0}) if len(rounded) > 1 else None
+    if found is None or not found[1].size:
+        return np.empty(0, dtype=np.complex128)
+    step, roots = found
+    roots = roots[np.abs(roots) > 0]
+    w = np.log(np.abs(roots)) / step + 1j * np.abs(np.angle(roots)) / step
+    return np.asarray(w[w.imag <= 1.2 * reach], dtype=np.complex128)
+
+
+def _balanced(powers: Floats, values: Floats, reach: float) -> Complex:
+    """Where two terms alone cancel, as ln s: far out, where orders that are close part, nothing else does."""
+    out = []
+    for i, j in itertools.combinations(range(powers.size), 2):
+        apart = powers[j] - powers[i]
+        turn = np.angle(-values[i] / values[j] + 0j)
+        angles = (turn + 2 * math.pi * np.arange(-1, math.ceil(reach * abs(apart) / math.pi) + 1)) / apart
+        size = math.log(abs(values[i] / values[j])) / apart
+        out += [complex(size, a) for a in angles.tolist() if -SAME <= a <= reach]
+    return np.array(out, dtype=np.complex128)
+
+
+def _descended(w: Complex, powers: Floats, values: Floats) -> list[complex]:
+    """Where Newton's method leads from these seeds, of those that reach a zero."""
+    if not w.size:
+        return []
+    for _ in range(NEWTON):
+        terms, _ = _terms(w, powers, values)
+        with np.errstate(divide="ignore", invalid="ignore"):
+            step = np.sum(terms, axis=0) / np.sum(powers[:, None] * terms, axis=0)
+        step = np.where(np.isfinite(step), step, 0.0)
+        w = w - step * np.minimum(1.0, LONGEST / np.maximum(np.abs(step), 1e-300))
+    terms, _ = _terms(w, powers, values)
+    good = np.abs(np.sum(terms, axis=0)) <= CANCELS * np.sum(np.abs(terms), axis=0)
+    return [complex(z) for z in w[good]]
+
+
+def _terms(w: Complex, powers: Floats, values: Floats) -> tuple[Complex, Floats]:
+    """Terms of the sum at each ln s, divided by the size of the largest, and the logarithm of that."""
+    exponents = np.outer(powers, w)
+    largest = np.max(exponents.real + np.log(np.abs(values))[:, None], axis=0)
+    return np.asarray(values[:, None] * np.exp(exponents - largest)), largest
+
+
+def _spreads(model: Solved, at: int, zeros: Complex, *, coupled: bool) -> Sequence[tuple[float, float, float] | None]:
+    """Standard deviations of Re and Im of ln s at each zero, and of ln abs(Re s): d ln s = -dD / (dD/d ln s)."""
+    covariance = None if model.estimate is None else model.estimate.covariance
+    if covariance is None or not zeros.size:
+        return [None] * zeros.size
+    matrix = np.asarray(covariance, dtype=np.float64)
+    values = model_numbers(model)
+    slopes = np.zeros((values.size, zeros.size), dtype=np.complex128)
+
+    def value(numbers: Floats) -> tuple[Complex, Complex]:
+        polynomial = characteristic(with_numbers(model, numbers), coupled=coupled)[at]
+        powers = np.array(list(polynomial))
+        terms, level = _terms(zeros, powers, np.array(list(polynomial.values())))
+        scale = np.exp(level)
+        return np.sum(terms, axis=0) * scale, np.sum(powers[:, None] * terms, axis=0) * scale
+
+    _, slope = value(values)
+    for k in np.flatnonzero(np.any(matrix != 0, axis=1)):
+        step = STEP * max(abs(values[k]), 1e-3)
+        shift = step * np.eye(values.size)[k]
+        (above, _), (below, _) = value(values + shift), value(values - shift)
+        with np.errstate(divide="ignore", invalid="ignore"):
+            slopes[k] = -(above - below) / (2 * step) / slope
+    with np.errstate(invalid="ignore"):
+        along = slopes.real - np.tan(zeros.imag) * slopes.imag
+        parts = (slopes.real, slopes.imag, along)
+        variances = [np.einsum("ik,ij,jk->k", part, matrix, part) for part in parts]
+        spreads = [np.sqrt(np.maximum(v, 0.0)).tolist() for v in variances]
+    return list(zip(*spreads, strict=True))
+
+
+@dataclass(frozen=True)
+class SteadyState:
+    """What an output does in the end under a unit step of an input.
+
+    Parameters
+    ----------
+    output, input
+        Names.
+    gain
+        Where the output comes to rest; 0 where it returns, infinite where it runs on.
+    error
+        Standard error of the rate; None without a covariance.
+    order
+        Order with which it runs on: 0 for none, 1 for an integrator, below 0 where it returns to 0.
+    rate
+        Coefficient of t^order/Gamma(order + 1) in the end; the gain where the order is 0.
+    order_error
+        Standard error of the order, 0 where it was given; None without a covariance.
+    """
+
+    output: str
+    input: str
+    gain: float
+    error: float | None
+    order: float
+    rate: float
+    order_error: float | None = None
+
+
+def steady_states(model: Solved) -> tuple[SteadyState, ...]:
+    """Steady state of every output under every input that reaches it, the equations together.
+
+    Parameters
+    ----------
+    model
+        A linear model.
+
+    Raises
+    ------
+    ModelError
+        An input that saturates or has a dead zone, or friction.
+    """
+    check_solved(model)
+    check_unlimited(model, "a steady state")
+    pairs = _final(model)
+    covariance = None if model.estimate is None else model.estimate.covariance
+    errors: dict[tuple[str, str], tuple[float, float]] = {}
+    if covariance is not None:
+        matrix, values = np.asarray(covariance, dtype=np.float64), model_numbers(model)
+        slopes = {pair: np.zeros((2, values.size)) for pair in pairs}
+        for k in np.flatnonzero(np.any(matrix != 0, axis=1)):
+            step = STEP * max(abs(values[k]), 1e-3)
+            shift = step * np.eye(values.size)[k]
+            above, below = (_final(with_numbers(model, values + side)) for side in (shift, -shift))
+            for pair, slope in slopes.items():
+                slope[:, k] = np.subtract(above[pair], below[pair]) / (2 * step)
+        for pair, (turn, slope) in slopes.items():
+            variances = [float(v @ matrix @ v) for v in (turn, slope)]
+            errors[pair] = (math.sqrt(max(variances[0], 0.0)), math.sqrt(max(variances[1], 0.0)))
+    out = []
+    for (output, signal), (order, rate) in pairs.items():
+        gain = rate if abs(order) < SEEN_ORDER else 0.0 if order < 0 else math.copysign(math.inf, rate)
+        turned, error = errors.get((output, signal), (None, None))
+        out.append(SteadyState(output, signal, gain, error, order, rate, turned))
+    return tuple(out)
+
+
+def _final(model: Solved) -> dict[tuple[str, str], tuple[float, float]]:
+    """Order and coefficient of what is left of every response in the end."""
+    transfer = transfer_functions(model)
+    sensor = model.structure.sensor_filter
+    out = {}
+    for output in transfer.outputs:
+        below, lowest = transfer.denominator[output][-1]
+        for signal in transfer.inputs:
+            if not transfer.numerators[output, signal]:
+                continue
+            above, power = transfer.numerators[output, signal][-1]
+            order, rate = lowest - power, above / below
+            if sensor is not None and (output in sensor.signals) != (signal in sensor.signals):
+                (p, a), (q, b) = (min((o, c) for c, o in part) for part in (sensor.numerator, sensor.denominator))
+                side = 1 if output in sensor.signals else -1
+                order, rate = order + side * (q - p), rate * (a / b) ** side
+            out[output, signal] = (0.0 if abs(order) < GRAIN else order, rate)
+    return out
+
+
+def dcgain(model: Solved) -> Floats:
+    """Steady-state gain of every output from every input that is not modelled.
+
+    Parameters
+    ----------
+    model
+        The model; its equations act together.
+
+    Returns
+    -------
+    ndarray, shape (outputs, inputs)
+        In SI units of output over input: 0 where an input does not reach the output or its effect dies away, infinite
+        where it is integrated. Inputs are in the order of :func:`ftlm.analysis.transfer_functions`.
+
+    Raises
+    ------
+    ModelError
+        An input that saturates or has a dead zone, or friction.
+    """
+    states = steady_states(model)
+    inputs = response_inputs(model, coupled=True)
+    out = np.zeros((len(model.outputs), len(inputs)))
+    for state in states:
+        out[model.outputs.index(state.output), inputs.index(state.input)] = state.gain
+    return out
+
+
+def settling_time(model: Solved) -> float:
+    """Seconds in which a model shows what it does: some time constants of its slowest mode.
+
+    No more than fifty periods of the fastest swing, so that a picture of it shows a swing.
+    """
+    found = modes(model)
+    if not found:
+        return 10.0
+    slowest = max(min(m.time_constant, 20.0 * 2 * math.pi / m.frequency) for m in found)
+    swings = [2 * math.pi / m.frequency for m in found if m.swings]
+    settled = min(6.0 * slowest, 50.0 * min(swings)) if swings else 6.0 * slowest
+    return settled + max(model.structure.delay.values(), default=0.0)

@@ -1,0 +1,346 @@
+"""Linear systems of whole order that stand for fractional ones within a band (Oustaloup)."""
+
+from __future__ import annotations
+
+import importlib
+import math
+import re
+import warnings
+from collections.abc import Iterable, Mapping, Sequence
+from dataclasses import dataclass, replace
+from typing import Any
+
+import numpy as np
+from numpy.typing import NDArray
+
+from ftlm.analysis.frequency_response import check_unlimited, frequency_response, response_inputs
+from ftlm.analysis.poles import stability
+from ftlm.errors import ModelError
+from ftlm.model.model import Solved
+from ftlm.simulation.discretization import check_linear
+from ftlm.utils.validation import Floats, real_number, shown, whole_number
+
+#: Errors of the approximation beyond which a warning is due: gain [dB], phase [degrees].
+GAIN_DB, PHASE_DEGREES = 1.0, 5.0
+#: Frequencies at which the approximation is compared with the model.
+COMPARED = 200
+#: Filters reach this many times beyond the band on both sides: near their ends their phase is off.
+REACH = 100.0
+#: A pole closer to the imaginary axis than this share of the band's lower end is on it.
+AT_ORIGIN = 1e-3
+#: Largest order of Oustaloup's filter: zeros and poles a hair apart say nothing new.
+LARGEST_ORDER = 50
+#: Order of the Padé approximation of a delay.
+PADE = 4
+
+
+def identifier(name: str) -> str:
+    """A name that MATLAB, Python and python-control take."""
+    plain = re.sub(r"[^A-Za-z0-9_]+", "_", name).strip("_")[:60]
+    return plain if plain and plain[0].isalpha() else f"x_{plain}"
+
+
+@dataclass(frozen=True)
+class Approximation:
+    """A linear system of whole order that stands for a fractional one within a band.
+
+    Parameters
+    ----------
+    a, b, c, d
+        State space; inputs and outputs in the order of their names.
+    outputs, inputs
+        Names.
+    band
+        Where the approximation is meant to hold [rad/s].
+    order
+        Order of Oustaloup's filter: one operator has 2 order + 1 poles.
+    gain_error, phase_error
+        Largest errors over the band by output and input [dB], [degrees].
+    stable
+        Whether the approximation is stable.
+    warnings
+        What not to do with it, in words.
+    """
+
+    a: Floats
+    b: Floats
+    c: Floats
+    d: Floats
+    outputs: tuple[str, ...]
+    inputs: tuple[str, ...]
+    band: tuple[float, float]
+    order: int
+    gain_error: dict[tuple[str, str], float]
+    phase_error: dict[tuple[str, str], float]
+    stable: bool
+    warnings: tuple[str, ...]
+
+    @property
+    def states(self) -> int:
+        """Number of states."""
+        return int(self.a.shape[0])
+
+    def frequency_response(self, w: Sequence[float] | Floats) -> NDArray[np.complex128]:
+        """Response of the approximation, shape (outputs, inputs, W)."""
+        omega = np.asarray(w, dtype=np.float64)
+        system = 1j * omega[:, None, None] * np.eye(self.states) - self.a
+        response = self.c @ np.linalg.solve(system, np.broadcast_to(self.b, (omega.size, *self.b.shape))) + self.d
+        return np.asarray(np.moveaxis(response, 0, -1), dtype=np.complex128)
+
+    def __str__(self) -> str:
+        gain, phase = max(self.gain_error.values()), max(self.phase_error.values())
+        lines = [
+            f"{self.states} states for {self.band[0]:g} to {self.band[1]:g} rad/s: within {gain:.2g} dB and "
+            f"{phase:.2g} degrees of the model"
+        ]
+        return "\n".join(lines + [f"warning: {w}" for w in self.warnings])
+
+
+def oustaloup(power: float, band: tuple[float, float], order: int) -> tuple[Floats, Floats, float]:
+    """Poles, residues and direct gain of Oustaloup's filter for s^power, 0 < power < 1 (doi:10.1109/81.817385)."""
+    low, high = band
+    k = np.arange(-order, order + 1) + order
+    count = 2 * order + 1
+    ratio = high / low
+    zeros = low * ratio ** ((k + 0.5 * (1 - power)) / count)
+    roots = low * ratio ** ((k + 0.5 * (1 + power)) / count)
+    gain = high**power
+    # Residues as products of quotients: neither numerator nor denominator is ever formed.
+    differences = zeros[None, :] - roots[:, None]
+    others = roots[None, :] - roots[:, None]
+    np.fill_diagonal(others, 1.0)
+    residues = gain * np.prod(differences / others, axis=1)
+    return roots, residues, gain
+
+
+class _Builder:
+    """Collects states; every piece reads the inputs u, the outputs y, or states."""
+
+    def __init__(self, inputs: int, outputs: int) -> None:
+        self.a: list[dict[int, float]] = []
+        self.u: list[dict[int, float]] = []
+        self.y: list[dict[int, float]] = []
+        self.shape = (inputs, outputs)
+
+    def state(self, a: Mapping[int, float], u: Mapping[int, float], y: Mapping[int, float]) -> int:
+        self.a.append(dict(a))
+        self.u.append(dict(u))
+        self.y.append(dict(y))
+        return len(self.a) - 1
+
+    def matrices(self) -> tuple[Floats, Floats, Floats]:
+        inputs, outputs = self.shape
+        return _dense(self.a, len(self.a)), _dense(self.u, inputs), _dense(self.y, outputs)
+
+
+def _dense(rows: Sequence[Mapping[int, float]], width: int) -> Floats:
+    matrix = np.zeros((len(rows), width))
+    for i, row in enumerate(rows):
+        for j, value in row.items():
+            matrix[i, j] = value
+    return matrix
+
+
+#: A signal inside the approximation: what it reads of states, inputs and outputs.
+_Signal = tuple[dict[int, float], dict[int, float], dict[int, float]]
+
+
+def _scaled(signal: _Signal, factor: float) -> _Signal:
+    x, u, y = ({i: factor * v for i, v in part.items()} for part in signal)
+    return x, u, y
+
+
+def _sum(signals: Iterable[_Signal]) -> _Signal:
+    total: _Signal = ({}, {}, {})
+    for signal in signals:
+        for into, part in zip(total, signal, strict=True):
+            for j, v in part.items():
+                into[j] = into.get(j, 0.0) + v
+    return total
+
+
+def _filtered(builder: _Builder, signal: _Signal, power: float, band: tuple[float, float], order: int) -> _Signal:
+    """Oustaloup's filter for s^power of a signal, one state a pole."""
+    roots, residues, gain = oustaloup(power, band, order)
+    states, u, y = _scaled(signal, gain)
+    for pole, residue in zip(roots.tolist(), residues.tolist(), strict=True):
+        row, row_u, row_y = _scaled(signal, pole)
+        own = len(builder.a)
+        row[own] = row.get(own, 0.0) - pole
+        states[builder.state(row, row_u, row_y)] = residue / pole
+    return states, u, y
+
+
+def _delayed(builder: _Builder, source: int, delay: float) -> _Signal:
+    """Padé's approximation of a delayed input, in observer form."""
+    # Coefficients of sum (2n-k)! n! / ((2n)! k! (n-k)!) x^k, x = -s tau above and + below.
+    f, n = math.factorial, PADE
+    c = [f(2 * n - k) * f(n) / (f(2 * n) * f(k) * f(n - k)) for k in range(n + 1)]
+    below = [c[k] * delay**k / (c[PADE] * delay**PADE) for k in range(PADE)]
+    direct = (-1.0) ** PADE
+    above = [(-1.0) ** k * c[k] * delay**k / (c[PADE] * delay**PADE) - direct * below[k] for k in range(PADE)]
+    first = len(builder.a)
+    last = first + PADE - 1
+    for k in range(PADE):
+        row = {last: -below[k]}
+        if k:
+            row[first + k - 1] = row.get(first + k - 1, 0.0) + 1.0
+        builder.state(row, {source: above[k]}, {})
+    return {last: 1.0}, {source: direct}, {}
+
+
+def approximate(model: Solved, *, band: tuple[float, float], order: int = 5) -> Approximation:
+    """Approximate a model by a system of whole order in state space.
+
+    Parameters
+    ----------
+    model
+        The model; its equations act together, driven by what is not modelled.
+    band
+        Frequencies (low, high) [rad/s] within which the approximation is to hold, 0 < low < high.
+    order
+        Of Oustaloup's filter, 1 to 50: each distinct integral of fractional order gets 2 order + 1 poles.
+
+    Returns
+    -------
+    Approximation
+        With its errors over the band.
+
+    Raises
+    ------
+    ModelError
+        A band or an order that is none, or equations that cannot be solved for their outputs.
+
+    Notes
+    -----
+    Filters reach two decades beyond the band on both sides, since Oustaloup's phase is poor near its ends. Whole
+    orders are exact; delays get Padé's approximation of order 4; the sensor filter is left out.
+    """
+    try:
+        low, high = (real_number("band", b) for b in band)
+    except (TypeError, ValueError):
+        raise ModelError(f"band = {shown(band)} is no pair of frequencies; give (low, high) in rad/s") from None
+    if not (math.isfinite(low) and math.isfinite(high) and 0 < low < high):
+        raise ModelError(f"band = ({low:g}, {high:g}) rad/s is no interval; give 0 < low < high")
+    count = whole_number(order)
+    if count is None or not 1 <= count <= LARGEST_ORDER:
+        raise ModelError(f"order = {shown(order)} is no whole number from 1 to {LARGEST_ORDER}")
+    check_linear(model.equations, "a linear system in state space")
+    check_unlimited(model, "a linear system in state space")
+    inputs, outputs = response_inputs(model, coupled=True), model.outputs
+    builder = _Builder(len(inputs), len(outputs))
+    delays = model.structure.delay
+    sources: dict[str, _Signal] = {o: ({}, {}, {i: 1.0}) for i, o in enumerate(outputs)}
+    for i, name in enumerate(inputs):
+        sources[name] = _delayed(builder, i, delays[name]) if delays.get(name) else ({}, {i: 1.0}, {})
+    reach = (low / REACH, high * REACH)
+    # D^alpha y = sum of c D^nu s becomes y = sum of c s^-ceil(eta) (filter for the rest) s. The integrators of an
+    # equation form one chain that adds up what every term feeds in (observer form): none runs away by itself, and what
+    # a model does at rest and far below the band stays exact.
+    filters: dict[tuple[str, float], _Signal] = {}
+    read: list[_Signal] = []
+    for item in model.equations:
+        fed: dict[int, list[_Signal]] = {}
+        for term in item.terms:
+            eta = round(item.order.constant - term.order.constant, 9)
+            whole = math.ceil(eta)
+            key = (term.signal, round(whole - eta, 9))
+            if key not in filters:
+                source = sources[term.signal]
+                filters[key] = _filtered(builder, source, key[1], reach, count) if key[1] > 0 else source
+            fed.setdefault(whole, []).append(_scaled(filters[key], float(term.fixed or 0.0)))
+        behind: _Signal = ({}, {}, {})
+        for level in range(max(fed), 0, -1):
+            behind = ({builder.state(*_sum([*fed.get(level, []), behind])): 1.0}, {}, {})
+        read.append(_sum([behind, *fed.get(0, [])]))
+    a, b, feedback = builder.matrices()
+    reads, direct, loop = (
+        _dense(rows, width)
+        for rows, width in zip(zip(*read, strict=True), (len(a), len(inputs), len(outputs)), strict=True)
+    )
+    solved = np.eye(len(outputs)) - loop
+    if abs(float(np.linalg.det(solved))) < 1e-12:
+        raise ModelError(
+            f"the equations of {', '.join(outputs)} cannot be solved for them: they are no more than a loop"
+        )
+    c: Floats = np.asarray(np.linalg.solve(solved, reads), dtype=np.float64)
+    d: Floats = np.asarray(np.linalg.solve(solved, direct), dtype=np.float64)
+    a, b = a + feedback @ c, b + feedback @ d
+    unjudged = Approximation(a, b, c, d, outputs, inputs, (low, high), count, {}, {}, stable=True, warnings=())
+    return _judged(model, unjudged)
+
+
+def _judged(model: Solved, system: Approximation) -> Approximation:
+    """Say how far off an approximation is, and how much of what it says of stability holds."""
+    low, high = system.band
+    omega = np.geomspace(low, high, COMPARED)
+    exact = frequency_response(model, omega, sensor=False)
+    got = system.frequency_response(omega)
+    gain, phase = {}, {}
+    for i, output in enumerate(system.outputs):
+        for j, signal in enumerate(system.inputs):
+            if not np.any(exact[i, j]):
+                continue
+            with np.errstate(divide="ignore", invalid="ignore"):
+                quotient = got[i, j] / exact[i, j]
+                gain[output, signal] = float(np.max(np.abs(20 * np.log10(np.abs(quotient)))))
+                phase[output, signal] = float(np.degrees(np.max(np.abs(np.angle(quotient)))))
+    roots = np.linalg.eigvals(system.a)
+    stable = bool(np.all(roots.real < -AT_ORIGIN * low))
+    words = []
+    worst_gain, worst_phase = max(gain.values(), default=0.0), max(phase.values(), default=0.0)
+    if not (worst_gain <= GAIN_DB and worst_phase <= PHASE_DEGREES):
+        words.append(
+            f"over {low:g} to {high:g} rad/s the approximation is off by up to {worst_gain:.2g} dB "
+            f"and {worst_phase:.2g} degrees: a gain or phase margin smaller than that means nothing; raise order, or "
+            "change the band"
+        )
+    if stability(model).unstable_poles != np.sum(roots.real > AT_ORIGIN * low):
+        words.append(
+            "the approximation does not have as many unstable poles as the model: no stability margin of it holds for "
+            "the model; raise order, or move the band"
+        )
+    return replace(system, gain_error=gain, phase_error=phase, stable=stable, warnings=tuple(words))
+
+
+def to_control(model: Solved, *, band: tuple[float, float], order: int = 5) -> Any:
+    """Return a python-control system that stands for a model within a band.
+
+    Parameters
+    ----------
+    model, band, order
+        See :func:`approximate`.
+
+    Returns
+    -------
+    control.StateSpace
+        With named inputs and outputs; its attribute ``approximation`` is the :class:`Approximation` with the errors.
+
+    Warns
+    -----
+    UserWarning
+        Where the approximation is too far off for a margin to be read from it.
+
+    Raises
+    ------
+    ModelError
+        python-control is not installed; see also :func:`approximate`.
+    """
+    try:
+        control = importlib.import_module("control")
+    except ImportError:
+        raise ModelError("python-control is not installed; pip install 'ftlm[control]'") from None
+    near = approximate(model, band=band, order=order)
+    for words in near.warnings:
+        warnings.warn(words, UserWarning, stacklevel=2)
+    system = control.ss(
+        near.a,
+        near.b,
+        near.c,
+        near.d,
+        inputs=list(near.inputs),
+        outputs=list(near.outputs),
+        name=identifier(model.structure.name),
+    )
+    system.approximation = near
+    return system

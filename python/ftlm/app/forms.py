@@ -1,0 +1,429 @@
+"""What a person asks of a file on the page, done by ftlm's own functions, and the Python lines that do the same."""
+
+from __future__ import annotations
+
+import json
+from collections.abc import Callable, Mapping, Sequence
+from dataclasses import asdict, dataclass, field
+from pathlib import Path
+from typing import Any, Protocol
+
+from ftlm._core import __version__
+from ftlm.arm.flexible_link import flexible_link
+from ftlm.data.run import Run
+from ftlm.errors import DataError, ModelError
+from ftlm.estimation.identify import identify
+from ftlm.estimation.result import Identification
+from ftlm.estimation.verdict import Validation
+from ftlm.io.load import load
+from ftlm.progress import WONDER, left_in_words
+from ftlm.structure.parser import equation
+from ftlm.structure.structure import Structure
+from ftlm.structure_selection.result import Selection
+from ftlm.structure_selection.select import select
+from ftlm.utils.resources import by_output_error, expected
+from ftlm.utils.validation import check_threads
+
+#: Structures that have a name of their own, as calls of Python.
+NAMED: dict[str, Callable[[], Structure]] = {
+    "flexible_link(stage=1)": lambda: flexible_link(stage=1),
+    "flexible_link(stage=2)": lambda: flexible_link(stage=2),
+}
+#: How a model is come to: fit the structure, choose what of it earns its place, one of several, or from nothing.
+WAYS = ("fit", "inside", "offered", "auto")
+METHODS = ("output-error", "instrumental-variables", "multi-innovation", "least-squares")
+OFFSETS = ("none", "constant", "ramp", "auto")
+LOSSES = ("squares", "huber")
+#: What is done while structures are tried.
+CHOOSING = "choosing a structure"
+#: A line of a script, as long as those of the house.
+LINE = 100
+
+
+class Told(Protocol):
+    """Whom work tells how far it is."""
+
+    def phase(self, words: str) -> None:
+        """Say what comes next."""
+
+    def __call__(self, done: int, total: int) -> None:
+        """Say how far it is."""
+
+
+@dataclass(frozen=True)
+class Reading:
+    """A file and the arguments of `ftlm.load` that make it a run.
+
+    Parameters
+    ----------
+    file
+        Its name, in the folder in which the work is done.
+    options
+        As `ftlm.open_file` says them, a layout as a dictionary.
+    """
+
+    file: str
+    options: dict[str, Any] = field(default_factory=dict)
+
+    def run(self) -> Run:
+        """Load it."""
+        return load(self.file, **self.options)
+
+    def script(self, name: str) -> list[str]:
+        """The lines that load it."""
+        return call(name, "ftlm.load", [quoted(self.file)], self.options)
+
+
+@dataclass(frozen=True)
+class Recipe:
+    """All that makes a model: nothing else decides a number of it.
+
+    Parameters
+    ----------
+    estimation
+        The run that is fitted to.
+    validation
+        A run that is not; None where there is none, or where a part of the first is kept for that.
+    share
+        Part of the run, at its end, that is kept for validation, from 0 (none) to 0.8.
+    structure
+        An equation in words, or one of :data:`NAMED`; of ``"offered"`` several, ``"auto"`` has none.
+    way
+        One of :data:`WAYS`.
+    method, offset, loss
+        As of :func:`ftlm.identify`; "" for its own defaults.
+    """
+
+    estimation: Reading
+    validation: Reading | None = None
+    share: float = 0.0
+    structure: tuple[str, ...] = ()
+    way: str = "fit"
+    method: str = ""
+    offset: str = ""
+    loss: str = ""
+
+    @classmethod
+    def of(cls, told: Mapping[str, Any]) -> Recipe:
+        """From what :meth:`to_dict` made."""
+        other = told["validation"]
+        parts = {**told, "structure": tuple(told["structure"]), "estimation": Reading(**told["estimation"])}
+        return cls(**{**parts, "validation": None if other is None else Reading(**other)})
+
+    def to_dict(self) -> dict[str, Any]:
+        """For JSON."""
+        return asdict(self)
+
+    @property
+    def words(self) -> str:
+        """What is asked for, in a line."""
+        return {
+            "fit": "; ".join(self.structure),
+            "inside": f"chosen inside {'; '.join(self.structure)}",
+            "offered": f"chosen among {len(self.structure)} structures",
+            "auto": "chosen by ftlm",
+        }[self.way]
+
+    def settings(self) -> dict[str, Any]:
+        """Arguments of the fit besides runs and structure."""
+        given = {"method": self.method, "offset": self.offset, "loss": self.loss}
+        return {name: value for name, value in given.items() if value}
+
+    def structures(self) -> list[Structure]:
+        """The structures that are named.
+
+        Raises
+        ------
+        ModelError
+            One that is none, in ftlm's own words.
+        """
+        return [structure_of(text) for text in self.structure]
+
+    @property
+    def is_choice(self) -> bool:
+        """Whether structures are tried, which takes long enough to go on with another time."""
+        return self.way != "fit"
+
+    def made(self, told: Told, store: str | None = None) -> Made:
+        """Make the model.
+
+        Parameters
+        ----------
+        told
+            Told how far it is.
+        store
+            File that keeps the fits of a choice, in which one that was stopped goes on.
+
+        Raises
+        ------
+        DataError, ModelError, ConvergenceError
+            As of :func:`ftlm.load`, :func:`ftlm.identify`, :func:`ftlm.select`.
+        """
+        wanted = self.structures()
+        told.phase("reading")
+        own, other, cut = self._runs()
+        told.phase(CHOOSING if self.is_choice else f"fitting{self._takes(own, wanted[0])}")
+        choice = None
+        if not self.is_choice:
+            result = identify(own, wanted[0], progress=told, **self.settings())
+        else:
+            candidates = "auto" if self.way == "auto" else wanted[0] if self.way == "inside" else wanted
+            choice = select(own, candidates, progress=told, store=store)
+            # Chosen from rest, where its run starts so; another run may not.
+            told.phase("fitting what was chosen")
+            result = identify(own, choice.winner.structure, progress=told)
+        told.phase("validating")
+        return Made(result, own, other, None if other is None else result.validate(other), choice, self._script(cut))
+
+    def _takes(self, run: Run, structure: Structure) -> str:
+        """About how long a fit takes, where that is long enough to wonder."""
+        numbers = len(structure.order_names) + len(structure.coefficient_names) + len(structure.free_inputs)
+        seconds = expected(by_output_error(run.length * len(structure.outputs), numbers), check_threads(None))
+        if seconds < WONDER or self.method not in ("", METHODS[0]):
+            return ""
+        return f", {left_in_words(seconds).removesuffix(' left')} in all"
+
+    def _runs(self) -> tuple[Run, Run | None, float | None]:
+        """The run that is fitted to, the one that is not, and where one was cut from the other [s]."""
+        run = self.estimation.run()
+        if self.validation is not None:
+            return run, self.validation.run(), None
+        if not self.share:
+            return run, None, None
+        cut = cut_at(run.length, run.step, self.share)
+        return run.slice(None, cut), run.slice(cut, None), cut
+
+    def _script(self, cut: float | None) -> str:
+        """The Python lines that do all of it."""
+        stem = Path(self.estimation.file).stem
+        lines = [f'"""A model of {docstring(self.estimation.file)}, as the page of ftlm {__version__} made it."""', ""]
+        lines += ["import ftlm", ""]
+        if cut is None:
+            lines += self.estimation.script("run")
+        else:
+            lines += self.estimation.script("whole")
+            lines.append(f"run, other = whole.slice(None, {cut!r}), whole.slice({cut!r}, None)")
+        if self.validation is not None:
+            lines += self.validation.script("other")
+        if not self.is_choice:
+            lines.append(f"structure = {written(self.structure[0])}")
+            lines += call("result", "ftlm.identify", ["run", "structure"], self.settings())
+        else:
+            if self.way == "offered":
+                lines += ["candidates = [", *(f"    {written(text)}," for text in self.structure), "]"]
+            else:
+                lines.append(f"candidates = {quoted('auto') if self.way == 'auto' else written(self.structure[0])}")
+            lines += ["choice = ftlm.select(run, candidates)", "print(choice.reason)"]
+            lines.append("result = ftlm.identify(run, choice.winner.structure)")
+        tried = cut is not None or self.validation is not None
+        lines.append("print(result.summary(result.validate(other)))" if tried else "print(result.summary())")
+        lines.append(f"result.model.save({quoted(stem + '-model.json')})")
+        lines.append(f"result.report({quoted(stem + '-report.html')}{', validation=other' if tried else ''})")
+        return "\n".join(lines) + "\n"
+
+
+@dataclass(frozen=True)
+class Made:
+    """A model with its runs, and the script that makes it again."""
+
+    result: Identification
+    run: Run
+    other: Run | None
+    checked: Validation | None
+    choice: Selection | None
+    script: str
+
+
+def structure_of(text: str) -> Structure:
+    """The structure that a text names."""
+    return NAMED[text]() if text in NAMED else equation(text)
+
+
+def checked_structures(recipe: Recipe) -> list[Structure]:
+    """The structures of a recipe; what does not belong together is refused, before any work."""
+    for name, value, known in (
+        ("way", recipe.way, WAYS),
+        ("method", recipe.method, ("", *METHODS)),
+        ("offset", recipe.offset, ("", *OFFSETS)),
+        ("loss", recipe.loss, ("", *LOSSES)),
+    ):
+        if value not in known:
+            raise ModelError(f"{name} = {value!r} is not known; use {' or '.join(filter(None, known))}")
+    if recipe.way == "offered" and len(recipe.structure) < 2:
+        raise ModelError("one structure is no choice; fit it, or choose what of it earns its place")
+    if recipe.way in ("fit", "inside") and len(recipe.structure) != 1:
+        raise ModelError("no structure is given; write an equation, or take one that is offered")
+    if recipe.way != "fit" and recipe.settings():
+        raise ModelError(
+            f"{', '.join(recipe.settings())}: a choice of structures is by output error, with its own offset; leave it "
+            "at its default"
+        )
+    if not 0.0 <= recipe.share <= 0.8:
+        raise ModelError(f"share = {recipe.share!r} of the run for validation; keep from 0 to 0.8")
+    return recipe.structures()
+
+
+def cut_at(rows: int, step: float, share: float) -> float:
+    """Where a run is cut [s] so that this share of its rows lies behind."""
+    return float(f"{round(rows * (1.0 - share)) * step:.9g}")
+
+
+def written(structure: str) -> str:
+    """A structure as Python writes it."""
+    return f"ftlm.{structure}" if structure in NAMED else f"ftlm.equation({quoted(structure)})"
+
+
+def call(target: str, function: str, values: list[str], named: Mapping[str, Any]) -> list[str]:
+    """A call in Python, a line an argument where one line is too long."""
+    parts = [*values, *(f"{name}={literal(value)}" for name, value in named.items())]
+    line = f"{target} = {function}({', '.join(parts)})"
+    if len(line) <= LINE:
+        return [line]
+    return [f"{target} = {function}(", *(f"    {part}," for part in parts), ")"]
+
+
+def literal(value: Any) -> str:
+    """A value of JSON as Python writes it."""
+    if isinstance(value, str):
+        return quoted(value)
+    if isinstance(value, Mapping):
+        return "{" + ", ".join(f"{quoted(k)}: {literal(v)}" for k, v in value.items()) + "}"
+    return f"[{', '.join(map(literal, value))}]" if isinstance(value, (list, tuple)) else repr(value)
+
+
+def quoted(text: str) -> str:
+    """A text as Python writes it, within double quotes and without what a terminal would obey."""
+    if text.isprintable():
+        return json.dumps(text, ensure_ascii=False)
+    return repr(text).encode("ascii", "backslashreplace").decode()
+
+
+def docstring(text: str) -> str:
+    """A name as it may stand within a docstring."""
+    return "".join(c if c.isalnum() or c in " ._-()" else "?" for c in text)[:100]
+
+
+#: Fields of a file's layout that hold whole numbers, and those that hold words.
+NUMBERS, WORDS = ("skip", "header"), ("encoding", "separator", "decimal", "thousands", "dates", "sheet")
+ROLES = ("", "time", "input", "output")
+MOST_SIGNALS = 500
+
+
+def asked_of(said: Mapping[str, Any]) -> dict[str, Any]:
+    """Turn fields into arguments; an empty field says nothing.
+
+    Parameters
+    ----------
+    said
+        ``columns``: a list of name, role, signal and unit; ``step``, ``resample``, ``from``, ``to``: text of numbers;
+        ``time_unit``, ``missing`` and those of the layout: words.
+
+    Raises
+    ------
+    DataError
+        A field that is none of these, or holds no number where one belongs.
+    """
+    asked: dict[str, Any] = {}
+    for name in ("step", "resample"):
+        if _text(said, name):
+            asked[name] = number(name, _text(said, name))
+    for name in ("time_unit", "missing"):
+        if _text(said, name):
+            asked[name] = _text(said, name)
+    ends = [number(name, _text(said, name)) if _text(said, name) else None for name in ("from", "to")]
+    if ends != [None, None]:
+        asked["slice"] = ends
+    layout: dict[str, Any] = {name: _text(said, name) for name in WORDS if _text(said, name)}
+    layout |= {name: _whole(name, _text(said, name)) for name in NUMBERS if _text(said, name)}
+    if layout:
+        asked["layout"] = layout
+    return asked | _roles(said.get("columns"))
+
+
+def _roles(columns: Any) -> dict[str, Any]:
+    """Time, inputs, outputs and units; nothing where no column is told."""
+    if columns is None:
+        return {}
+    if not isinstance(columns, list) or len(columns) > MOST_SIGNALS:
+        raise DataError(f"columns is no list of at most {MOST_SIGNALS} columns")
+    asked: dict[str, Any] = {}
+    for entry in columns:
+        if not isinstance(entry, Mapping):
+            raise DataError("a column is no object with name, role, signal and unit")
+        name, role = _text(entry, "name"), _text(entry, "role")
+        signal, unit = _text(entry, "signal") or name, _text(entry, "unit")
+        if role not in ROLES:
+            raise DataError(f"the role {role!r} of column {name!r} is not known; take time, input, output or none")
+        if role == "time":
+            if "time" in asked:
+                raise DataError(f"{asked['time']!r} and {name!r} are both the time; keep one of them")
+            asked["time"] = name
+        elif role:
+            signals = asked.setdefault(f"{role}s", {})
+            if signal in signals or signal in asked.get("inputs", {}) or signal in asked.get("outputs", {}):
+                raise DataError(f"two columns are called {signal!r}; give each signal a name of its own")
+            signals[signal] = name
+            if unit:
+                asked.setdefault("units", {})[signal] = unit
+    return asked
+
+
+def number(name: str, text: str) -> float:
+    """A number of a field."""
+    try:
+        return float(text)
+    except ValueError:
+        raise DataError(f"{name}: {text[:40]!r} is no number; write one such as 0.5") from None
+
+
+def _whole(name: str, text: str) -> int:
+    """A whole number of a field."""
+    if not (text.isascii() and text.isdigit() and len(text) < 10):
+        raise DataError(f"{name}: {text[:40]!r} is no number of lines; write one such as 2")
+    return int(text)
+
+
+def _text(said: Mapping[str, Any], name: str) -> str:
+    value = said.get(name)
+    if value is None:
+        return ""
+    if isinstance(value, bool) or not isinstance(value, (str, int, float)):
+        raise DataError(f"{name} is no text; write one")
+    return str(value).strip() if name not in ("name",) else str(value)
+
+
+#: Outputs and inputs beyond which nobody reads a list of offers.
+MOST = 6
+
+
+def offers(inputs: Sequence[str], outputs: Sequence[str]) -> list[dict[str, str]]:
+    """Structures for each output: what they are called, what they are for, the equation, and of which output."""
+    made: list[dict[str, str]] = []
+    driven = list(inputs)[:MOST]
+    for output in list(outputs)[:MOST]:
+        drives = "".join(f" + b{k} {name}" for k, name in enumerate(driven))
+        for name, why, left, own in (
+            ("Lag", "first order: heating, filling, a motor's speed", "D", "a0 {y}"),
+            ("Lag of free order", "diffusion, batteries, creep: its order is estimated", "D^alpha", "a0 {y}"),
+            ("Oscillator", "second order: a mass on a spring", "D^2", "a1 D {y} + a0 {y}"),
+            (
+                "Oscillator, damping of free order",
+                "viscoelastic damping: its order is estimated",
+                "D^2",
+                "a1 D^mu {y} + a0 {y}",
+            ),
+            ("Oscillator of free orders", "both orders are estimated", "D^alpha", "a1 D^mu {y} + a0 {y}"),
+        ):
+            text = f"{left} {output} = {own.format(y=output)}{drives}"
+            made.append({"name": name, "why": why, "structure": text, "output": output})
+    for stage in (1, 2):
+        if {f"I{stage}", f"theta{stage}1", f"theta{stage}2"} <= {*inputs, *outputs}:
+            made.append(
+                {
+                    "name": f"Flexible link {stage}",
+                    "why": "hub and deflection of a flexible arm",
+                    "structure": f"flexible_link(stage={stage})",
+                    "output": f"theta{stage}1, theta{stage}2",
+                }
+            )
+    return made

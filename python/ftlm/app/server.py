@@ -1,0 +1,518 @@
+"""The page's door: which requests are answered, and how; everything else is refused before its body is read."""
+
+from __future__ import annotations
+
+import asyncio
+import contextlib
+import errno
+import importlib.util
+import json
+import secrets
+import signal
+import socket
+import sys
+import webbrowser
+from collections.abc import AsyncIterator, Awaitable, Callable, Mapping, MutableMapping, Sequence
+from dataclasses import dataclass
+from pathlib import Path
+from typing import TYPE_CHECKING, Any
+from urllib.parse import parse_qs
+
+from ftlm.app import views as view
+from ftlm.app.forms import asked_of
+from ftlm.app.session import MADE, Desk
+from ftlm.errors import DataError, FtlmError, ModelError
+
+if TYPE_CHECKING:
+    from uvicorn.protocols.http.h11_impl import H11Protocol
+
+Scope = MutableMapping[str, Any]
+Receive = Callable[[], Awaitable[MutableMapping[str, Any]]]
+Send = Callable[[MutableMapping[str, Any]], Awaitable[None]]
+
+#: Bytes of a request that is no file.
+MOST_WORDS = 64 << 10
+#: The page runs its own script and style, asks its own server, and is shown in nobody's frame.
+POLICY = (
+    "default-src 'none'; script-src 'self'; style-src 'self'; connect-src 'self'; img-src data:; base-uri 'none'; "
+    "form-action 'none'; frame-ancestors 'none'"
+)
+#: A report is a page of its own: its scripts run where they reach nothing of this one.
+REPORT_POLICY = "sandbox allow-scripts; frame-ancestors 'none'"
+ALWAYS = {
+    "content-security-policy": POLICY,
+    "x-content-type-options": "nosniff",
+    "referrer-policy": "no-referrer",
+    "cache-control": "no-store",
+    "x-frame-options": "DENY",
+    "cross-origin-opener-policy": "same-origin",
+    "cross-origin-resource-policy": "same-origin",
+}
+HTML, JSON, TEXT = "text/html; charset=utf-8", "application/json", "text/plain; charset=utf-8"
+
+
+@dataclass(frozen=True)
+class Answer:
+    """What is sent back.
+
+    Parameters
+    ----------
+    status
+        Of HTTP.
+    body
+        Text or bytes.
+    kind
+        Its type.
+    more
+        Further headers.
+    """
+
+    status: int
+    body: str | bytes = ""
+    kind: str = JSON
+    more: Mapping[str, str] | None = None
+
+
+class RefusedError(Exception):
+    """A request that is refused: status of HTTP and why."""
+
+    def __init__(self, status: int, why: str) -> None:
+        super().__init__(why)
+        self.status = status
+
+
+@dataclass
+class Request:
+    """A request whose head was read and found good."""
+
+    method: str
+    path: list[str]
+    query: dict[str, str]
+    headers: dict[str, str]
+    receive: Receive
+
+    async def chunks(self) -> AsyncIterator[bytes]:
+        """Its body in pieces; one that is cut off is refused."""
+        while True:
+            message = await self.receive()
+            if message["type"] == "http.disconnect":
+                raise RefusedError(400, "the upload was cut off; try again")
+            if message.get("body"):
+                yield message["body"]
+            if not message.get("more_body"):
+                return
+
+    async def words(self) -> dict[str, Any]:
+        """Its body as a JSON object."""
+        body = b""
+        async for chunk in self.chunks():
+            body += chunk
+            if len(body) > MOST_WORDS:
+                raise RefusedError(413, f"the request is longer than {MOST_WORDS >> 10} kB")
+        try:
+            said = json.loads(body)
+        except (ValueError, RecursionError):
+            raise RefusedError(400, "the request is no JSON") from None
+        if not isinstance(said, dict):
+            raise RefusedError(400, "the request is no JSON object")
+        return said
+
+
+class Door:
+    """The page as an ASGI application.
+
+    Parameters
+    ----------
+    desk
+        What lies on it.
+    token
+        What its address holds.
+    hosts
+        Names and ports by which a browser may ask for it.
+    key
+        What a first address holds that is good for one visit; it leads to the lasting one.
+    """
+
+    def __init__(self, desk: Desk, token: str, hosts: tuple[str, ...], key: str = "") -> None:
+        self._desk = desk
+        self._token = token
+        self._hosts = hosts
+        self._key = key
+
+    async def __call__(self, scope: Scope, receive: Receive, send: Send) -> None:
+        """Answer one request."""
+        if scope["type"] != "http":
+            return
+        try:
+            answer = await self._answered(self._checked(scope, receive))
+        except _LetInError:
+            answer = Answer(303, more={"location": f"/{self._token}/"})
+        except RefusedError as refused:
+            answer = Answer(refused.status, json.dumps({"error": str(refused)}))
+        except FtlmError as error:
+            words = view.page_words(self._desk.without_paths(str(error)))
+            answer = Answer(400, json.dumps({"error": words}))
+        except Exception as error:
+            # The page must be told; a traceback would name folders of this machine.
+            answer = Answer(500, json.dumps({"error": f"a fault in ftlm itself ({type(error).__name__})"}))
+        body = answer.body.encode("utf-8", "replace") if isinstance(answer.body, str) else answer.body
+        headers = {**ALWAYS, "content-type": answer.kind, "content-length": str(len(body)), **(answer.more or {})}
+        if answer.status in (403, 404, 413, 415):
+            # What is left of a refused body is not waited for.
+            headers["connection"] = "close"
+        pairs = [(name.encode(), value.encode("latin-1")) for name, value in headers.items()]
+        await send({"type": "http.response.start", "status": answer.status, "headers": pairs})
+        await send({"type": "http.response.body", "body": b"" if scope["method"] == "HEAD" else body})
+
+    def _checked(self, scope: Scope, receive: Receive) -> Request:
+        """Refuse strangers by the head of the request alone."""
+        headers: dict[str, str] = {}
+        for name, value in scope["headers"]:
+            key = name.decode("latin-1").lower()
+            if key in headers and key in ("host", "origin", "content-length"):
+                raise RefusedError(400, f"the header {key} is given twice")
+            headers[key] = value.decode("latin-1")
+        if headers.get("host", "").lower() not in self._hosts:
+            raise RefusedError(403, "this page answers to its own address alone")
+        method, origin = scope["method"], headers.get("origin")
+        if origin is not None and origin not in {f"http://{host}" for host in self._hosts}:
+            raise RefusedError(403, "another page asks; this one answers to itself alone")
+        if method not in ("GET", "HEAD") and (
+            origin is None or headers.get("sec-fetch-site", "same-origin") != "same-origin"
+        ):
+            raise RefusedError(403, "only the page itself may change what is on it")
+        path = scope["path"].split("/")[1:]
+        if method == "GET" and len(path) == 2 and path[0] == "open":
+            self._first(path[1])
+        if not secrets.compare_digest(path[0].encode("utf-8", "replace"), self._token.encode()):
+            raise RefusedError(404, "there is nothing here; use the address that ftlm app printed")
+        try:
+            query = parse_qs(scope["query_string"].decode("latin-1"), max_num_fields=10, errors="replace")
+        except ValueError:
+            raise RefusedError(400, "the address has too many fields") from None
+        return Request(method, path[1:], {k: v[0] for k, v in query.items()}, headers, receive)
+
+    def _first(self, key: str) -> None:
+        """Let the browser that was started in, once: others may have read its command line."""
+        good = bool(self._key) and secrets.compare_digest(key.encode("utf-8", "replace"), self._key.encode())
+        if not good:
+            raise RefusedError(404, "this address was good once; the one that lasts is in the terminal of ftlm app")
+        self._key = ""
+        raise _LetInError(303, "")
+
+    async def _answered(self, request: Request) -> Answer:
+        """Find who answers."""
+        method = "GET" if request.method == "HEAD" else request.method
+        match method, request.path:
+            case "GET", []:
+                raise _LetInError(303, "")
+            case "GET", [""]:
+                return Answer(200, view.page(self._desk), HTML)
+            case "GET", ["app.js"]:
+                return Answer(200, view.script(), "text/javascript; charset=utf-8")
+            case "GET", ["app.css"]:
+                return Answer(200, view.style(), "text/css; charset=utf-8")
+            case "GET", ["state"]:
+                return Answer(200, json.dumps(view.state(self._desk)))
+            case "POST", ["files"]:
+                return await self._upload(request)
+            case _, ["files", key]:
+                return await self._file(method, key, request)
+            case "POST", ["models"]:
+                model = self._desk.start(self._desk.recipe(await request.words()))
+                return Answer(200, view.model(model), HTML)
+            case "POST", ["check"]:
+                return Answer(200, json.dumps({"error": self._wrong(await request.words())}))
+            case "GET", ["comparison"]:
+                return Answer(200, view.comparison(self._desk), HTML)
+            case _, ["models", key, *what]:
+                return self._model(method, key, what)
+        known = request.path in (
+            [""],
+            ["app.js"],
+            ["app.css"],
+            ["state"],
+            ["files"],
+            ["models"],
+            ["check"],
+            ["comparison"],
+        )
+        raise RefusedError(405 if known else 404, "there is nothing here" if not known else "not in this way")
+
+    def _wrong(self, wanted: Mapping[str, Any]) -> str:
+        """What is wrong with what is asked for; nothing where it could be made."""
+        try:
+            self._desk.recipe(wanted)
+        except FtlmError as error:
+            return view.page_words(self._desk.without_paths(str(error)))
+        return ""
+
+    async def _upload(self, request: Request) -> Answer:
+        if request.headers.get("content-type", "").partition(";")[0].strip() != "application/octet-stream":
+            raise RefusedError(415, "a file is sent as it is (application/octet-stream), not as a form")
+        said = request.headers.get("content-length")
+        # Of more digits than Python reads none is a size; what comes is counted whatever is said.
+        size = int(said) if said is not None and said.isascii() and said.isdigit() and len(said) < 20 else None
+        name = request.query.get("name", "")
+        try:
+            self._desk.check_room(name, size)
+            file = await self._desk.take(name, size, request.chunks())
+        except FtlmError as error:
+            raise RefusedError(413, self._desk.without_paths(str(error))) from None
+        return Answer(200, view.file(file), HTML)
+
+    async def _file(self, method: str, key: str, request: Request) -> Answer:
+        file = self._desk.files.get(key)
+        if file is None:
+            raise RefusedError(404, "this file is no longer on the page")
+        match method:
+            case "GET":
+                pass
+            case "POST":
+                file.asked = asked_of(await request.words())
+                await self._desk.open(file)
+            case "DELETE":
+                self._desk.remove_file(key)
+                return Answer(200, "{}")
+            case _:
+                raise RefusedError(405, "not in this way")
+        return Answer(200, view.file(file), HTML)
+
+    def _model(self, method: str, key: str, what: list[str]) -> Answer:
+        model = self._desk.models.get(key)
+        if model is None:
+            raise RefusedError(404, "this model is no longer on the page")
+        match method, what:
+            case "GET", []:
+                return Answer(200, view.model(model), HTML)
+            case "POST", ["stop"]:
+                self._desk.stop(key)
+                return Answer(200, view.model(model), HTML)
+            case "POST", ["resume"]:
+                return Answer(200, view.model(self._desk.resume(key)), HTML)
+            case "DELETE", []:
+                self._desk.remove_model(key)
+                return Answer(200, "{}")
+            case "GET", ["report" | "model" | "script" | "page"]:
+                if model.state != MADE or model.told is None:
+                    raise RefusedError(404, "this model is not made yet")
+                return self._download(key, what[0], Path(model.recipe.estimation.file).stem)
+        raise RefusedError(405 if what in ([], ["stop"], ["resume"]) else 404, "not in this way")
+
+    def _download(self, key: str, what: str, stem: str) -> Answer:
+        """A file of a model; its path is of this program, never of a request."""
+        model = self._desk.models[key]
+        ending, kind = {
+            "report": ("report.html", HTML),
+            "page": ("report.html", HTML),
+            "model": ("model.json", JSON),
+            "script": ("script.py", TEXT),
+        }[what]
+        if what == "script":
+            content = str((model.told or {})["script"]).encode("utf-8", "replace")
+        else:
+            suffix = "json" if what == "model" else "html"
+            try:
+                content = (self._desk.folder / f"{key}.{suffix}").read_bytes()
+            except OSError:
+                raise RefusedError(404, "its file is no longer there") from None
+        policy = {"content-security-policy": REPORT_POLICY}
+        if what == "page":
+            return Answer(200, content, kind, policy)
+        plain = "".join(c if c.isascii() and (c.isalnum() or c in "._-") else "_" for c in stem)[:80] or "ftlm"
+        name = f'attachment; filename="{plain}-{model.number}-{ending}"'
+        return Answer(200, content, kind, {"content-disposition": name, **policy})
+
+
+class _LetInError(RefusedError):
+    """Who came by the first address, or without the last stroke of the lasting one, is sent on."""
+
+
+#: Seconds that a client may take for a request's head, between two pieces of its body, and for a part of an answer.
+PATIENCE = 20.0
+
+
+def patient() -> type[H11Protocol]:
+    """Make the connections of uvicorn that are looked at twice in the time of :data:`PATIENCE`.
+
+    Its own limit holds for connections that have been answered and then are silent altogether.
+    """
+    import h11  # noqa: PLC0415 — an extra
+    from uvicorn.protocols.http.h11_impl import H11Protocol  # noqa: PLC0415 — an extra
+
+    class Connection(H11Protocol):
+        """One that looks after itself."""
+
+        _since = 0.0
+        _unread = 0
+        _next: asyncio.TimerHandle | None = None
+
+        def connection_made(self, transport: asyncio.Transport) -> None:  # type: ignore[override]
+            """Begin to wait."""
+            super().connection_made(transport)
+            self._since = self.loop.time()
+            self._again()
+
+        def data_received(self, data: bytes) -> None:
+            """Take a piece: of a body it is a sign of life, of a head only the last one is."""
+            before = self.conn.their_state
+            super().data_received(data)
+            if self.conn.their_state is not before or before is h11.SEND_BODY:
+                self._since = self.loop.time()
+
+        def on_response_complete(self) -> None:
+            """Wait for the next head from here on."""
+            super().on_response_complete()
+            self._since = self.loop.time()
+
+        def connection_lost(self, exc: Exception | None) -> None:
+            """Wait no longer."""
+            if self._next is not None:
+                self._next.cancel()
+            super().connection_lost(exc)
+
+        def _again(self) -> None:
+            self._next = self.loop.call_later(PATIENCE / 2, self._look)
+
+        def _look(self) -> None:
+            """End what is silent for too long, and what does not read what it is sent."""
+            unread, before = self.transport.get_write_buffer_size(), self._unread
+            self._unread = unread
+            if unread < before or (unread and not before):
+                self._since = self.loop.time()
+            owes = bool(unread) or self.conn.their_state in (h11.IDLE, h11.SEND_BODY)
+            if owes and self.loop.time() - self._since >= PATIENCE:
+                # Not closed: that would wait for what was sent to be read.
+                self.transport.abort()
+            else:
+                self._again()
+
+    return Connection
+
+
+#: Where the page is if nobody says otherwise, and whoever else takes part of a request at a time.
+PORT, ADDRESS = 8347, "127.0.0.1"
+MOST_CONNECTIONS = 100
+CHUNK = 1 << 20
+
+
+def check_installed() -> None:
+    """Refuse where what serves pages is missing."""
+    if importlib.util.find_spec("uvicorn") is None:
+        raise ModelError("ftlm app needs uvicorn; run: pip install 'ftlm[app]'")
+
+
+def listening(port: int | None) -> tuple[socket.socket, str]:
+    """A socket that listens on this machine alone, and what is to be said of its port.
+
+    Parameters
+    ----------
+    port
+        Which; None for the usual one, or any other where that is taken.
+
+    Raises
+    ------
+    DataError
+        The port is taken, not allowed, or none.
+    """
+    if port is not None and not 0 <= port <= 65535:
+        raise ModelError(f"--port {port} is none; take one from 1024 to 65535, or 0 for any")
+    wanted = PORT if port is None else port
+    sock = socket.socket(socket.AF_INET, socket.SOCK_STREAM)
+    if sys.platform != "win32":
+        # There it would let two programs share the port.
+        sock.setsockopt(socket.SOL_SOCKET, socket.SO_REUSEADDR, 1)
+    try:
+        sock.bind((ADDRESS, wanted))
+        sock.listen(MOST_CONNECTIONS)
+    except OSError as error:
+        sock.close()
+        taken = error.errno == errno.EADDRINUSE
+        if port is None and taken:
+            return listening(0)[0], f"port {PORT} is taken, perhaps by another ftlm app; this one has a port of its own"
+        why = "is taken, perhaps by another ftlm app" if taken else f"cannot be used ({error.strerror})"
+        raise DataError(f"--port {wanted} {why}; take another one, or leave it out") from None
+    return sock, ""
+
+
+def serve(files: Sequence[str] = (), *, port: int | None = None, browser: bool = True) -> None:
+    """Serve the page until Ctrl-C.
+
+    Parameters
+    ----------
+    files
+        To open at once.
+    port
+        Of 127.0.0.1.
+    browser
+        Whether to open a browser.
+
+    Raises
+    ------
+    DataError
+        A file that is not there, a port that is taken.
+    ModelError
+        What serves pages is not installed.
+    """
+    check_installed()
+    paths = [Path(file) for file in files]
+    for path in paths:
+        if not path.is_file():
+            raise DataError(f"{str(path)!r} is no file; check the path")
+    sock, note = listening(port)
+    if note:
+        print(f"ftlm: {note}", file=sys.stderr)
+    with sock, contextlib.suppress(KeyboardInterrupt):
+        asyncio.run(_serve(sock, paths, browser))
+    print("\nftlm app has ended; its files are removed", file=sys.stderr)
+
+
+async def _serve(sock: socket.socket, paths: Sequence[Path], browser: bool) -> None:
+    import uvicorn  # noqa: PLC0415 — an extra
+
+    token, key = secrets.token_urlsafe(24), secrets.token_urlsafe(24)
+    own = sock.getsockname()[1]
+    hosts = (f"{ADDRESS}:{own}", f"localhost:{own}")
+    desk = Desk()
+    config = uvicorn.Config(
+        Door(desk, token, hosts, key if browser else ""),
+        log_config=None,
+        log_level="critical",
+        access_log=False,
+        lifespan="off",
+        server_header=False,
+        ws="none",
+        http=patient(),
+        loop="asyncio",
+        timeout_keep_alive=15,
+        timeout_graceful_shutdown=1,
+        limit_concurrency=MOST_CONNECTIONS,
+        proxy_headers=False,
+    )
+    server = uvicorn.Server(config)
+    for name in ("SIGTERM", "SIGHUP"):
+        if hasattr(signal, name) and signal.getsignal(getattr(signal, name)) is not signal.SIG_IGN:
+            signal.signal(getattr(signal, name), lambda *_: setattr(server, "should_exit", True))
+    address = f"http://{hosts[0]}/{token}/"
+    try:
+        for path in paths:
+            await desk.take(path.name, path.stat().st_size, _pieces(path))
+        print(f"ftlm app: {address}\nCtrl-C ends it. Who knows this address can use it: do not pass it on.", flush=True)
+        opener = None
+        if browser:
+            first = f"http://{hosts[0]}/open/{key}"
+            opener = asyncio.get_running_loop().run_in_executor(None, webbrowser.open, first)
+        await server.serve(sockets=[sock])
+        del opener
+    finally:
+        # Ctrl-C cancels what is awaited next, which must not be the end of the work.
+        with contextlib.suppress(asyncio.CancelledError):
+            await asyncio.sleep(0)
+        await desk.close()
+
+
+async def _pieces(path: Path) -> AsyncIterator[bytes]:
+    """A file of this machine, in pieces."""
+    with open(path, "rb") as stream:
+        while piece := stream.read(CHUNK):
+            yield piece

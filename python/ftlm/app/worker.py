@@ -1,0 +1,145 @@
+"""Opens a file or makes a model in a process of its own, which a hostile file or a long fit may take with it.
+
+Run as ``python -P -m ftlm.app.work`` in the folder of the files. The first line of standard input is the task, a JSON
+object: ``{"do": "open", "file": …, "options": …}`` or ``{"do": "model", "recipe": …, "store": …, "model": …,
+"report": …}``; where it ends, so does this process. Standard output has a JSON object a line: ``{"phase": words}``,
+``{"done": …, "total": …}`` and at last ``{"answer": …}`` or ``{"error": words}``.
+"""
+
+from __future__ import annotations
+
+import importlib
+import json
+import os
+import sys
+import threading
+import time
+from collections.abc import Mapping
+from typing import Any, TextIO
+
+from ftlm.app.forms import Recipe, offers
+from ftlm.app.views import pictures, shown
+from ftlm.errors import FtlmError
+from ftlm.io.preview import OpenedFile, open_file
+from ftlm.progress import Progress
+
+#: Memory that opening a file may take [bytes], and seconds between two reports of progress.
+MEMORY_LIMIT = 6 << 30
+PAUSE = 0.1
+#: Columns of a file that the page shows.
+MOST_COLUMNS = 200
+
+
+class Reports(Progress):
+    """Passes on what work says of itself, a line a report; several threads may tell it."""
+
+    def __init__(self, stream: TextIO) -> None:
+        super().__init__("", quiet=True)
+        self._stream = stream
+        self._turn = threading.Lock()
+        self._last = 0.0
+
+    def send(self, **facts: Any) -> None:
+        """Write one line."""
+        line = json.dumps(facts, allow_nan=False)
+        with self._turn:
+            self._stream.write(line + "\n")
+            self._stream.flush()
+
+    def phase(self, words: str) -> None:
+        """Say what comes next."""
+        self.send(phase=words)
+
+    def __call__(self, done: int, total: int, pruned: int | None = None) -> None:
+        """Say how far it is, now and then."""
+        now = time.monotonic()
+        if now - self._last >= PAUSE or done >= total:
+            self._last = now
+            self.send(done=int(done), total=int(total))
+
+
+def main() -> None:
+    """Do the task of standard input."""
+    # What anything prints must not stand between the answers.
+    stream = os.fdopen(os.dup(sys.stdout.fileno()), "w", encoding="utf-8")
+    os.dup2(os.open(os.devnull, os.O_WRONLY), sys.stdout.fileno())
+    reports = Reports(stream)
+    task = json.loads(sys.stdin.readline())
+    threading.Thread(target=_end_with_parent, daemon=True).start()
+    _limit_memory()
+    try:
+        answer = opened(task) if task["do"] == "open" else modelled(task, reports)
+    except FtlmError as error:
+        reports.send(error=str(error))
+    except MemoryError:
+        reports.send(error="it needs more memory than there is; take a shorter file, or a coarser step")
+    except Exception as error:
+        reports.send(error=f"a fault in ftlm itself ({type(error).__name__}: {error}); please report it")
+    else:
+        reports.send(answer=answer)
+
+
+def _end_with_parent() -> None:
+    """End at once where nobody is left to listen."""
+    sys.stdin.read()
+    os._exit(1)
+
+
+def _limit_memory() -> None:
+    """Bound this process's memory where the system can."""
+    try:
+        resource: Any = importlib.import_module("resource")
+    except ImportError:
+        return
+    _, hard = resource.getrlimit(resource.RLIMIT_AS)
+    try:
+        resource.setrlimit(resource.RLIMIT_AS, (MEMORY_LIMIT, hard))
+        resource.setrlimit(resource.RLIMIT_CORE, (0, 0))
+    except (OSError, ValueError):
+        return
+
+
+def opened(task: Mapping[str, Any]) -> dict[str, Any]:
+    """What a file is, as the page shows it."""
+    found = open_file(task["file"], **task["options"])
+    told = found.to_dict()
+    return {
+        "kind": found.kind,
+        "rows": found.rows,
+        "columns": told["columns"][:MOST_COLUMNS],
+        "hidden": max(len(found.columns) - MOST_COLUMNS, 0),
+        "assumed": [a.words for a in found.assumed],
+        "options": told["options"],
+        "step": found.step,
+        "problem": found.problem,
+        "notes": list(found.notes),
+        "offers": [] if found.problem else offers(*_signals(found)),
+        **_seen(found),
+    }
+
+
+def _signals(found: OpenedFile) -> tuple[list[str], list[str]]:
+    inputs, outputs = ([c.signal for c in found.columns if c.role == role] for role in ("input", "output"))
+    return inputs, outputs
+
+
+def _seen(found: OpenedFile) -> dict[str, Any]:
+    """The run of a file: its picture, and what to know before a model is made of it."""
+    if found.problem:
+        return {"figures": [], "advice": [], "length": 0}
+    # The rows that were shown are those that are fitted: read once more, everything said.
+    run = found.load()
+    return {"figures": pictures(run), "advice": [a.sentence for a in run.advice()], "length": run.length}
+
+
+def modelled(task: Mapping[str, Any], reports: Reports) -> dict[str, Any]:
+    """A model, its files and what the page shows of it."""
+    made = Recipe.of(task["recipe"]).made(reports, task["store"])
+    reports.phase("writing the report")
+    made.result.model.save(task["model"])
+    made.result.report(task["report"], validation=made.other)
+    return shown(made)
+
+
+if __name__ == "__main__":
+    main()

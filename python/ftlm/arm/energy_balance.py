@@ -1,0 +1,236 @@
+"""Energies (7)-(9) and generalised forces (10)-(11) of a run of one stage, and where their power goes."""
+
+from __future__ import annotations
+
+import math
+from collections.abc import Mapping
+from dataclasses import dataclass
+
+import numpy as np
+
+from ftlm import _core
+from ftlm.arm.flexible_link import PARAMETERS, LinkParameters, order_law, whole_order
+from ftlm.data.run import Run
+from ftlm.errors import DataError, ModelError
+from ftlm.fractional_calculus import fractional_derivative
+from ftlm.utils.validation import Floats
+
+#: A force of order nu is a sum over relaxations at rates from this share of 1/T to so many times 1/h; slower ones are a
+#: spring, faster ones a dashpot, exactly.
+SLOWEST, FASTEST = 1e-3, 1e3
+#: Distance of two rates in their logarithm: the sum is then the integral to 1e-6.
+APART = 0.5
+#: An angle is at rest where it starts within this share of its largest value, its first difference within that of the
+#: largest one, or, in few samples, of the second: from rest t^alpha has 1/3 of it with alpha = 2, and 0.55 with 1.5.
+STARTS, MOVES_OFF, SPEEDS_UP = 0.01, 0.1, 2 / 3
+#: Rows that differences of third order need.
+FEWEST = 4
+
+
+@dataclass(frozen=True)
+class Power:
+    """Power of one force c D^nu theta on its own angle, and what becomes of it, each of shape (N,).
+
+    Parameters
+    ----------
+    supplied
+        c D^nu theta times the rate of theta [W].
+    stored
+        What of it can come back [J]: all of a spring's (nu = 0), nothing of a dashpot's (nu = 1).
+    lost
+        What cannot [W], never negative.
+    """
+
+    supplied: Floats
+    stored: Floats
+    lost: Floats
+
+
+@dataclass(frozen=True)
+class Energies:
+    """Energies and generalised forces of a run of one stage at its N samples, each of shape (N,).
+
+    Parameters
+    ----------
+    time
+        [s].
+    potential
+        Viscoelastic potential energy of the link as (7) has it: with K_s in N m/rad and beta_2 = 0 in J.
+    hub_kinetic, link_kinetic
+        Kinetic energies (8); with gamma_1 = mu_2 = 1 in J.
+    hub_force, link_force
+        Non-conservative generalised forces (10), (11) [N m].
+    motor
+        Power of the motor's torque on its hub [W].
+    inertia
+        Power that the inertial terms of (14) and (15) take [W]: with whole orders the rate of (9).
+    elastic, hub_friction, link_friction
+        Of the link's elasticity K_s D^beta_2, of the friction B_1 D^gamma_1 of the hub, and B_2 D^mu_2 of the link.
+    """
+
+    time: Floats
+    potential: Floats
+    hub_kinetic: Floats
+    link_kinetic: Floats
+    hub_force: Floats
+    link_force: Floats
+    motor: Floats
+    inertia: Floats
+    elastic: Power
+    hub_friction: Power
+    link_friction: Power
+
+    @property
+    def kinetic(self) -> Floats:
+        """Total kinetic energy (9)."""
+        return self.hub_kinetic + self.link_kinetic
+
+    @property
+    def lagrangian(self) -> Floats:
+        """L = Tr - V, of which (12) and (13) are made."""
+        return self.kinetic - self.potential
+
+
+def energies(
+    run: Run, *, stage: int = 1, parameters: LinkParameters | None = None, orders: Mapping[str, float] | None = None
+) -> Energies:
+    """Energies and generalised forces of a run of one stage by (7)-(11), and the balance of their power.
+
+    Multiplied by the rates of their angles, (14) and (15) say where the motor's power goes: into inertia, into the
+    link's elasticity, and into both frictions. A force of fractional order stores a part of what it takes and loses
+    the rest: c D^nu theta is a sum of relaxing springs (its diffusive representation), whose energies add up.
+
+    Parameters
+    ----------
+    run
+        I1, theta11, theta12 or I2, theta21, theta22, in A and rad, from rest, at least 4 rows. Angles are
+        differentiated: noise is not for this; use what :func:`ftlm.simulate` gives.
+    stage
+        1 or 2.
+    parameters
+        Of the stage; default the maker's effective ones.
+    orders
+        alpha, gamma of the hub and alpha, beta, mu of the link by name; what is not given is the manual's whole one.
+
+    Returns
+    -------
+    Energies
+        At the run's samples.
+
+    Raises
+    ------
+    ModelError
+        A stage or an order that is not known, an order of a force outside [0, 1].
+    DataError
+        A run that lacks one of the three signals, has fewer than 4 rows, or an angle that does not start at rest at 0.
+    """
+    law = order_law(stage)
+    h, d = 2 * stage - 1, 2 * stage
+    free = [f"alpha{h}", f"alpha{d}", f"gamma{h}", f"beta{d}", f"mu{d}"]
+    for name in orders or {}:
+        if name not in free:
+            raise ModelError(f"order {name!r} is not known; the stage's free orders are {', '.join(free)}")
+    at = {n: float((orders or {}).get(n, whole_order(n))) for n in free}
+    for name in free[2:]:
+        if not 0.0 <= at[name] <= 1.0:
+            raise ModelError(
+                f"{name} = {at[name]:g} is outside [0, 1], where a force stores and loses, and gives nothing"
+            )
+    link = parameters or PARAMETERS["effective"][stage]
+    hub, bend, current = (
+        np.asarray(run[n], dtype=np.float64) for n in (f"theta{stage}1", f"theta{stage}2", f"I{stage}")
+    )
+    step = run.step
+    if run.length < FEWEST:
+        raise DataError(f"run {run.name!r} has {run.length} rows; energies need at least {FEWEST}")
+    for name, angle in ((f"theta{stage}1", hub), (f"theta{stage}2", bend)):
+        _check_rest(run.name, name, angle)
+
+    def rate(x: Floats, order: float) -> Floats:
+        return fractional_derivative(x, order, step=step, definition="caputo", initial=[0.0, 0.0, 0.0])
+
+    hub_rate, bend_rate = rate(hub, 1.0), rate(bend, 1.0)
+    turning, bending = rate(hub, at[f"gamma{h}"]), rate(bend, at[f"mu{d}"])
+    elastic = rate(bend, at[f"beta{d}"])
+    j1, j2 = link.hub_inertia, link.link_inertia
+    # (14) and (15), with every order as the law has it.
+    across = at[f"alpha{h}"] - at[f"gamma{h}"] + at[f"mu{d}"]
+    inertia = hub_rate * ((j1 + j2) * rate(hub, at[f"alpha{h}"]) + j2 * rate(bend, across))
+    inertia += bend_rate * j2 * (rate(hub, law[f"gamma{d}"].at(at)) + rate(bend, at[f"alpha{d}"]))
+    torque = link.torque_constant * current
+    time: Floats = np.arange(run.length, dtype=np.float64) * step
+    return Energies(
+        time,
+        0.5 * link.stiffness * elastic**2,
+        0.5 * j1 * turning**2,
+        0.5 * j2 * (turning + bending) ** 2,
+        torque - link.hub_friction * turning,
+        -link.link_friction * bending,
+        torque * hub_rate,
+        inertia,
+        power(bend, link.stiffness, at[f"beta{d}"], step),
+        power(hub, link.hub_friction, at[f"gamma{h}"], step),
+        power(bend, link.link_friction, at[f"mu{d}"], step),
+    )
+
+
+def _check_rest(run: str, name: str, angle: Floats) -> None:
+    """Every derivative here is one of rest: what was there before would be taken for a blow at the first sample."""
+    moves = np.diff(angle)
+    way_out = (
+        "energies are those of a run from rest, with angles from 0: slice it where it rests, and take that angle off"
+    )
+    if abs(angle[0]) > STARTS * np.max(np.abs(angle)):
+        raise DataError(f"run {run!r}: {name} starts at {angle[0]:.4g} rad, not at 0; {way_out}")
+    if abs(moves[0]) > max(MOVES_OFF * np.max(np.abs(moves)), SPEEDS_UP * abs(moves[1])):
+        raise DataError(f"run {run!r}: {name} moves by {moves[0]:.4g} rad in its first step; {way_out}")
+
+
+def power(angle: Floats, coefficient: float, order: float, step: float) -> Power:
+    """Power of c D^nu theta on theta, from rest: what it stores and what it loses.
+
+    D^nu theta = sin(pi nu)/pi times the integral over w from 0 of w^(nu-1) z_w, where z_w' = -w z_w + theta'. Every z_w
+    is a spring behind a dashpot: it stores z_w^2/2 and loses w z_w^2.
+
+    Parameters
+    ----------
+    angle
+        theta [rad], shape (N,), N at least 2; starts at rest at 0.
+    coefficient
+        c [N m s^nu/rad].
+    order
+        nu, from 0 (a spring) to 1 (a dashpot).
+    step
+        [s].
+
+    Returns
+    -------
+    Power
+        At the N samples.
+    """
+    start = np.concatenate([[0.0], np.diff(angle)])
+    rate = np.gradient(angle, step)
+    nothing = np.zeros(angle.size)
+    if order == 0.0:
+        return Power(coefficient * angle * rate, 0.5 * coefficient * angle**2, nothing)
+    if order == 1.0:
+        return Power(coefficient * rate**2, nothing, coefficient * rate**2)
+    duration = step * (angle.size - 1)
+    low, high = math.log(SLOWEST / duration), math.log(FASTEST / step)
+    count = max(2, round((high - low) / APART))
+    share = math.sin(math.pi * order) / math.pi
+    # Ends of the range lie between two rates, where those of the sum's weight end.
+    width = (high - low) / count
+    rates = np.exp(low + width * (np.arange(count) + 0.5))
+    spring, dashpot = share * math.exp(low * order) / order, share * math.exp(high * (order - 1.0)) / (1.0 - order)
+    force = spring * angle + dashpot * rate
+    stored, lost = 0.5 * spring * angle**2, dashpot * rate**2
+    k = np.arange(angle.size)
+    for w, weight in zip(rates.tolist(), (share * width * rates**order).tolist(), strict=True):
+        # Of an angle that is straight between two samples z is exact.
+        decay = np.exp(-w * step * k) * (-math.expm1(-w * step) / (w * step))
+        z = _core.series_multiply(decay, start, angle.size)
+        force += weight * z
+        stored += 0.5 * weight * z**2
+        lost += weight * w * z**2
+    return Power(coefficient * force * rate, coefficient * stored, coefficient * lost)

@@ -1,0 +1,531 @@
+"""Physical parameters of the two-link arm: named sets."""
+
+from __future__ import annotations
+
+from collections.abc import Mapping, Sequence
+from dataclasses import dataclass, replace
+from typing import Literal, TypeAlias
+
+from msgspec import UNSET
+
+from ftlm.errors import ModelError
+from ftlm.model.model import Model
+from ftlm.structure.equation import Equation, Friction, Stribeck, Term
+from ftlm.structure.order import Order
+from ftlm.structure.sensor_filter import SensorFilter
+from ftlm.structure.structure import Hints, Structure, check_offset
+from ftlm.utils.validation import shown
+
+
+@dataclass(frozen=True)
+class LinkParameters:
+    """Physical parameters of one stage.
+
+    Parameters
+    ----------
+    stiffness
+        Viscoelastic coefficient of the link, K_s [N m/rad] (for integer orders).
+    hub_inertia, link_inertia
+        J_j1 and J_j2 [kg m^2].
+    hub_friction, link_friction
+        B_j1 and B_j2 [N m s/rad].
+    torque_constant
+        Torque at the hub per ampere of motor current [N m/A].
+    """
+
+    stiffness: float
+    hub_inertia: float
+    link_inertia: float
+    hub_friction: float
+    link_friction: float
+    torque_constant: float
+
+    @property
+    def inertia_ratio(self) -> float:
+        """Inertia ratio r = (J_1 + J_2) / J_2, by which the coefficients of the deflection exceed those of the hub."""
+        return (self.hub_inertia + self.link_inertia) / self.link_inertia
+
+    def coefficients(self, stage: int) -> dict[str, float]:
+        """Coefficients a, b, d, g of both equations of a stage, by name (paper, after (21))."""
+        hub, deflection = 2 * stage - 1, 2 * stage
+        a, b = self.stiffness / self.hub_inertia, -self.hub_friction / self.hub_inertia
+        d, g = self.link_friction / self.hub_inertia, self.torque_constant / self.hub_inertia
+        r = self.inertia_ratio
+        return {
+            f"a{hub}": a,
+            f"b{hub}": b,
+            f"d{hub}": d,
+            f"g{hub}": g,
+            f"a{deflection}": -a * r,
+            f"b{deflection}": -b,
+            f"d{deflection}": 0.0 - d * r,
+            f"g{deflection}": -g,
+        }
+
+    def lagrange_coefficients(self, stage: int) -> dict[str, float]:
+        """Coefficients a, b, d, g of the hub's equation and a, b, d of the deflection's as (15) has them."""
+        hub, deflection = 2 * stage - 1, 2 * stage
+        own = {n: v for n, v in self.coefficients(stage).items() if n.endswith(str(hub))}
+        stiffness, friction = self.stiffness / self.link_inertia, self.link_friction / self.link_inertia
+        return own | {f"a{deflection}": -stiffness, f"b{deflection}": -1.0, f"d{deflection}": 0.0 - friction}
+
+
+#: Named parameter sets, by stage. "effective" reproduces the integer-order rows of the paper's Tables 4 and 5: the
+#: torque per ampere holds gear efficiency, gear ratio and torque constant. "table-3" is the paper's Table 3 as printed,
+#: whose stiffnesses are about 14.8 times smaller and whose torque constants lack gear and efficiency.
+PARAMETERS: dict[str, dict[int, LinkParameters]] = {
+    "effective": {
+        1: LinkParameters(39.9572, 0.0635362, 0.170434, 4.0, 0.0, 0.75 * 100 * 0.119),
+        2: LinkParameters(6.85775, 0.00301955, 0.0064387, 1.5, 0.085608, 0.75 * 50 * 0.0232),
+    },
+    "table-3": {
+        1: LinkParameters(2.69, 0.0635, 0.1704, 4.0, 0.421, 0.119),
+        2: LinkParameters(0.463, 0.003, 0.0064, 1.5, 0.856, 0.0234),
+    },
+}
+#: The manual's integer orders: alpha = 2, stiffness on the angle, damping and friction on its rate.
+INTEGER_ORDERS = {"gamma": 1.0, "beta": 0.0, "mu": 1.0}
+
+
+def whole_order(name: str) -> float:
+    """The manual's integer order of an order's name, such as gamma1."""
+    return INTEGER_ORDERS.get(name.rstrip("0123456789"), 2.0)
+
+
+#: Orders of the cross-stage terms: torques of the other stage act through its angles and its current as they are.
+CROSS_ORDER = 0.0
+#: A link is second order or a little less.
+HIGHEST = (1.2, 2.0)
+#: Values beside the whole orders of a link's physics: damping on the rate or a little below, stiffness on the angle.
+NATURAL = {"alpha": (2.0,), "gamma": (0.9, 1.0), "beta": (0.0, 0.15), "mu": (0.8, 1.0)}
+#: Where the orders of a link's elasticity and of its damping lie (low, high, step) where no other equation tells them.
+APART = {"beta": (0.0, 0.5, 0.05), "mu": (0.5, 1.95, 0.05)}
+#: Orders by the letter of the coefficient whose term they differentiate, as in (22)-(25).
+ORDER_OF = {"a": "beta", "b": "gamma", "d": "mu"}
+Form: TypeAlias = Literal["lagrange", "published"]
+InputOrder: TypeAlias = Literal["published", "derived"]
+CrossStage: TypeAlias = Literal["torques", "inertial"] | bool
+Rubs: TypeAlias = Literal["coulomb", "stribeck"] | bool
+Law: TypeAlias = Literal["orders", "coefficients", "velocities"]
+#: What is known of the arm.
+LAWS = ("orders", "coefficients", "velocities")
+
+
+def _hints(form: Form) -> Hints:
+    """What no order law changes: where the orders of either stage lie, what they are called, and what ratios exceed."""
+    return Hints(
+        HIGHEST,
+        {f"{order}{n}": values for order, values in NATURAL.items() for n in range(1, 5)},
+        {f"{letter}{n}": f"{order}{n}" for letter, order in ORDER_OF.items() for n in range(1, 5)},
+        {"j1": 0.0, "j2": 0.0} if form == "lagrange" else {"r1": 1.0, "r2": 1.0},
+        ("a1", "d1", "a3", "d3") if form == "lagrange" else (),
+        {"b2": -1.0, "b4": -1.0} if form == "lagrange" else {},
+    )
+
+
+def _form(form: Form | None, input_order: InputOrder | None) -> tuple[Form, InputOrder]:
+    """The form that is asked for: naming an order of the current names the form that has one."""
+    if form is None:
+        form = "lagrange" if input_order is None else "published"
+    if form not in ("lagrange", "published"):
+        raise ModelError(f"form = {form!r} is not known; use 'lagrange' or 'published'")
+    if form == "lagrange" and input_order is not None:
+        raise ModelError(
+            f"input_order = {input_order!r} is not used by form='lagrange', whose deflection does not see the current; "
+            "leave it out, or use form='published'"
+        )
+    input_order = input_order or "published"
+    if input_order not in ("published", "derived"):
+        raise ModelError(f"input_order = {input_order!r} is not known; use 'published' or 'derived'")
+    return form, input_order
+
+
+def order_law(
+    stage: int, input_order: InputOrder | None = None, *, form: Form | None = None, velocities: bool = False
+) -> dict[str, Order]:
+    """Every order of a stage's two equations as a function of the five free ones.
+
+    Parameters
+    ----------
+    stage
+        1 or 2.
+    input_order
+        ``"published"`` or ``"derived"``, of the published form.
+    form
+        ``"lagrange"`` or ``"published"``, see :func:`flexible_link`; default lagrange, or published where an input
+        order is named.
+    velocities
+        Whether gamma_1 = mu_2, so that D^gamma_1 theta_11 and D^mu_2 theta_12, which (8) adds, are velocities of one
+        kind; the hub angle then stands in the deflection's equation (15) with alpha_2 itself.
+
+    Returns
+    -------
+    dict
+        alpha, beta, gamma, mu of the hub (index 2*stage - 1) and of the deflection (2*stage). The hub angle stands in
+        the deflection's equation with gamma_2 = alpha_2 - mu_2 + gamma_1 (15), above alpha_2 where gamma_1 exceeds
+        mu_2; in the published form with 2 gamma_1 - alpha_1 + alpha_2 - mu_2. That form also has ``input``, the order
+        of the current in the deflection's equation: 0 as published in (23), alpha_2 - mu_2 + gamma_1 - alpha_1 as
+        derived (the published elimination drops it).
+
+    Raises
+    ------
+    ModelError
+        A stage that is neither 1 nor 2, a form or an input order that is not known or not of that form.
+    """
+    if stage not in (1, 2):
+        raise ModelError(f"stage = {stage!r} is not known; use 1, 2 or 'both'")
+    form, input_order = _form(form, input_order)
+    h, d = 2 * stage - 1, 2 * stage
+    law = {
+        f"alpha{h}": f"alpha{h}",
+        f"beta{h}": f"alpha{h} - alpha{d} + mu{d} - gamma{h} + beta{d}",
+        f"gamma{h}": f"gamma{h}",
+        f"mu{h}": f"alpha{h} - alpha{d} + 2*mu{d} - gamma{h}",
+        f"alpha{d}": f"alpha{d}",
+        f"beta{d}": f"beta{d}",
+        f"gamma{d}": f"alpha{d} - mu{d} + gamma{h}",
+        f"mu{d}": f"mu{d}",
+    }
+    if form == "published":
+        law[f"gamma{d}"] = f"2*gamma{h} - alpha{h} + alpha{d} - mu{d}"
+        law["input"] = f"alpha{d} - mu{d} + gamma{h} - alpha{h}" if input_order == "derived" else "0"
+    if velocities:
+        law = {name: text.replace(f"gamma{h}", f"mu{d}") for name, text in law.items()}
+    return {name: Order.parse(text) for name, text in law.items()}
+
+
+def flexible_link(
+    *,
+    stage: Literal[1, 2, "both"] = 1,
+    form: Form | None = None,
+    input_order: InputOrder | None = None,
+    coupling: Literal["simulated", "measured"] | None = None,
+    cross_stage: CrossStage = False,
+    friction: Rubs = False,
+    cross_sensitivity: bool = False,
+    cross_damping: bool = False,
+    hub: bool = True,
+    laws: Sequence[Law] = ("orders", "coefficients"),
+    parameters: Literal["effective", "table-3"] = "effective",
+    sensor_filter: SensorFilter | Literal["stock"] | None = None,
+    offset: Literal["none", "constant", "ramp"] = "none",
+) -> Structure:
+    """Make the physics of a flexible link: two equations a stage, of its hub and of its deflection.
+
+    Parameters
+    ----------
+    stage
+        1 (theta11, theta12, I1), 2 (theta21, theta22, I2) or both.
+    form
+        ``"lagrange"``, the default: the Euler-Lagrange equations (14)-(15) with (16), nothing eliminated. The
+        deflection hangs on the hub's motion alone, D^alpha_2 theta_12 = a_2 D^beta_2 theta_12 - D^(alpha_2 - mu_2 +
+        gamma_1) theta_11 + d_2 D^mu_2 theta_12 with a_2 = -K_s/J_2 and d_2 = -B_2/J_2: no current, no hub friction and
+        no motor constant in it, and a signal above its own highest order where gamma_1 exceeds mu_2. The hub's equation
+        is (17).
+        ``"published"``: (22)-(25) as printed. There the hub's acceleration is eliminated from the deflection's
+        equation, and with it a derivative of the current is dropped: with fractional orders that link bends the wrong
+        way (its deflection goes with the current where a real one goes against it). It is the paper's, for its tables.
+    input_order
+        Of the published form: order of the current in the deflection's equation, see :func:`order_law`. ``"derived"``
+        is the Lagrange form with the hub's acceleration eliminated and nothing dropped: the same free runs, but what
+        bends the link is then the small difference of large terms. Naming it chooses the published form.
+    coupling
+        ``"measured"``: each equation is driven by the other angle as it was measured, the default of the Lagrange form.
+        ``"simulated"``: both follow from the currents alone, the default of the published one; noise of the hub's angle
+        then drives nothing.
+    cross_stage
+        ``"torques"`` (or True) adds the other stage's angles and current to every equation (order 0).
+        ``"inertial"``, of the Lagrange form, adds what the energies of the planar arm give, linearised: hub 2 sits on
+        the tip of link 1, so the accelerations of stage 2 push back on link 1 (p_2 D^2 theta_21 + q_2 D^2 theta_22) and
+        those of stage 1 carry hub 2 and link 2 with them (p_3, p_4 of theta_11, q_3, q_4 of theta_12); hub 1 feels
+        stage 2 through its link alone. With ``stage="both"`` the other stage is modelled too, and velocities add up as
+        in (8): theta_21 stands in the equation of theta_12 with alpha_2 - mu_2 + gamma_3, and so on. Of a stage alone
+        these terms are of the order of their equation, alpha_2, alpha_3 or alpha_4.
+    friction
+        ``"coulomb"`` (or True) adds Coulomb friction to the hub's equation. With ``coupling="simulated"``, in the
+        Lagrange form, it is - fc_j * sign(D theta_j1) of the velocity that the model gives, set-valued at rest
+        (:class:`Friction`), by output error: hubs stick and slip while their links ring, with ``stage="both"`` and
+        inertial coupling each of them while the other's motion shakes it. With measured coupling it is a linear term
+        c * coulomb_theta_j1 of the sign of the measured velocity, in the published form of both equations.
+        ``"stribeck"``, with simulated coupling, adds what hubs have more near rest, fs_j below the speed vs_j
+        (:class:`Stribeck`).
+    cross_sensitivity
+        Adds hub angles as they are (order 0) to the deflection's equation: strain gauges and cables make a measured
+        deflection follow the hub's angle. e_2 theta_11 in that of theta_12, and with ``cross_stage="inertial"``
+        f_2 theta_21.
+    cross_damping
+        Adds the rate of the other link's deflection, w_2 D theta_22 in the equation of theta_12, with
+        ``cross_stage="inertial"`` and measured coupling. No dissipation of the arm: it damps what a link does against
+        the other one, as the gain of an observer would, so that a free run is not thrown off by what little is
+        wrong with what drives it (docs/arm.md has what that is worth).
+    hub
+        False leaves the hub's equation out: a deflection driven by the measured hub, whose friction nobody knows. No
+        ratio of inertias is left to tie coefficients, and no other equation to tell the link's spring from its damper:
+        beta is sought up to 1/2, mu from there.
+    laws
+        ``"orders"``: orders obey :func:`order_law`, five are free. Without it each equation has its own four orders.
+        With the Lagrange form and with ``"derived"`` alpha_2 (alpha_4) is fixed at 2: it is seen only through the
+        link's viscous friction.
+        ``"coefficients"``: the coefficient law is stated in the structure, with the ratio r = (J_1 + J_2)/J_2 of the
+        published form or j = J_1/J_2 of the Lagrange form, where the coefficient -1 of the hub's motion is then known;
+        without it that is free, b_2. The equation-error estimators estimate the coefficients freely and report how far
+        they are from the law. With inertial coupling it says besides that the tip of link 1 carries stage 2 by the sum
+        of its angles: q_3 = p_3 and q_4 = p_4.
+        ``"velocities"``: gamma_1 = mu_2 (gamma_3 = mu_4), see :func:`order_law`; of the Lagrange form under
+        ``"orders"``.
+    parameters
+        Named set that results are set beside.
+    sensor_filter
+        ``"stock"`` for the 2 Hz low-pass that the arm's stock real-time model puts on both deflections, whether they
+        are modelled or drive a model, or a filter.
+    offset
+        ``"constant"`` or ``"ramp"``: an unknown constant (and a ramp) in each equation, one a run, such as the current
+        that it takes to hold the arm still; see :func:`ftlm.equation`.
+
+    Returns
+    -------
+    Structure
+        Orders and coefficients free.
+
+    Raises
+    ------
+    ModelError
+        An argument that is not known, or not used by that form.
+
+    Notes
+    -----
+    Time is in seconds. Where gamma_1 may differ from mu_2 the law of coefficients ties numbers whose dimensions differ
+    by time to the power of gamma_1 - mu_2, the known -1 among them: it is another law for a run told in milliseconds.
+    Under ``"velocities"`` the unit does not matter.
+    """
+    if stage not in (1, 2, "both"):
+        raise ModelError(f"stage = {stage!r} is not known; use 1, 2 or 'both'")
+    form, input_order = _form(form, input_order)
+    for law in laws:
+        if law not in LAWS:
+            raise ModelError(f"law {law!r} is not known; use 'orders', 'coefficients', both or ()")
+    if "velocities" in laws and (form != "lagrange" or "orders" not in laws):
+        raise ModelError(
+            "law 'velocities' ties two orders of form='lagrange' under the order law; use it with laws=('orders', …)"
+        )
+    if cross_stage not in (False, True, "torques", "inertial"):
+        raise ModelError(f"cross_stage = {cross_stage!r} is not known; use False, 'torques' or 'inertial'")
+    if cross_stage == "inertial" and form != "lagrange":
+        raise ModelError("cross_stage='inertial' follows from the energies, as form='lagrange' does; use that form")
+    if parameters not in PARAMETERS:
+        raise ModelError(f"parameters = {parameters!r} is not known; use {' or '.join(map(repr, PARAMETERS))}")
+    if not (isinstance(friction, bool) or friction in ("coulomb", "stribeck")):
+        raise ModelError(f"friction = {shown(friction)} is not known; use False, 'coulomb' or 'stribeck'")
+    flags = {"cross_sensitivity": cross_sensitivity, "cross_damping": cross_damping, "hub": hub}
+    for name, flag in flags.items():
+        if not isinstance(flag, bool):
+            raise ModelError(f"{name} = {shown(flag)} is neither True nor False; use one of them")
+    if coupling is None:
+        coupling = "measured" if form == "lagrange" else "simulated"
+    if friction == "stribeck" and coupling != "simulated":
+        raise ModelError(
+            "friction='stribeck' is of the velocity that the model gives; use coupling='simulated', or "
+            "friction='coulomb'"
+        )
+    if friction and coupling == "simulated" and form != "lagrange":
+        raise ModelError(
+            "friction=True with coupling='simulated' follows hubs of form='lagrange', where it does not enter the "
+            "links' equations; use that form, or coupling='measured', whose friction has the sign of the measured "
+            "velocity"
+        )
+    if not hub and (form != "lagrange" or coupling == "simulated" or friction):
+        raise ModelError(
+            "hub=False leaves the deflection to the measured hub: it needs form='lagrange' and coupling='measured', "
+            "and knows no friction=True"
+        )
+    if cross_damping and (cross_stage != "inertial" or coupling == "simulated"):
+        raise ModelError(
+            "cross_damping=True follows the other deflection as it was measured; use it with cross_stage='inertial' "
+            "and coupling='measured'"
+        )
+    stages: tuple[int, ...] = (1, 2) if stage == "both" else (stage,)
+    equations: list[Equation] = []
+    coefficient_law: list[tuple[str, float, tuple[str, ...]]] = []
+    reference: dict[str, float] = {}
+    for j in stages:
+        named = input_order if form == "published" else None
+        orders = order_law(j, form=form, input_order=named, velocities="velocities" in laws)
+        made = _stage(j, form, orders, laws, bool(friction) and coupling == "measured")
+        if friction and coupling == "simulated":
+            near = Stribeck(f"fs{j}", f"vs{j}") if friction == "stribeck" else UNSET
+            made = (replace(made[0], coulomb=Friction(f"fc{j}", more=near)), made[1])
+        if cross_stage:
+            made = _pushed(made, j, laws, stage == "both") if cross_stage == "inertial" else _twisted(made, j)
+        if cross_damping:
+            made = (made[0], _added(made[1], [Term(f"theta{3 - j}2", Order(1.0), f"w{2 * j}")]))
+        if cross_sensitivity:
+            made = (made[0], _followed(made[1], j, other=cross_stage == "inertial"))
+        equations += made if hub else made[1:]
+        h, d = 2 * j - 1, 2 * j
+        ratio = f"j{j}" if form == "lagrange" else f"r{j}"
+        tied: tuple[tuple[str, tuple[str, ...]], ...] = (("a", (ratio,)), ("d", (ratio,)))
+        if form == "published":
+            tied = (("a", (ratio,)), ("b", ()), ("d", (ratio,)), ("g", ()))
+        coefficient_law += [(f"{c}{d}", -1.0, (f"{c}{h}", *factors)) for c, factors in tied]
+        if cross_stage == "inertial" and j == 2:
+            # Both angles of stage 1 turn what stands on its tip.
+            coefficient_law += [(f"q{n}", 1.0, (f"p{n}",)) for n in (h, d)]
+        link = PARAMETERS[parameters][j]
+        known = link.lagrange_coefficients(j) if form == "lagrange" else link.coefficients(j)
+        reference |= {n: v for n, v in known.items() if any(n in e.coefficient_names for e in equations)}
+    if sensor_filter == "stock":
+        seen = {s for e in equations for s in e.signals}
+        sensor_filter = SensorFilter.low_pass([s for s in ("theta12", "theta22") if s in seen])
+    if not (sensor_filter is None or isinstance(sensor_filter, SensorFilter)):
+        raise ModelError(f"sensor_filter = {sensor_filter!r} is not known; use 'stock' or a SensorFilter")
+    structure = Structure(
+        equations=tuple(equations),
+        coupling=coupling,
+        sensor_filter=sensor_filter,
+        coefficient_law=tuple(coefficient_law) if "coefficients" in laws and hub else (),
+        reference=reference,
+        name=f"flexible link, stage {stage}" if stage != "both" else "flexible link, both stages",
+        hints=_hints(form),
+        offset=check_offset(offset),
+    )
+    if form == "lagrange" or input_order == "derived":
+        structure = structure.with_orders({f"alpha{2 * j}": 2.0 for j in stages})
+    if not hub:
+        # Nothing else tells the link's two own terms apart: exchanged, they are the same equation.
+        structure = structure.with_orders({f"{n}{2 * j}": APART[n] for j in stages for n in APART})
+    return structure
+
+
+def _stage(
+    stage: int, form: Form, law: Mapping[str, Order], laws: Sequence[str], friction: bool
+) -> tuple[Equation, Equation]:
+    """Equations of the hub and of the deflection."""
+    h, d = 2 * stage - 1, 2 * stage
+    hub, deflection, current = f"theta{stage}1", f"theta{stage}2", f"I{stage}"
+    tied = "orders" in laws
+
+    def order(name: str) -> Order:
+        return law[name] if tied else Order(0.0, ((name, 1.0),))
+
+    def extra(n: int) -> list[Term]:
+        rubs = friction and (n == h or form == "published")
+        return [Term(f"coulomb_{hub}", Order(), f"c{n}")] if rubs else []
+
+    def equation(output: str, n: int, drive: Order | None) -> Equation:
+        terms = [
+            Term(deflection, order(f"beta{n}"), f"a{n}"),
+            Term(hub, order(f"gamma{n}"), f"b{n}"),
+            Term(deflection, order(f"mu{n}"), f"d{n}"),
+        ]
+        if drive is None and "coefficients" in laws:
+            # The hub's motion bends the link by as much as it turns it, whatever the link is made of.
+            terms[1] = Term(hub, order(f"gamma{n}"), -1.0, name=f"b{n}")
+        if drive is not None:
+            terms.append(Term(current, drive, f"g{n}"))
+        return Equation(output, order(f"alpha{n}"), (*terms, *extra(n)))
+
+    drive = None if form == "lagrange" else law["input"] if tied else Order()
+    return equation(hub, h, Order()), equation(deflection, d, drive)
+
+
+def _added(item: Equation, terms: Sequence[Term]) -> Equation:
+    """An equation with more terms, before those of friction."""
+    rubs = tuple(t for t in item.terms if t.signal.startswith("coulomb_"))
+    return replace(item, terms=(*item.terms[: len(item.terms) - len(rubs)], *terms, *rubs))
+
+
+def _twisted(made: tuple[Equation, Equation], stage: int) -> tuple[Equation, Equation]:
+    """Torques of the other stage: its angles and its current as they are."""
+    other, first = 3 - stage, 2 * stage - 1
+    signals = (f"theta{other}1", f"theta{other}2", f"I{other}")
+    hub, deflection = (
+        _added(item, [Term(s, Order(CROSS_ORDER), f"{c}{n}") for c, s in zip("pqs", signals, strict=True)])
+        for n, item in enumerate(made, first)
+    )
+    return hub, deflection
+
+
+def _pushed(made: tuple[Equation, Equation], stage: int, laws: Sequence[str], both: bool) -> tuple[Equation, Equation]:
+    """Inertia of the other stage, by the energies of the planar arm with the absolute rates of (8) in them.
+
+    T = (J_11 w_1^2 + J_12 w_2^2 + J_21 w_3^2 + J_22 w_4^2)/2 + H w_2 w_4 with w_1 = D theta_11, w_2 = w_1 + D theta_12,
+    w_3 = w_2 + D theta_21, w_4 = w_3 + D theta_22, J_12 with all masses beyond link 1 at its tip and H the product of
+    that arm with the moment of mass of link 2. Of hub 1 less link 1 nothing of stage 2 is left.
+    """
+    h, d, other = 2 * stage - 1, 2 * stage, 3 - stage
+    oh, od = 2 * other - 1, 2 * other
+    rates = (f"mu{od}" if "velocities" in laws else f"gamma{oh}", f"mu{od}")
+    law = both and "orders" in laws
+
+    def terms(n: int, damping: str) -> list[Term]:
+        orders = [Order.parse(f"alpha{n} - {damping} + {rate}" if law else f"alpha{n}") for rate in rates]
+        return [Term(f"theta{other}{k}", order, f"{c}{n}") for k, c, order in zip((1, 2), "pq", orders, strict=True)]
+
+    hub, deflection = made
+    # The order of D that makes of the rate of a hub its acceleration is alpha_3 - gamma_3, of a link alpha_2 - mu_2.
+    own = f"mu{d}" if "velocities" in laws else f"gamma{h}"
+    return hub if stage == 1 else _added(hub, terms(h, own)), _added(deflection, terms(d, f"mu{d}"))
+
+
+def _followed(item: Equation, stage: int, *, other: bool) -> Equation:
+    """Hub angles in the measured deflection."""
+    signals = (f"theta{stage}1", f"theta{3 - stage}1")[: 1 + other]
+    return _added(item, [Term(s, Order(), f"{c}{2 * stage}") for c, s in zip("ef", signals, strict=False)])
+
+
+def link_model(
+    *,
+    stage: Literal[1, 2, "both"] = 1,
+    parameters: Literal["effective", "table-3"] | Mapping[int, LinkParameters] = "effective",
+    orders: Mapping[str, float] | None = None,
+    coefficients: Mapping[str, float] | None = None,
+    form: Form | None = None,
+    input_order: InputOrder | None = None,
+    coupling: Literal["simulated", "measured"] = "simulated",
+) -> Model:
+    """Make the arm with everything known: by default the integer-order model of the maker's manual.
+
+    With whole orders the forms are one model. With fractional ones the published form bends the link the wrong way.
+
+    Parameters
+    ----------
+    stage
+        1, 2 or both.
+    parameters
+        Named set, or physical parameters by stage.
+    orders
+        Free orders of the law, by name; default the manual's integer ones.
+    coefficients
+        Coefficients to use instead of the parameters', by name.
+    form, input_order, coupling
+        See :func:`flexible_link`; both angles follow from the current by default.
+
+    Returns
+    -------
+    Model
+        Ready to simulate.
+
+    Raises
+    ------
+    ModelError
+        A name that is not known, orders out of range.
+    """
+    named = parameters if isinstance(parameters, str) else "effective"
+    form, order = _form(form, input_order)
+    structure = flexible_link(
+        stage=stage, form=form, input_order=order if form == "published" else None, coupling=coupling, parameters=named
+    )
+    values = dict(structure.reference)
+    if not isinstance(parameters, str):
+        for j, link in parameters.items():
+            own = link.lagrange_coefficients(j) if form == "lagrange" else link.coefficients(j)
+            values |= {n: v for n, v in own.items() if n in structure.coefficient_names}
+    values |= dict(coefficients or {})
+    integer = {name: INTEGER_ORDERS.get(name.rstrip("0123456789"), 2.0) for name in structure.order_names}
+    free = integer | dict(orders or {})
+    return Model(
+        structure.with_orders(free).with_coefficients(values),
+        orders=free,
+        units={s: "A" if s.startswith("I") else "rad" for s in structure.signals},
+        about={"origin": f"parameters {named}" if isinstance(parameters, str) else "given parameters"},
+    )

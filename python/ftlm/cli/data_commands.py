@@ -1,0 +1,231 @@
+"""Commands that look first: at a file (`open`), at a run (`inspect`), at the installation (`doctor`)."""
+
+from __future__ import annotations
+
+import json
+import math
+import platform
+import sys
+from collections.abc import Callable
+from dataclasses import dataclass
+from importlib import metadata
+from typing import Annotated, Any, Literal
+
+import typer
+from typer import Argument, Option
+
+from ftlm import _core
+from ftlm.arm.flexible_link import flexible_link
+from ftlm.cli.framework import command, numbers, say, several, show
+from ftlm.cli.options import Files, Force, Json, Number, ReadingOptions, Text, Texts
+from ftlm.errors import ModelError
+from ftlm.estimation.linear import Streaming
+from ftlm.progress import Progress
+from ftlm.rig import recording as experiment
+from ftlm.rig.arm_parameters import ArmParameters
+from ftlm.rig.quanser import driver_state
+from ftlm.structure.parser import equation
+from ftlm.utils.validation import available_threads
+from ftlm.validation.data_advice import inspect_run
+
+#: What reads which files, and the extra that installs it.
+_READERS = {
+    "scipy": (".mat files", "mat"),
+    "h5py": (".mat files of version 7.3 and HDF5", "hdf5"),
+    "pyarrow": ("parquet and feather", "parquet"),
+    "python-calamine": ("xlsx and ods", "excel"),
+}
+
+
+@command
+def open_(
+    *,
+    file: Annotated[str, Argument(metavar="FILE", help="Any measured file.")],
+    reading: ReadingOptions,
+    as_json: Json = False,
+) -> None:
+    """Say what a file is: columns, units, roles, step, what was assumed and what says otherwise, what to type next."""
+    show(reading.opened(file), as_json=as_json)
+
+
+@command
+def inspect(*, files: Files, reading: ReadingOptions, as_json: Json = False) -> None:
+    """Show what a run holds: ranges, noise, quantisation, rest, and what to do about it before identification."""
+    inspected = [(inspect_run(run), run.advice()) for run in reading.runs(files)]
+    if as_json:
+        data = [{**figures.to_dict(), "advice": advice.to_dict()} for figures, advice in inspected]
+        print(json.dumps(data, indent=1, ensure_ascii=False))
+    else:
+        say("\n\n".join(f"{figures}\n{advice}" for figures, advice in inspected))
+
+
+@command
+def doctor(*, as_json: Json = False) -> None:
+    """Show versions, cores, vector unit, and whether the rig's driver is there."""
+    about: dict[str, Any] = {
+        "ftlm": _core.__version__,
+        "core": _core.__version__,
+        "python": platform.python_version(),
+        "platform": platform.platform(),
+        "cores": available_threads(),
+        "simd": _core.SIMD,
+        "numpy": _installed("numpy"),
+        **{package: _installed(package) for package in _READERS},
+        "rig driver": driver_state(),
+    }
+    if as_json:
+        print(json.dumps(about, indent=1))
+        return
+    for name, value in about.items():
+        print(f"{name:<17}{value if value is not None else 'not installed'}")
+    for package, (files, extra) in _READERS.items():
+        if about[package] is None:
+            print(f"{package} is needed for {files}: pip install 'ftlm[{extra}]'")
+
+
+def _installed(package: str) -> str | None:
+    try:
+        return metadata.version(package)
+    except metadata.PackageNotFoundError:
+        return None
+
+
+@dataclass(frozen=True)
+class LiveOptions:
+    """What is identified while the run is recorded."""
+
+    live: Annotated[Text, Option(metavar="STRUCTURE", help="Identify meanwhile: flexible-link:1, :2, an equation.")] = (
+        None
+    )
+    orders: Annotated[
+        Texts, Option("--order", metavar="NAME=VALUE", help="Orders of --live; default the arm's own.")
+    ] = None
+    p: Annotated[int | None, Option(help="Innovation length of --live; default 7.")] = None
+    k0: Annotated[Number, Option(help="Prior covariance of --live; default 1.")] = None
+
+    def stream(self, rig: str, parameters: str, rate: float, limit: float) -> Streaming | None:
+        """The identification, for a rig's samples a second and longest run [s]; None where none is asked for."""
+        if self.live is None:
+            given = {"--order": bool(self.orders), "--p": self.p is not None, "--k0": self.k0 is not None}
+            useless = [option for option, is_given in given.items() if is_given]
+            if useless:
+                raise ModelError(f"{', '.join(useless)}: of --live, which is not given; leave out, or give --live")
+            return None
+        free = numbers("--order", self.orders)
+        if self.live.startswith("flexible-link:"):
+            stages: dict[str, Literal[1, 2]] = {"1": 1, "2": 2}
+            stage = stages.get(self.live.removeprefix("flexible-link:"))
+            if stage is None:
+                raise ModelError(
+                    f"--live {self.live!r} is not known; use flexible-link:1, flexible-link:2 or an equation"
+                )
+            # A stream integrates what passes; (15) would differentiate the hub angle more often than the deflection.
+            structure = flexible_link(stage=stage, form="published", laws=("orders",), coupling="measured")
+            if rig == "virtual":
+                arm = ArmParameters.of(parameters)
+                free = (arm.stage1 if stage == 1 else arm.stage2).orders(stage) | free
+        else:
+            structure = equation(self.live)
+        return Streaming(
+            structure.with_orders(free),
+            step=1.0 / rate,
+            longest=limit + 1.0,
+            innovation_length=7 if self.p is None else self.p,
+            prior_covariance=1.0 if self.k0 is None else self.k0,
+        )
+
+
+@command
+def record(
+    *,
+    out: Annotated[str, Option("-o", "--out", metavar="FILE", help="Run to write, .csv or .parquet.")],
+    rig: Annotated[str, Option(help="virtual or q8.")] = "virtual",
+    shape: Annotated[str, Option("--input", help="square, sine, chirp, multisine, prbs, doublet or csv.")] = "square",
+    amplitude: Annotated[
+        str, Option(metavar="A or A1:A2", help="Largest current [A] of both motors, or of each.")
+    ] = "0.3",
+    period: Annotated[Number, Option(help="Period [s]; of a prbs its clock.")] = None,
+    band: Annotated[str, Option(metavar="LOW:HIGH", help="Of chirp and multisine [Hz].")] = "0.1:20",
+    ramp: Annotated[float, Option(help="Time over which the amplitude grows [s].")] = 0.0,
+    file: Annotated[Text, Option(help="Currents I1, I2 [A] for --input csv.")] = None,
+    duration: Annotated[float, Option(help="Length of the run [s].")] = 10.0,
+    limit: Annotated[float, Option(help="Longest run that is allowed [s], at most 600.")] = 30.0,
+    rate: Annotated[float, Option(help="Samples per second.")] = 500.0,
+    seed: Annotated[int, Option(min=0, help="Of noise and random inputs.")] = 0,
+    parameters: Annotated[
+        str, Option(metavar="NAME or TOML", help="Virtual arm: effective, measured, measured-lqr, linear or a file.")
+    ] = "effective",
+    offset: Annotated[
+        Text, Option(metavar="A1:A2", help="Virtual arm: current that drives each motor besides its command.")
+    ] = None,
+    paced: Annotated[bool, Option("--real-time", help="Pace the virtual rig.")] = False,
+    stock_filter: Annotated[bool, Option("--stock-filter", help="Record behind the stock 2 Hz low-pass.")] = False,
+    watchdog: Annotated[float, Option(help="Time after which the motors are stopped [s].")] = 0.1,
+    arm: Annotated[bool, Option("--arm", help="Real hardware: yes, the arm may move.")] = False,
+    card: Annotated[str, Option(help="Which Q8-USB board.")] = "0",
+    live: LiveOptions,
+    force: Force = False,
+    as_json: Json = False,
+) -> None:
+    """Drive a rig, simulated by default, and record a run that every other command reads."""
+    currents = several("--amplitude", amplitude, 1, 2)
+    low, high = several("--band", band, 2)
+    shift = None if offset is None else several("--offset", offset, 2)
+    stream = live.stream(rig, parameters, rate, limit)
+    try:
+        with Progress("recording", quiet=as_json) as progress:
+            run = experiment.record(
+                rig,
+                input=shape,
+                amplitude=(currents[0], currents[-1]),
+                period=period,
+                band=(low, high),
+                ramp=ramp,
+                file=file,
+                duration=duration,
+                limit=limit,
+                rate=rate,
+                seed=seed,
+                parameters=parameters,
+                offset=None if shift is None else (shift[0], shift[1]),
+                paced=paced,
+                sensor_filter="stock" if stock_filter else None,
+                watchdog=watchdog,
+                arm=arm,
+                card=card,
+                out=out,
+                force=force,
+                live=stream,
+                progress=each_second(stream, rate, progress),
+            )
+    except (KeyboardInterrupt, SystemExit) as ended:
+        what = experiment.stopped_by(ended)
+        motors = "; ".join(getattr(ended, "__notes__", [])) or "the motors are at 0 V"
+        print(f"ftlm: {what}; {motors}; what was recorded is in {out}", file=sys.stderr)
+        code = ended.code if isinstance(ended, SystemExit) else 130
+        raise typer.Exit(code if isinstance(code, int) else 1) from None
+    if stream is not None:
+        print(f"live, after {stream.pulses} rows: {stream}", file=sys.stderr)
+    if as_json:
+        told = {"written": out, "rows": run.length, "step": run.step, "about": run.about}
+        print(json.dumps(told, indent=1, ensure_ascii=False))
+    else:
+        print(f"{run}\nwritten to {out}")
+    missed = run.about["missed_deadlines"]
+    if missed:
+        print(f"ftlm: {missed} deadlines were missed", file=sys.stderr)
+
+
+def each_second(stream: Streaming | None, rate: float, progress: Progress) -> Callable[[int, int], None]:
+    """Moves the bar, and prints the live estimate once a second of the run."""
+    due = 1.0
+
+    def shown(done: int, total: int) -> None:
+        nonlocal due
+        progress(done, total)
+        seconds = done / rate
+        if stream is not None and seconds >= due:
+            print(f"{seconds:7.2f} s: {stream}", file=sys.stderr, flush=True)
+            due = math.floor(seconds) + 1.0
+
+    return shown

@@ -1,0 +1,478 @@
+"""Commands that find a model in runs: identify, search, resume, status."""
+
+from __future__ import annotations
+
+import contextlib
+import sys
+from collections.abc import Iterator, Mapping, Sequence
+from dataclasses import dataclass, replace
+from pathlib import Path
+from typing import Annotated, Any, Literal
+
+import typer
+from typer import Argument, Option
+
+from ftlm.cli.framework import EXIT_INTERRUPTED, command, numbers, pairs, ranges, say, show, show_json
+from ftlm.cli.options import (
+    CandidateTexts,
+    Decimal,
+    Files,
+    Force,
+    GeneticOptions,
+    HeaderLines,
+    Json,
+    Number,
+    Out,
+    ReadingOptions,
+    SearchOptions,
+    Separator,
+    Sheet,
+    Skipped,
+    StructureOptions,
+    StructureText,
+    Text,
+    Texts,
+    Thousands,
+    Threads,
+    Verbose,
+    layout_of,
+)
+from ftlm.data.frequency_data import FrequencyData
+from ftlm.data.run import Run
+from ftlm.errors import ModelError
+from ftlm.estimation import consistency as parts_of_runs
+from ftlm.estimation import identify as estimation
+from ftlm.estimation.frequency_domain import identify_frequency as frequency_estimation
+from ftlm.io.load_frequency import load_frequency
+from ftlm.model.model import load_model
+from ftlm.order_search.certificate import certify_job, check_certifiable
+from ftlm.order_search.checkpoint import Store
+from ftlm.order_search.options import check_used
+from ftlm.order_search.result import SearchResult
+from ftlm.order_search.search import announce, job_of, make_job, resume_job, run_job, search_status
+from ftlm.progress import Progress
+from ftlm.structure.order_grid import Lattice
+from ftlm.structure.structure import Structure
+from ftlm.structure_selection import select as choice
+from ftlm.structure_selection.select import automatic
+from ftlm.utils.files import COMMAND, check_free
+from ftlm.utils.resources import between, by_output_error, expected
+from ftlm.utils.validation import check_threads
+
+Method = Literal["output-error", "instrumental-variables", "multi-innovation", "least-squares", "genetic"]
+Estimator = Literal["instrumental-variables", "multi-innovation", "least-squares"]
+StoreFile = Annotated[str, Argument(metavar="STORE", help="A file written with --store.")]
+
+
+def fit_seconds(runs: Sequence[Run], structure: Structure, threads: int | None, fits: int = 1) -> float:
+    """About how long fits by output error of all their numbers take here, the runs shared out among them [s]."""
+    samples = sum(run.length for run in runs) * len(structure.outputs)
+    numbers = len(structure.order_names) + len(structure.coefficient_names) + len(structure.free_inputs)
+    return expected(fits * by_output_error(samples // max(fits, 1), numbers), check_threads(threads))
+
+
+@command
+def identify(
+    *,
+    files: Files,
+    structure: StructureText,
+    method: Annotated[Method, Option(help="How numbers are estimated.")] = "output-error",
+    reading: ReadingOptions,
+    shape: StructureOptions,
+    search: SearchOptions,
+    genetic: GeneticOptions,
+    loss: Annotated[
+        Literal["squares", "huber"] | None,
+        Option(help="Of output error: huber, so that outliers decide nothing; default squares."),
+    ] = None,
+    intervals: Annotated[
+        Literal["auto", "quadratic", "profile"] | None,
+        Option(help="Of output error: by profile likelihood for all numbers, or (default) where it matters."),
+    ] = None,
+    start: Annotated[
+        Text, Option(metavar="MODEL", help="Of output error: a saved model, simpler or not, to start from as well.")
+    ] = None,
+    threads: Threads = None,
+    reference: Annotated[
+        Text, Option(metavar="SIGNAL", help="What drives a closed loop from outside; also name it with -u.")
+    ] = None,
+    store: Annotated[
+        Text, Option(metavar="FILE", help="Keep finished order searches there; the same command goes on.")
+    ] = None,
+    out: Out = None,
+    report: Annotated[Text, Option(metavar="HTML", help="Page to write.")] = None,
+    validation: Annotated[Text, Option(metavar="FILE", help="Another run, to judge the model on.")] = None,
+    force: Force = False,
+    verbose: Verbose = False,
+    as_json: Json = False,
+) -> None:
+    """Identify a model: whether to trust it, its equations, numbers, gain and modes, its fit, and warnings in words."""
+    check_free(out, report, force=force, words=COMMAND)
+    shape.structure(structure)
+    begin = None if start is None else load_model(start)
+    runs = reading.runs(files)
+    wanted = shape.measured(structure, runs)
+    # The slice is of the runs that are identified from.
+    others = replace(reading, sliced=None).runs([validation]) if validation is not None else []
+    label = "fitting" if method == "output-error" else "searching orders"
+    with resumable(store, "the same command"), Progress(label, quiet=as_json) as progress:
+        if method == "output-error":
+            progress.expect("the fit", *between(fit_seconds(runs, wanted, threads)))
+        result = estimation.identify(
+            runs,
+            wanted,
+            method=method,
+            lattice=search.lattice(),
+            **search.settings(),
+            genetic=genetic.settings(method),
+            threads=threads,
+            progress=progress,
+            store=store,
+            loss=loss,
+            intervals=intervals,
+            reference=reference,
+            start=begin,
+        )
+    if out is not None:
+        result.model.save(out, force=force)
+    if report is not None:
+        progress.say("writing the report")
+        result.report(report, validation=others or None, force=force)
+    checked = result.validate(others) if others else None
+    if as_json:
+        judged = {"verdict": result.verdict(checked).to_dict()}
+        show_json({**judged, **result.to_dict(), "validation": None if checked is None else checked.to_dict()})
+        return
+    # What Python has as a method, the command line has as an option.
+    say(result.summary(checked).replace("print(result.details())", "--verbose shows all"))
+    if verbose:
+        say(f"\n{result.details()}")
+    if verbose and checked is not None:
+        say(f"\nvalidation on {', '.join(r.name for r in others)}\n{checked}")
+    elif checked is not None:
+        print(f"validation on {', '.join(r.name for r in others)}")
+        say("\n".join(f"! {w}" for w in checked.warnings), end="\n" if checked.warnings else "")
+
+
+@command
+def search(
+    *,
+    files: Files,
+    structure: StructureText,
+    coefficients: Annotated[Estimator, Option(help="How coefficients are estimated.")] = "multi-innovation",
+    reading: ReadingOptions,
+    shape: StructureOptions,
+    options: SearchOptions,
+    threads: Threads = None,
+    store: Annotated[Text, Option(metavar="FILE", help="Keep finished work there; go on with ftlm resume.")] = None,
+    certify: Annotated[
+        Number,
+        Option(
+            metavar="SHARE",
+            help="Prove of orders between those of the lattice, too, that none is better by more than this share; of "
+            "squared equation errors at rest.",
+        ),
+    ] = None,
+    as_json: Json = False,
+) -> None:
+    """Rank the orders of each equation, or of a stage under its order law, and account for every candidate."""
+    shape.structure(structure)
+    runs = reading.runs(files)
+    wanted = shape.measured(structure, runs)
+    parts = wanted.parts() or {e.output: wanted.equation(e.output) for e in wanted.equations}
+    lattice = options.lattice() or Lattice()
+    check_named(lattice, wanted)
+    check_used(coefficients, options.settings(), argument="coefficients")
+    results = {}
+    with resumable(store), contextlib.ExitStack() as stack:
+        jobs = {
+            name: make_job(
+                runs, part, lattice_of(lattice, part), coefficients=coefficients, threads=threads, **options.settings()
+            )
+            for name, part in parts.items()
+        }
+        if certify is not None:
+            for job in jobs.values():
+                check_certifiable(job, certify)
+        kept = None
+        if store is not None:
+            kept = stack.enter_context(Store(store, [job.request(name) for name, job in jobs.items()]))
+            show_notes(kept)
+        announce(Progress("", quiet=as_json), list(jobs.values()), kept)
+        for number, (name, job) in enumerate(jobs.items()):
+            with Progress(f"searching orders of {name}", quiet=as_json) as progress:
+                results[name] = run_job(replace(job, progress=progress), store=kept, number=number)
+            if certify is not None:
+                with Progress(f"proving what lies between of {name}", quiet=as_json) as progress:
+                    proved = certify_job(job, within=certify, apart=lattice.step, progress=progress.so_far)
+                results[name] = replace(results[name], certificate=proved)
+    show_searches(results, as_json=as_json)
+
+
+def check_named(lattice: Lattice, structure: Structure) -> None:
+    """Refuse values of an order that is not free in any equation."""
+    for name in lattice.orders:
+        if name not in {"alpha", *structure.order_names}:
+            free = ", ".join(structure.order_names) or "none"
+            raise ModelError(f"--lattice {name!r} is no free order; free are {free}")
+
+
+def lattice_of(lattice: Lattice, part: Structure) -> Lattice:
+    """What a lattice says of the orders of one part."""
+    return replace(lattice, orders={n: v for n, v in lattice.orders.items() if n == "alpha" or n in part.order_names})
+
+
+def show_searches(results: Mapping[str, SearchResult], *, as_json: bool) -> None:
+    """Searches by output, for people or as JSON."""
+    if as_json:
+        show_json({name: result.to_dict() for name, result in results.items()})
+    else:
+        say("\n\n".join(f"{name}\n{result}" for name, result in results.items()))
+
+
+@contextlib.contextmanager
+def resumable(path: str | None, how: str | None = None) -> Iterator[None]:
+    """Say after Ctrl-C how to go on with a store, if there is one."""
+    try:
+        yield
+    except KeyboardInterrupt:
+        if path is None or not Path(path).exists():
+            raise
+        print(f"ftlm: interrupted; go on with: {how or f'ftlm resume {path}'}", file=sys.stderr)
+        raise typer.Exit(EXIT_INTERRUPTED) from None
+
+
+def show_notes(store: Store) -> None:
+    """What was mended in a store."""
+    for note in store.notes:
+        print(f"ftlm: {store.path}: {note}", file=sys.stderr)
+
+
+@command
+def resume(
+    *,
+    store: StoreFile,
+    salvage: Annotated[
+        bool, Option("--salvage", help="Go on with a damaged store; the damaged file is kept beside it.")
+    ] = False,
+    threads: Threads = None,
+    as_json: Json = False,
+) -> None:
+    """Go on with the searches of a store, and show them; it needs no other file."""
+    results = {}
+    with resumable(store), Store(store, salvage=salvage) as kept:
+        show_notes(kept)
+        told = Progress("", quiet=as_json)
+        if not told.quiet:
+            announce(told, [job_of(kept, n, threads) for n in range(len(kept.contents.requests))], kept)
+        for number, request in enumerate(kept.contents.requests):
+            with Progress(f"searching orders of {request.name}", quiet=as_json) as progress:
+                results[request.name] = resume_job(kept, number, threads=threads, progress=progress)
+    show_searches(results, as_json=as_json)
+
+
+@command
+def status(*, store: StoreFile, as_json: Json = False) -> None:
+    """Show how far the searches of a store are; it may be in use."""
+    states = search_status(store)
+    if as_json:
+        show_json({name: state.to_dict() for name, state in states.items()})
+    else:
+        print("\n".join(str(state) for state in states.values()))
+
+
+@dataclass(frozen=True)
+class ResponseOptions:
+    """How files of frequency responses are read; None is an option that is not given."""
+
+    columns: Annotated[
+        Texts,
+        Option(
+            "--column",
+            metavar="PART=COLUMN",
+            help="Column of frequency, real, imag, magnitude, phase or deviation; default by their names.",
+        ),
+    ] = None
+    frequency_unit: Annotated[
+        Text, Option("--frequency-unit", metavar="UNIT", help="Hz, kHz, MHz, mHz or rad/s; default what is stated.")
+    ] = None
+    magnitude_unit: Annotated[
+        Literal["dB", "abs"] | None, Option("--magnitude-unit", help="Of sizes; default what is stated, or abs.")
+    ] = None
+    phase_unit: Annotated[
+        Literal["deg", "rad"] | None, Option("--phase-unit", help="Of phases; default what is stated, or deg.")
+    ] = None
+    negated: Annotated[
+        bool | None,
+        Option("--negated/--not-negated", help="Whether the imaginary column holds -Z''; default by its name."),
+    ] = None
+    output: Annotated[Text, Option("-y", "--output", metavar="NAME", help="What the response is of.")] = None
+    input: Annotated[Text, Option("-u", "--input", metavar="NAME", help="What it is from.")] = None
+    separator: Separator = None
+    decimal: Decimal = None
+    thousands: Thousands = None
+    skip: Skipped = None
+    header: HeaderLines = None
+    sheet: Sheet = None
+
+    def load(self, file: str) -> FrequencyData:
+        """The record of one file."""
+        columns: dict[str, Any] | None = pairs("--column", self.columns) or None
+        return load_frequency(
+            file,
+            columns=columns,
+            frequency_unit=self.frequency_unit,
+            magnitude_unit=self.magnitude_unit,
+            phase_unit=self.phase_unit,
+            negated=self.negated,
+            output=self.output or "",
+            input=self.input or "",
+            layout=layout_of(self),
+        )
+
+
+@command
+def identify_frequency(
+    *,
+    files: Annotated[list[str], Argument(metavar="FILE...", help="Frequency responses or impedance spectra.")],
+    structure: Annotated[str, Option(metavar="EQUATION", help="Equation in words, such as D^alpha y = a0 y + b0 u.")],
+    weights: Annotated[
+        Literal["auto", "relative", "uniform", "deviation"],
+        Option(help="relative to the size, uniform, or by stated deviations; auto: those where there are some."),
+    ] = "auto",
+    reading: ResponseOptions,
+    orders: Annotated[Texts, Option("--order", metavar="NAME=VALUE", help="Fix an order, or LOW:HIGH:STEP.")] = None,
+    fixed: Annotated[Texts, Option(metavar="NAME=VALUE", help="Fix a coefficient.")] = None,
+    delay: Annotated[Texts, Option(metavar="INPUT=SECONDS", help="Delay of an input; LEAST:LARGEST is estimated.")] = (
+        None
+    ),
+    start: Annotated[Texts, Option(metavar="NAME=VALUE", help="Value of a free number to start from besides.")] = None,
+    out: Out = None,
+    report: Annotated[Text, Option(metavar="HTML", help="Page to write.")] = None,
+    validation: Annotated[Text, Option(metavar="FILE", help="Another response, to judge the model on.")] = None,
+    force: Force = False,
+    verbose: Verbose = False,
+    as_json: Json = False,
+) -> None:
+    """Identify a model from a frequency response or an impedance: orders and coefficients with 95 % intervals."""
+    check_free(out, report, force=force, words=COMMAND)
+    if structure.startswith(("flexible-link", "arm:")) or structure == "auto":
+        raise ModelError(f"--structure {structure!r}: a frequency response takes an equation in words")
+    records = [reading.load(file) for file in files]
+    with Progress("fitting", quiet=as_json) as progress:
+        result = frequency_estimation(
+            records,
+            structure,
+            weights=weights,
+            orders=dict(pairs("--order", orders)),
+            fixed=numbers("--fixed", fixed),
+            delay=ranges("--delay", delay),
+            start=numbers("--start", start) or None,
+            progress=progress,
+        )
+    checked = None if validation is None else result.validate(reading.load(validation))
+    if out is not None:
+        result.model.save(out, force=force)
+    if report is not None:
+        result.report(report, validation=checked, force=force)
+    if as_json:
+        judged = {"verdict": result.verdict(checked).to_dict()}
+        show_json({**judged, **result.to_dict(), "validation": None if checked is None else checked.to_dict()})
+        return
+    say(result.summary(checked).replace("result.warnings", "--verbose shows all"))
+    if verbose:
+        say("\n".join(f"warning: {w}" for w in result.warnings))
+
+
+#: A choice from a list, and one inside structures, took between these multiples of what one fit of each of them takes.
+LISTED, GROWN = (1.0, 8.0), (1.5, 20.0)
+
+
+@command
+def select(
+    *,
+    files: Files,
+    structures: CandidateTexts,
+    reading: ReadingOptions,
+    shape: StructureOptions,
+    validation: Annotated[
+        Text,
+        Option(
+            metavar="runs|blocks|FILE",
+            help="Judge each run, or each quarter of every run, by the others; or by a run that nothing is fitted to.",
+        ),
+    ] = None,
+    threads: Threads = None,
+    store: Annotated[
+        Text, Option(metavar="FILE", help="Keep every fit there; the same command goes on with it.")
+    ] = None,
+    out: Out = None,
+    report: Annotated[Text, Option(metavar="HTML", help="Page to write.")] = None,
+    force: Force = False,
+    as_json: Json = False,
+) -> None:
+    """Choose the terms and orders that earn their place on what they were not fitted to."""
+    check_free(out, report, force=force, words=COMMAND)
+    if "auto" in structures and len(structures) > 1:
+        raise ModelError("--structure auto is searched by itself; leave the others out, or give them without it")
+    if structures == ["auto"]:
+        given = shape.given()
+        if given:
+            raise ModelError(f"{', '.join(given)}: of a structure that is given, not used with --structure auto")
+        candidates: str | Structure | list[Structure] = "auto"
+    else:
+        made = [shape.structure(text) for text in structures]
+        candidates = made[0] if len(made) == 1 else made
+    runs = reading.runs(files)
+    if structures != ["auto"]:
+        made = [shape.measured(text, runs) for text in structures]
+        candidates = made[0] if len(made) == 1 else made
+    # The slice is of the runs that are fitted to.
+    of_its_own = validation not in (None, "runs", "blocks")
+    judges = replace(reading, sliced=None).runs([str(validation)]) if of_its_own else validation
+    with resumable(store, "the same command"), Progress("fitting candidates", quiet=as_json) as progress:
+        tried = [candidates] if isinstance(candidates, Structure) else candidates
+        grown = automatic(runs) if isinstance(tried, str) else tried
+        seconds = sum(fit_seconds(runs, one, threads) for one in grown)
+        listed = isinstance(candidates, list)
+        progress.expect("choosing", *between(seconds, LISTED if listed else GROWN))
+        # How many candidates come up turns with what earns its place.
+        told = progress if listed else progress.so_far
+        found = choice.select(runs, candidates, validation=judges, threads=threads, progress=told, store=store)
+    if out is not None:
+        found.best.model.save(out, force=force)
+    if report is not None:
+        found.report(report, force=force)
+    show(found, as_json=as_json)
+
+
+@command
+def agreement(
+    *,
+    files: Files,
+    structure: StructureText,
+    reading: ReadingOptions,
+    shape: StructureOptions,
+    parts: Annotated[
+        int | None, Option(help="Parts that one run is cut into, by default 2; several runs are parts by themselves.")
+    ] = None,
+    loss: Annotated[
+        Literal["squares", "huber"] | None, Option(help="huber, so that outliers decide nothing; default squares.")
+    ] = None,
+    threads: Threads = None,
+    report: Annotated[Text, Option(metavar="HTML", help="Page to write.")] = None,
+    force: Force = False,
+    as_json: Json = False,
+) -> None:
+    """Identify parts of a run each by itself, and tell which numbers of which parts are not one model's."""
+    check_free(report, force=force, words=COMMAND)
+    shape.structure(structure)
+    runs = reading.runs(files)
+    wanted = shape.measured(structure, runs)
+    with Progress("fitting parts", quiet=as_json) as progress:
+        count = max(parts or 0, 2) if len(runs) == 1 else len(runs)
+        progress.expect("fitting all parts", *between(fit_seconds(runs, wanted, threads, count)))
+        found = parts_of_runs.agreement(runs, wanted, parts=parts, loss=loss, threads=threads, progress=progress)
+    if report is not None:
+        found.report(report, force=force)
+    show(found, as_json=as_json)

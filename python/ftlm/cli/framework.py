@@ -1,0 +1,429 @@
+"""Words of the command line that hold several things: NAME=VALUE, FROM:TO, numbers joined by a colon."""
+
+from __future__ import annotations
+
+import contextlib
+import functools
+import inspect
+import io
+import json
+import os
+import re
+import sys
+from collections.abc import Callable, Sequence
+from dataclasses import fields, is_dataclass
+from pathlib import Path
+from typing import Any, get_type_hints
+
+import typer
+from typer.core import TyperCommand
+
+from ftlm.data.run import Run
+from ftlm.errors import FtlmError, InternalError, ModelError, RigFault
+from ftlm.progress import Progress
+from ftlm.utils.files import write_atomically
+from ftlm.utils.formatting import columns, wrapped
+from ftlm.utils.resources import between, expected
+
+#: What the command line calls an argument of Python.
+OPTIONS = {
+    "method": "--method",
+    "coefficients": "--coefficients",
+    "criterion": "--criterion",
+    "norm": "--norm",
+    "lattice": "--lattice or --step",
+    "innovation_length": "--p",
+    "prior_covariance": "--k0",
+    "rows": "--rows",
+    "m": "--m",
+    "keep": "--keep",
+    "threads": "--threads",
+    "store": "--store",
+    "genetic": "--seed or --evaluations",
+    "slice": "--slice",
+    "resample": "--resample",
+    "step": "--sampling",
+    "time": "--time",
+    "time_unit": "--time-unit",
+    "units": "--unit",
+    "columns": "--columns",
+    "intersample": "--intersample",
+    "inputs": "-u",
+    "outputs": "-y",
+    "coupling": "--coupling",
+    "initial": "--initial",
+    "laws": "--laws",
+    "form": "--form",
+    "input_order": "--input-order",
+    "friction": "--friction",
+    "cross_stage": "--cross-stage",
+    "cross_sensitivity": "--cross-sensitivity",
+    "cross_damping": "--cross-damping",
+    "tolerance": "--tolerance",
+    "lags": "--lags",
+    "delay": "--delay",
+    "force": "--force",
+    "offset": "--offset",
+    "reference": "--reference",
+    "start": "--start",
+    "validation": "--validation",
+    "loss": "--loss",
+    "intervals": "--intervals",
+    "missing": "--missing",
+    "encoding": "--encoding",
+    "separator": "--separator",
+    "decimal": "--decimal",
+    "skip": "--skip",
+    "thousands": "--thousands",
+    "weights": "--weights",
+    "frequency_unit": "--frequency-unit",
+    "magnitude_unit": "--magnitude-unit",
+    "phase_unit": "--phase-unit",
+    "negated": "--negated",
+    "duration": "--duration",
+    "peak": "--peak",
+    "slew": "--slew",
+    "limits": "--limit",
+    "names": "--for",
+    "noise": "--noise",
+    "period": "--period",
+    "like": "--like",
+    "crossover": "--crossover",
+    "phase_margin": "--phase-margin",
+    "effort": "--effort",
+    "drift": "--drift",
+    "allowed": "--allowed",
+    "band": "--band",
+    "poles": "--poles",
+    "samples": "--samples",
+    "rate": "--rate",
+    "measured": "--measured",
+    "limit": "--limit",
+    "input": "--input",
+    "output": "--output",
+    "of": "--of",
+    "kind": "--kind",
+    "modes_shaped": "--modes",
+    "header": "--header",
+    "dates": "--dates",
+    "sheet": "--sheet",
+}
+#: ``force=True (--force)``, where the option stands beside the argument already.
+_BESIDE = re.compile(r"\b\w+=\S* \((--[a-z-]+)\)")
+#: What a run is cut by, whose ends a command takes joined by a colon.
+_CUT = re.compile(r"\bslice\((\S+), (?:None|(\S+?))\)")
+#: What Python says of a layout, whose keys are options of their own.
+_LAYOUT = re.compile(r"layout=dict\(([^()]*)\)")
+_COMMANDS = re.compile(r" \(commands: [^)]*\)")
+#: ``-u m=3`` is a name that a user gave, not an argument.
+_ARGUMENT = re.compile(r"(--?[\w-]+ )?(?<![^\s(])(" + "|".join(OPTIONS) + r")=(?:'([^']*)'|([\w.+-]+))?(?![\w{])")
+_BARE = re.compile(r"\b(innovation_length|prior_covariance|time_unit)\b(?!=)")
+
+
+def in_options(text: str) -> str:
+    """Return a message in which the options of the command line stand for the arguments of Python."""
+    text = text.replace("inputs={name: column}", "-u NAME=COLUMN").replace("outputs={name: column}", "-y NAME=COLUMN")
+    text = text.replace("columns={part: column}", "--column PART=COLUMN")
+    text = _LAYOUT.sub(lambda found: found[1].replace(", ", " "), text).replace("layout=: ", "")
+    text = text.replace("in a columns file", "in a file for --columns")
+    text = _CUT.sub(lambda found: f"--slice {found[1]}:{found[2] or ''}", text)
+    text = _BESIDE.sub(r"\1", _COMMANDS.sub("", text))
+    return _BARE.sub(lambda found: OPTIONS[found[1]], _ARGUMENT.sub(_as_option, text))
+
+
+def _as_option(found: re.Match[str]) -> str:
+    before, name, quoted, bare = found.groups()
+    if before:
+        return found[0]
+    value = quoted or bare or ""
+    return OPTIONS[name] if value in ("", "True") else f"{OPTIONS[name]} {value}"
+
+
+def pairs(option: str, given: list[str] | None) -> dict[str, str]:
+    """NAME=VALUE options as a dictionary; a bare NAME stands for NAME=NAME."""
+    values: dict[str, str] = {}
+    for item in given or []:
+        name, equals, value = item.partition("=")
+        value = value if equals else name
+        if not equals and name and not re.fullmatch(r"[^\W\d][\w.\[\]]*", name):
+            short = re.sub(r"\W+", "_", name.partition("(")[0]).strip("_0123456789").lower() or "name"
+            raise ModelError(
+                f'{option} {item!r} has no name of its own; write NAME=…, such as {option} "{short}={item}"'
+            )
+        if not name or not value:
+            raise ModelError(f"{option} {item!r} is not NAME=VALUE")
+        if name in values:
+            raise ModelError(f"{option} names {name!r} twice")
+        values[name] = value
+    return values
+
+
+def numbers(option: str, given: list[str] | None) -> dict[str, float]:
+    """NAME=NUMBER options as a dictionary."""
+    values = {}
+    for name, value in pairs(option, given).items():
+        try:
+            values[name] = float(value)
+        except ValueError:
+            raise ModelError(f"{option} {name}={value}: {value!r} is no number") from None
+    return values
+
+
+def ranges(option: str, given: list[str] | None) -> dict[str, float | tuple[float, float]]:
+    """INPUT=NUMBER options, or INPUT=LEAST:LARGEST where the number is to be estimated."""
+    what, example = ("seconds", "0:0.02") if option == "--delay" else ("a number", "0.5:1.5")
+    values: dict[str, float | tuple[float, float]] = {}
+    for name, value in pairs(option, given).items():
+        ends = joined(value)
+        if len(ends) not in (1, 2):
+            raise ModelError(f"{option} {name}={value}: {value!r} is neither {what} nor LEAST:LARGEST, as in {example}")
+        values[name] = ends[0] if len(ends) == 1 else (ends[0], ends[1])
+    return values
+
+
+def interval(text: str, option: str, example: str) -> tuple[float | None, float | None]:
+    """FROM:TO, either end optional."""
+    parts = text.split(":")
+    try:
+        if len(parts) != 2:
+            raise ValueError
+        start, stop = (float(p) if p.strip() else None for p in parts)
+    except ValueError:
+        raise ModelError(f"{option} {text!r} is no FROM:TO, such as {example}") from None
+    return start, stop
+
+
+def several(option: str, text: str, *counts: int) -> list[float]:
+    """As many numbers joined by a colon as may be."""
+    values = joined(text)
+    if len(values) not in counts:
+        raise ModelError(f"{option} {text!r} is not {' or '.join(str(c) for c in counts)} numbers joined by a colon")
+    return values
+
+
+def joined(text: str) -> list[float]:
+    """Numbers joined by a colon; none where one cannot be read."""
+    try:
+        return [float(part) for part in text.split(":")]
+    except ValueError:
+        return []
+
+
+#: Options that people take for others, from other programs or from the names of ftlm's functions.
+MEANT = {"--equation": "--structure"}
+#: So many gaps between its cells make a line the row of a table.
+ROW, _GAPS, _ENTRY = 3, re.compile(" {2,}"), re.compile(r" *(?:[\w ]+\S {2,}|! |-> |\* |warning: |note: |assumed: )")
+#: Types as a person names them.
+KINDS = {
+    "<str>": "TEXT",
+    "<list[str]>": "TEXT",
+    "<float>": "NUMBER",
+    "<int>": "N",
+    "<int range>": "N",
+    "<list[int]>": "N",
+    "<list[int range]>": "N",
+}
+EXIT_INTERNAL, EXIT_USAGE, EXIT_DATA, EXIT_VALIDATION, EXIT_RIG, EXIT_INTERRUPTED = 1, 2, 3, 4, 5, 130
+
+
+class Command(TyperCommand):
+    """A command that knows which of its options another name was meant for, and names kinds of values in words."""
+
+    def __init__(self, *given: Any, **named: Any) -> None:
+        super().__init__(*given, **named)
+        for parameter in self.params:
+            # An argument is named by what it is of, and what no option names is a text or a number to a person.
+            told: Any = parameter
+            told.display_type_rich = functools.partial(
+                _kind, told.display_type_rich, argument=told.param_type_name == "argument"
+            )
+
+    def parse_args(self, ctx: Any, args: list[str]) -> list[str]:
+        """Options as usual; one that is another's name ends in a sentence."""
+        known = {name for parameter in self.params for name in parameter.opts}
+        for given in (a.partition("=")[0] for a in args):
+            if given not in known and MEANT.get(given) in known:
+                ctx.fail(f"No such option: {given}; {MEANT[given]} takes equations in words, too.")
+        return super().parse_args(ctx, args)
+
+
+def _kind(kind: Callable[..., str], *, ctx: Any, argument: bool) -> str:
+    """What an option takes, in words."""
+    return "" if argument else KINDS.get(kind(ctx=ctx), kind(ctx=ctx))
+
+
+def command(work: Callable[..., None]) -> Callable[..., None]:
+    """Make a function a command.
+
+    A parameter that is a dataclass stands for its fields: each is an option of the command, in that place, and the
+    function receives the record. An error becomes one line on standard error and an exit code.
+    """
+    records: dict[str, type[Any]] = {}
+    options: list[inspect.Parameter] = []
+    for parameter in inspect.signature(work, eval_str=True).parameters.values():
+        kind = parameter.annotation
+        if isinstance(kind, type) and is_dataclass(kind):
+            records[parameter.name] = kind
+            options += _options_of(kind)
+        else:
+            options.append(parameter)
+
+    @functools.wraps(work)
+    def run(**given: Any) -> None:
+        made = {name: kind(**{f.name: given.pop(f.name) for f in fields(kind)}) for name, kind in records.items()}
+        try:
+            work(**given, **made)
+            sys.stdout.flush()
+        except KeyboardInterrupt:
+            print("ftlm: interrupted; nothing was written", file=sys.stderr)
+            raise typer.Exit(EXIT_INTERRUPTED) from None
+        except BrokenPipeError:
+            # The reader of a pipe has gone; what it did not read is nobody's loss.
+            os.dup2(os.open(os.devnull, os.O_WRONLY), sys.stdout.fileno())
+            raise typer.Exit(0) from None
+        except FtlmError as error:
+            print(f"ftlm: {in_options(str(error))}", file=sys.stderr)
+            raise typer.Exit(exit_code(error)) from None
+        except OSError as error:
+            # Of what is printed, or of a working folder that is gone; files have sentences of their own.
+            what = "" if error.filename is None else f" {error.filename!r}"
+            print(
+                f"ftlm: the system refuses{what}: {error.strerror or error}; what was written to files is there, check "
+                "where the output goes and the working folder",
+                file=sys.stderr,
+            )
+            with contextlib.suppress(OSError, ValueError, AttributeError):
+                os.dup2(os.open(os.devnull, os.O_WRONLY), sys.stdout.fileno())
+            raise typer.Exit(EXIT_DATA) from None
+
+    # What typer reads.
+    run.__annotations__ = {option.name: option.annotation for option in options}
+    run.__signature__ = inspect.Signature(options)  # type: ignore[attr-defined]
+    return run
+
+
+def _options_of(record: type[Any]) -> list[inspect.Parameter]:
+    """The fields of a record as parameters of a function."""
+    hints = get_type_hints(record, include_extras=True)
+    return [
+        inspect.Parameter(f.name, inspect.Parameter.KEYWORD_ONLY, default=f.default, annotation=hints[f.name])
+        for f in fields(record)
+    ]
+
+
+def exit_code(error: FtlmError) -> int:
+    """Exit code of an error: 1 internal, 2 usage, 3 data refused, 5 rig."""
+    if isinstance(error, InternalError):
+        return EXIT_INTERNAL
+    if isinstance(error, ModelError):
+        return EXIT_USAGE
+    return EXIT_RIG if isinstance(error, RigFault) else EXIT_DATA
+
+
+def show(result: Any, *, as_json: bool) -> None:
+    """Print a result, for people or as JSON."""
+    if as_json:
+        show_json(result.to_dict())
+    else:
+        say(str(result))
+
+
+def say(text: str, end: str = "\n") -> None:
+    """Print what people read, in lines that a terminal does not break within words.
+
+    Rows of tables and commands to be copied stay as they are.
+    """
+    text = in_options(text)
+    if sys.stdout.isatty():
+        text = "\n".join(broken for line in text.split("\n") for broken in broken_line(line))
+    print(text, end=end)
+
+
+def broken_line(line: str) -> list[str]:
+    """A line as a terminal takes it: itself, or several where it is longer."""
+    lead = line[: len(line) - len(line.lstrip())]
+    if len(line) <= columns() or line.startswith("next: ") or len(_GAPS.findall(line.strip())) >= ROW:
+        return [line]
+    # An entry such as "  mode  of so much": what follows stands under its words.
+    entry = _ENTRY.match(line)
+    return wrapped(line.strip(), lead, " " * (entry.end() if entry else len(lead) + 2))
+
+
+def show_json(document: Any) -> None:
+    """Print a document of plain values and NumPy's."""
+    print(json.dumps(document, indent=1, ensure_ascii=False, allow_nan=False, default=_plain))
+
+
+def tell(sentence: str, *, as_json: bool, **facts: Any) -> None:
+    """Print what was done, as a sentence or as one line of JSON."""
+    print(json.dumps(facts, ensure_ascii=False) if as_json else sentence)
+
+
+def _plain(value: Any) -> Any:
+    """NumPy scalars and arrays as JSON knows them."""
+    return value.tolist() if hasattr(value, "tolist") else str(value)
+
+
+#: Kinds of figures.
+FIGURES = ("png", "pdf", "svg")
+
+
+def check_ending(path: str | None, ending: str, why: str = "") -> None:
+    """Refuse a name with another ending; none is no file to write."""
+    if path is not None and Path(path).suffix.lower() != ending:
+        raise ModelError(f"{path} does not end in {ending}{why}; name it so")
+
+
+def figure_kind(path: str | None) -> str:
+    """The kind of a figure by its name's ending; a name without one of them is refused, none is no figure."""
+    kind = "" if path is None else Path(path).suffix.removeprefix(".").lower()
+    if path is not None and kind not in FIGURES:
+        raise ModelError(f"{path} ends in {kind or 'nothing'!r}; write .png, .pdf or .svg")
+    return kind
+
+
+def write_figure(figure: Any, path: str, *, force: bool) -> None:
+    """Write a figure of matplotlib."""
+    data = io.BytesIO()
+    figure.savefig(data, format=figure_kind(path), dpi=200)
+    write_atomically(path, data.getvalue(), force=force)
+
+
+def say_written(*paths: str | None) -> None:
+    """Print what was written; none is nothing."""
+    for path in paths:
+        if path is not None:
+            print(in_options(f"written: {path}"))
+
+
+#: What the machine that base/pace.py knows takes to read a byte and to judge a sample of an output [s], and between
+#: which multiples of it that came out: numbers in few digits are more of them, free runs of lasting motion are refined.
+OF_BYTE, OF_SAMPLE, CAME_TO = 8e-8, 4e-6, (0.4, 4.0)
+#: A controller's design, and judging one sample of the model's numbers with it [s].
+OF_DESIGN, OF_JUDGED = {"pid": 0.1, "lqg": 1.2}, {"pid": 0.005, "lqg": 0.01}
+
+
+def expect_reading(files: Sequence[str]) -> None:
+    """Say about how long it takes to read these files, where that is long."""
+    size = 0
+    for file in files:
+        try:
+            size += os.stat(file).st_size
+        except (OSError, ValueError):
+            # Who reads it says so in words.
+            return
+    if OF_BYTE * size > 0.2:
+        Progress("").expect("reading", *between(expected(OF_BYTE * size, 1), CAME_TO))
+
+
+def expect_judging(runs: Sequence[Run], outputs: int, *, quiet: bool) -> None:
+    """Say about how long it takes to run a model of so many outputs over these runs, where that is long."""
+    samples = outputs * sum(run.length for run in runs)
+    if OF_SAMPLE * samples > 0.2:
+        Progress("", quiet=quiet).expect("running the model", *between(expected(OF_SAMPLE * samples, 1), CAME_TO))
+
+
+def expect_designing(design: str, samples: int) -> None:
+    """Say about how long a design takes whose loop is judged on so many samples, where that is long."""
+    seconds = OF_DESIGN[design] + OF_JUDGED[design] * max(samples, 0)
+    Progress("").expect("designing", *between(expected(seconds, 1), CAME_TO))

@@ -1,0 +1,169 @@
+"""The commands `ftlm demo` and `ftlm reproduce`."""
+
+from __future__ import annotations
+
+from pathlib import Path
+from typing import Annotated
+
+from typer import Argument, Option
+
+from ftlm.app.server import PORT, serve
+from ftlm.cli.framework import command, say, show_json
+from ftlm.cli.options import (
+    Files,
+    Force,
+    GeneticOptions,
+    Json,
+    LatticeStep,
+    Page,
+    ReadingOptions,
+    Text,
+    Texts,
+    Threads,
+    Verbose,
+)
+from ftlm.errors import ModelError
+from ftlm.progress import Progress
+from ftlm.reproduction import reproduction
+from ftlm.reproduction.cross_validation import orders_on_unseen_runs
+from ftlm.reproduction.demo import run_demo
+from ftlm.reproduction.optimizer_comparison import CONTEST_STEP
+from ftlm.reproduction.report import demo_details, demo_page, demo_text, reproduction_text, unseen_page, unseen_text
+from ftlm.reproduction.reproduction import ALWAYS_SAVED
+from ftlm.utils.files import COMMAND, check_folder, check_free
+from ftlm.utils.resources import expected
+from ftlm.utils.validation import check_threads
+
+#: Processor seconds of `ftlm demo` and of its pages on the machine that base/pace.py knows.
+DEMO_SECONDS = 22.0
+
+
+@command
+def demo(
+    *,
+    out: Annotated[str, Option("-o", "--out", metavar="FOLDER", help="Where to write.")] = "ftlm-demo",
+    step: LatticeStep = 0.1,
+    noise: Annotated[float, Option(help="Noise on every angle [rad].")] = 1e-4,
+    seed: Annotated[int, Option(min=0, help="Seed of the noise.")] = 1,
+    threads: Threads = None,
+    force: Force = False,
+    verbose: Verbose = False,
+    as_json: Json = False,
+) -> None:
+    """Simulate both stages, identify every equation with p = 1, 3, 5, 7, compare, save, draw.
+
+    The paper's lattice is that of --step 0.05, which takes minutes.
+    """
+    with Progress("", quiet=as_json) as progress:
+        progress.expect("the demo", expected(DEMO_SECONDS * (0.1 / step) ** 2, check_threads(threads)))
+        result = run_demo(
+            Path(out),
+            step=step,
+            noise=noise,
+            seed=seed,
+            threads=threads,
+            force=force,
+            say=progress.name,
+            progress=progress,
+        )
+        result.files.append(demo_page(result, Path(out) / "demo.html", force=force))
+    if as_json:
+        show_json(result.to_dict())
+    else:
+        if verbose:
+            say(f"{demo_details(result)}\n")
+        files = f"{Path(out) / 'demo.html'} (open it), and {len(result.files) - 1} runs and models"
+        say(f"{demo_text(result)}\nwritten: {files}")
+
+
+@command
+def reproduce(
+    *,
+    out: Page = "paper.html",
+    save: Annotated[Text, Option(metavar="FOLDER", help="Also write runs, models and the tables' numbers.")] = None,
+    square: Annotated[Text, Option(metavar="FILE", help="A measured run to identify from.")] = None,
+    sine: Annotated[Text, Option(metavar="FILE", help="Another one, to validate on.")] = None,
+    reading: ReadingOptions,
+    step: LatticeStep = 0.05,
+    noise: Annotated[float, Option(help="Noise on every angle of the virtual rig [rad].")] = 1e-4,
+    seed: Annotated[int, Option("--noise-seed", min=0, help="Seed of that noise.")] = 1,
+    arms: Annotated[
+        Texts, Option("--arms", metavar="ARM", help="Simulated arm that verdicts are computed on; several, or all.")
+    ] = None,
+    records: Annotated[int, Option(min=1, help="Records of each, whose noise differs.")] = 3,
+    rivals_step: Annotated[
+        float, Option("--rivals-step", help="Smallest step of the lattice that the genetic algorithm is held against.")
+    ] = CONTEST_STEP,
+    genetic: GeneticOptions,
+    threads: Threads = None,
+    force: Force = False,
+    as_json: Json = False,
+) -> None:
+    """Recompute the tables and figures of the paper, on the virtual rig or on measured runs, as one page."""
+    check_free(out, force=force, words=COMMAND)
+    if save is not None:
+        check_folder(Path(save), ALWAYS_SAVED, force=force)
+    if sine is not None and square is None:
+        raise ModelError("--sine is given without --square; give both, or neither for the virtual rig")
+    measured = reading.runs([f for f in (square, sine) if f is not None], apart=True)
+    with Progress("", quiet=as_json) as progress:
+        result = reproduction.reproduce(
+            *measured,
+            step=step,
+            noise=noise,
+            seed=seed,
+            genetic=genetic.settings(),
+            rivals_step=rivals_step,
+            arms=arms,
+            records=records,
+            threads=threads,
+            say=progress.say,
+            progress=progress,
+        )
+        progress.say("writing the page")
+        files = [result.page(out, force=force), *(result.save(save, force=force) if save is not None else [])]
+    if as_json:
+        show_json({**result.to_dict(), "files": [str(f) for f in files]})
+    else:
+        say(f"{reproduction_text(result)}\n\nwritten: {', '.join(str(f) for f in files)}")
+
+
+@command
+def orders(
+    *,
+    files: Files,
+    out: Page = "orders.html",
+    reading: ReadingOptions,
+    filtered: Annotated[
+        bool, Option("--stock-filter/--no-filter", help="Whether deflections passed the stock 2 Hz low-pass.")
+    ] = True,
+    threads: Threads = None,
+    force: Force = False,
+    as_json: Json = False,
+) -> None:
+    """Integer against fractional orders of the arm's links, fitted to each run and judged on the others: a page."""
+    check_free(out, force=force, words=COMMAND)
+    runs = reading.runs(files, apart=True)
+    with Progress("", quiet=as_json) as progress:
+        found = orders_on_unseen_runs(runs, filtered=filtered, threads=threads, say=progress.say, progress=progress)
+        progress.say("writing the page")
+        page = unseen_page(found, out, force=force)
+    if as_json:
+        show_json({**found.to_dict(), "files": [str(page)]})
+    else:
+        say(f"{unseen_text(found)}\n\nwritten: {page}")
+
+
+@command
+def app(
+    *,
+    files: Annotated[list[str] | None, Argument(metavar="[FILE...]", help="Measured files to open at once.")] = None,
+    port: Annotated[
+        int | None, Option(metavar="PORT", help=f"Of 127.0.0.1; default {PORT}, or any other where that is taken.")
+    ] = None,
+    browser: Annotated[
+        bool, Option("--browser/--no-browser", help="Open a browser, or print the address alone.")
+    ] = True,
+) -> None:
+    """From a file to a model in a browser: a local page that nobody else can open; Ctrl-C ends it."""
+    serve(files or [], port=port, browser=browser)

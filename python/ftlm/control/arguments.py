@@ -1,0 +1,86 @@
+"""Arguments that designs share: names and sums of outputs, numbers above 0."""
+
+from __future__ import annotations
+
+import math
+from collections.abc import Sequence
+
+import numpy as np
+
+from ftlm.errors import ModelError
+from ftlm.utils.validation import Floats, check_seed, nearest, real_number, shown, whole_number
+
+#: Rates of a loop [Hz]: beyond, floating point tells no margins.
+RATES = (1e-9, 1e9)
+#: Deviations and times.
+SIZES = (1e-100, 1e100)
+
+
+def checked_rate(rate: object) -> float:
+    """Samples per second of a loop, as a number."""
+    value = real_number("rate", rate)
+    if not RATES[0] <= value <= RATES[1]:
+        raise ModelError(
+            f"rate = {shown(rate)} Hz is not a positive number of samples per second from {RATES[0]:g} to {RATES[1]:g}"
+        )
+    return value
+
+
+def names_of(what: str, given: Sequence[str] | None, outputs: tuple[str, ...]) -> tuple[str, ...]:
+    """Outputs by name, all of them where none is named."""
+    if given is None:
+        return outputs
+    names = [] if isinstance(given, str) or not isinstance(given, Sequence) else [*given[: len(outputs) + 1]]
+    absent = [n for n in names if not (isinstance(n, str) and n in outputs)]
+    if not names or (not absent and len(set(names)) < len(names)):
+        raise ModelError(
+            f"{what} = {shown(given)} is no list of outputs, each once; the input reaches {', '.join(outputs)}"
+        )
+    if absent:
+        near = nearest(absent[0], outputs) if isinstance(absent[0], str) else ""
+        raise ModelError(
+            f"{what} = {shown(absent[0])} is not one of the outputs that the input reaches{near}; they are "
+            f"{', '.join(outputs)}"
+        )
+    return tuple(names)
+
+
+def positive(name: str, value: object) -> float:
+    """A finite number above 0."""
+    number = real_number(name, value)
+    if not (math.isfinite(number) and number > 0):
+        raise ModelError(f"{name} = {shown(value)} is not a finite number above 0")
+    if not SIZES[0] <= number <= SIZES[1]:
+        raise ModelError(f"{name} = {shown(value)} is outside [{SIZES[0]:g}, {SIZES[1]:g}], where squares are numbers")
+    return number
+
+
+def largest(limit: object) -> float:
+    """The largest command, which may be infinite."""
+    most = real_number("limit", limit)
+    if not most > 0:
+        raise ModelError(f"limit = {shown(limit)} is not a number above 0")
+    return most
+
+
+def drawn_from(samples: object, seed: object) -> tuple[int, int]:
+    """How many samples of a model's numbers are drawn, and from which seed."""
+    count = whole_number(samples)
+    if count is None or not 0 <= count <= 10_000:
+        raise ModelError(f"samples = {shown(samples)} is no whole number from 0 to 10000")
+    return count, check_seed(seed)
+
+
+def sums(what: str, text: object, outputs: tuple[str, ...]) -> Floats:
+    """A sum of outputs in words, such as "theta11 + theta12", as the row of its factors."""
+    row = np.zeros(len(outputs))
+    for part in text.split("+") if isinstance(text, str) else [""]:
+        name = part.strip()
+        if name not in outputs:
+            near = nearest(name, outputs)
+            raise ModelError(
+                f"{what} = {shown(text)} is not a sum of outputs that the input reaches{near}; they are "
+                f"{', '.join(outputs)}"
+            )
+        row[outputs.index(name)] += 1.0
+    return row

@@ -1,0 +1,300 @@
+"""The file of a controller: what a machine needs to run it, sample by sample, and how it is read back."""
+
+from __future__ import annotations
+
+import math
+import os
+from typing import Any, Literal, TypeAlias
+
+import msgspec
+import numpy as np
+
+from ftlm._core import __version__
+from ftlm.control.fractional_pid import FractionalPid, Realised
+from ftlm.control.lqg import Lqg, Observer
+from ftlm.control.realization import MOST, Realisation
+from ftlm.errors import DataError, FtlmError, ModelError
+from ftlm.utils.files import Saved, write_atomically
+from ftlm.utils.validation import Floats, words_of
+
+SCHEMA = 1
+#: How to run either kind without ftlm.
+MEANING = {
+    "pid": "each sample, with e = reference - measured: every lag becomes x = keep x + now e + before e_last, and the "
+    "output is (kp + direct) e + the sum of weight x, cut at the limit; lags of the derivative begin with "
+    "e (now + before)/(1 - keep), those of the integral with 0 and stand still where they would push further",
+    "lqg": "each sample, with y what is measured and u what the last sample put out, cut at the limit: "
+    "x = x + correction (y - [c 0] x); x = [[a, b], [0, 1]] x + [b; 0] u; output = ahead reference - [feedback 1] x",
+}
+
+Matrix: TypeAlias = list[list[float]]
+
+
+class Lag(msgspec.Struct, forbid_unknown_fields=True):
+    """A memory of one number."""
+
+    of: Literal["integral", "derivative"]
+    keep: float
+    now: float
+    before: float
+    weight: float
+
+
+class PidFile(msgspec.Struct, forbid_unknown_fields=True, tag="pid"):
+    """A fractional PID at a rate: what it is, and what it does from sample to sample."""
+
+    kp: float
+    ki: float
+    kd: float
+    lam: float
+    mu: float
+    rate: float
+    limit: float | None
+    band: tuple[float, float]
+    order: int
+    direct: float
+    lags: list[Lag]
+
+    def controller(self) -> Realised:
+        """The controller, made again."""
+        pid = FractionalPid(self.kp, self.ki, self.kd, self.lam, self.mu)
+        limit = math.inf if self.limit is None else self.limit
+        return Realised(pid, self.rate, limit=limit, band=self.band, order=self.order)
+
+
+class LqgFile(msgspec.Struct, forbid_unknown_fields=True, tag="lqg"):
+    """An observer and a state feedback at a rate."""
+
+    rate: float
+    limit: float | None
+    input: str
+    outputs: list[str]
+    measured: list[str]
+    tracked: str
+    a: Matrix
+    b: Matrix
+    c: Matrix
+    correction: Matrix
+    feedback: Matrix
+    ahead: float
+    poles: list[tuple[float, float]]
+    band: tuple[float, float]
+    gain_error_db: list[float]
+    phase_error_degrees: list[float]
+    noise: list[float]
+    drift: float
+    deviations: list[float]
+
+    def controller(self) -> Lqg:
+        """The controller, made again."""
+        a, b, c, correction, feedback = (
+            np.array(m, dtype=np.float64) for m in (self.a, self.b, self.c, self.correction, self.feedback)
+        )
+        size, seen = len(self.a), len(self.measured)
+        shapes = {
+            "a": (a, (size, size)),
+            "b": (b, (size, 1)),
+            "c": (c, (len(self.outputs), size)),
+            "correction": (correction, (size + 1, seen)),
+            "feedback": (feedback, (1, size)),
+        }
+        for name, (matrix, shape) in shapes.items():
+            if matrix.shape != shape:
+                raise ModelError(f"{name} has shape {matrix.shape}, not {shape}")
+            if not np.isfinite(matrix).all():
+                raise ModelError(f"{name} is not finite")
+        if not 0 < size <= MOST + 1:
+            raise ModelError(f"{size} states are not 1 to {MOST + 1}")
+        if not 0 < len(self.poles) <= size:
+            raise ModelError(f"{len(self.poles)} poles are not those of {size} states")
+        absent = [n for n in (*self.measured, self.tracked) if n not in self.outputs]
+        if absent:
+            raise ModelError(f"{absent[0]} is not one of its outputs")
+        if not (self.rate > 0 and len(self.noise) == seen):
+            raise ModelError("its rate is not above 0, or not every measured output has its noise")
+        lists = (self.gain_error_db, self.phase_error_degrees, self.deviations)
+        if any(len(one) != len(self.outputs) for one in lists):
+            raise ModelError("not every output has its errors")
+        gain, phase, deviations = (dict(zip(self.outputs, one, strict=True)) for one in lists)
+        realisation = Realisation(
+            tuple(self.outputs),
+            self.input,
+            self.rate,
+            self.band,
+            tuple(complex(*p) for p in self.poles),
+            a,
+            b,
+            c,
+            gain,
+            phase,
+        )
+        observer = Observer(realisation, tuple(self.measured), tuple(self.noise), self.drift, correction, deviations)
+        limit = math.inf if self.limit is None else self.limit
+        return Lqg(observer, feedback, self.tracked, limit=limit)
+
+
+class ControllerFile(msgspec.Struct, forbid_unknown_fields=True):
+    """The whole file."""
+
+    format: Literal["ftlm-controller"]
+    schema: int
+    written_by: str
+    model: str
+    meaning: str
+    controller: PidFile | LqgFile
+
+
+#: A controller of thirty states has a few tens of kilobytes.
+CONTROLLER = Saved("controller", "a file that ftlm control wrote", ControllerFile, SCHEMA)
+
+
+def save_controller(
+    controller: Realised | Lqg, path: str | os.PathLike[str], *, model: str = "", force: bool = False
+) -> None:
+    """Write a controller as JSON: what it was made of, and the numbers that a machine runs from sample to sample.
+
+    Parameters
+    ----------
+    controller
+        What runs.
+    path
+        File to write.
+    model
+        What it was designed on, in words.
+    force
+        Overwrite a file that exists.
+
+    Raises
+    ------
+    ModelError
+        Something that is no controller of ftlm.
+    DataError
+        The file exists and ``force`` is not set, or it cannot be written.
+    """
+    if isinstance(controller, Realised):
+        written: PidFile | LqgFile = _pid(controller)
+    elif isinstance(controller, Lqg):
+        written = _lqg(controller)
+    else:
+        raise ModelError(f"controller is a {type(controller).__name__}; give a Realised or an Lqg")
+    kind = "pid" if isinstance(written, PidFile) else "lqg"
+    file = ControllerFile("ftlm-controller", SCHEMA, f"ftlm {__version__}", str(model), MEANING[kind], written)
+    write_atomically(path, msgspec.json.format(msgspec.json.encode(file), indent=1) + b"\n", force=force)
+
+
+def load_controller(path: str | os.PathLike[str]) -> Realised | Lqg:
+    """Read a controller that :func:`save_controller` or ``ftlm control`` wrote.
+
+    Raises
+    ------
+    DataError
+        A file that cannot be read, or is no controller of this version.
+    """
+    read = CONTROLLER.read(path)
+    CONTROLLER.check_schema(path, read, SCHEMA)
+    try:
+        return read.controller.controller()
+    except (FtlmError, ValueError) as error:
+        raise DataError(f"{path} is damaged: {words_of(error)}; write it again") from error
+
+
+def _limit(value: float) -> float | None:
+    return value if math.isfinite(value) else None
+
+
+def _pid(controller: Realised) -> PidFile:
+    pid = controller.pid
+    lags = [Lag(of, *values) for of, values in controller.lags()]
+    return PidFile(
+        pid.kp,
+        pid.ki,
+        pid.kd,
+        pid.lam,
+        pid.mu,
+        controller.rate,
+        _limit(controller.limit),
+        controller.band,
+        controller.order,
+        controller.direct,
+        lags,
+    )
+
+
+def _lqg(controller: Lqg) -> LqgFile:
+    observer = controller.observer
+    made = observer.realisation
+    return LqgFile(
+        made.rate,
+        _limit(controller.limit),
+        made.input,
+        list(made.outputs),
+        list(observer.measured),
+        controller.tracked,
+        made.a.tolist(),
+        made.b.tolist(),
+        made.c.tolist(),
+        observer.gain.tolist(),
+        controller.feedback.tolist(),
+        controller.ahead,
+        [(p.real, p.imag) for p in made.poles],
+        made.band,
+        [made.gain_error[o] for o in made.outputs],
+        [made.phase_error[o] for o in made.outputs],
+        list(observer.noise),
+        observer.drift,
+        [observer.deviations[o] for o in made.outputs],
+    )
+
+
+#: What a rig hands over, in its order.
+ANGLES = ("theta11", "theta12", "theta21", "theta22")
+
+
+class HubLoops:
+    """A controller of each hub for :func:`ftlm.rig.control`: angles and reference in, currents out.
+
+    Parameters
+    ----------
+    first, second
+        Of hub 1 and hub 2: a :class:`Realised`, called with reference less hub angle [rad], or an :class:`Lqg`, which
+        reads the angles that it names; None leaves a hub without current.
+
+    Raises
+    ------
+    ModelError
+        What is neither, or a controller that reads what the arm does not measure.
+    """
+
+    def __init__(self, first: Realised | Lqg | None, second: Realised | Lqg | None = None) -> None:
+        self.loops = (first, second)
+        self._reads: list[list[int]] = []
+        for j, loop in enumerate(self.loops):
+            if not isinstance(loop, (Realised, Lqg, type(None))):
+                raise ModelError("first and second are Realised or Lqg controllers, or None")
+            names = loop.observer.measured if isinstance(loop, Lqg) else (ANGLES[2 * j],)
+            unknown = [n for n in names if n not in ANGLES]
+            if unknown:
+                raise ModelError(f"the controller reads {', '.join(unknown)}; the arm measures {', '.join(ANGLES)}")
+            self._reads.append([ANGLES.index(n) for n in names])
+
+    def reset(self) -> None:
+        """Forgets what was."""
+        for loop in self.loops:
+            if loop is not None:
+                loop.reset()
+
+    def to_dict(self) -> dict[str, Any]:
+        """For JSON."""
+        return {f"hub{j}": None if loop is None else loop.to_dict() for j, loop in enumerate(self.loops, start=1)}
+
+    def __call__(self, time: float, angles: Floats, reference: Floats) -> tuple[float, float]:
+        """Both currents [A]."""
+        first, second = (
+            0.0
+            if loop is None
+            else loop(angles[reads], float(reference[j]))
+            if isinstance(loop, Lqg)
+            else loop(float(reference[j] - angles[reads[0]]))
+            for j, (loop, reads) in enumerate(zip(self.loops, self._reads, strict=True))
+        )
+        return first, second

@@ -1,0 +1,293 @@
+"""Input shapers: a reference split into a few steps whose vibrations cancel at the poles of a model."""
+
+from __future__ import annotations
+
+import math
+from dataclasses import dataclass
+from typing import Any, Literal
+
+import numpy as np
+from numpy.typing import ArrayLike
+
+from ftlm.analysis.poles import Mode, modes
+from ftlm.control.arguments import checked_rate
+from ftlm.errors import DataError, ModelError
+from ftlm.model.model import Solved
+from ftlm.utils.formatting import with_error
+from ftlm.utils.statistics import NORMAL_95
+from ftlm.utils.validation import Floats, check_choice, shown, whole_number
+
+#: How often the zero-vibration shaper of a mode is put behind itself: the order of the zero on its pole.
+KINDS = {"zv": 1, "zvd": 2}
+#: A shaper that may leave more than this share of the vibration within the intervals of its poles is no design.
+WIDEST = 0.2
+#: Most samples that a shaper may last, and poles that it may be made for [rad/s].
+LONGEST = 1 << 22
+POLES = (1e-12, 1e12)
+#: Values of frequency and damping each, of a grid over their intervals.
+GRID = 9
+
+
+@dataclass(frozen=True)
+class Shaper:
+    """A few impulses, of sum 1, that leave no vibration at the poles they were made for.
+
+    Parameters
+    ----------
+    kind
+        ``"zv"``: no vibration at the pole. ``"zvd"``: nor any change of it with the pole, at twice the delay.
+    modes
+        What it was made for.
+    times, amplitudes
+        The impulses in continuous time [s].
+    worst
+        Largest share of the vibration that is left within the 95 % intervals of the modes; None where they have none.
+    """
+
+    kind: str
+    modes: tuple[Mode, ...]
+    times: tuple[float, ...]
+    amplitudes: tuple[float, ...]
+    worst: float | None
+
+    @property
+    def delay(self) -> float:
+        """How much later a shaped reference arrives [s]."""
+        return self.times[-1]
+
+    def residual(self, frequency: ArrayLike, damping: ArrayLike) -> Floats:
+        """Share of the vibration that is left of a step on a mode.
+
+        Parameters
+        ----------
+        frequency
+            Of the mode, undamped [rad/s].
+        damping
+            Its ratio.
+        """
+        return left_over(np.array(self.times), np.array(self.amplitudes), frequency, damping)
+
+    def impulses(self, rate: float) -> Floats:
+        """The impulses at the samples of a rate [Hz], shape (N,): zero at the very poles, and of sum 1.
+
+        An impulse between two samples is split over both so that at the pole they are what it was, which interpolation
+        is not.
+
+        Raises
+        ------
+        ModelError
+            A rate that is none, with fewer than four samples a period of a mode, or so high that the shaper lasts for
+            millions of them.
+        """
+        rate = checked_rate(rate)
+        if self.delay * rate > LONGEST:
+            raise ModelError(
+                f"rate = {rate:g} Hz makes the shaper {self.delay * rate:.3g} samples long; use at most "
+                f"{LONGEST / self.delay:.3g} Hz"
+            )
+        taps = np.ones(1)
+        for mode in self.modes:
+            if mode.pole.imag * 2.0 > math.pi * rate:
+                raise ModelError(
+                    f"rate = {rate:g} Hz has fewer than four samples in a period of the mode at "
+                    f"{mode.frequency:.4g} rad/s; use at least {2.0 * mode.pole.imag / math.pi:.3g} Hz"
+                )
+            part = _sampled(mode, 1.0 / rate)
+            for _ in range(KINDS[self.kind]):
+                taps = _through(np.append(taps, np.zeros(len(part) - 1)), part)
+        return taps
+
+    def filter(self, reference: ArrayLike, rate: float) -> Floats:
+        """A reference, or an input, of one row a sample at a rate [Hz] through the shaper; it is as long as before.
+
+        What was before the first row is the first row. Where it ends the shaper is `delay` behind: let it end at rest.
+
+        Parameters
+        ----------
+        reference
+            One row a sample.
+        rate
+            Samples per second.
+
+        Raises
+        ------
+        DataError
+            Rows that are no finite numbers.
+        ModelError
+            As :meth:`impulses`.
+        """
+        try:
+            given = np.asarray(reference)
+            good = given.dtype.kind in "fiu" and given.ndim in (1, 2) and given.size > 0
+        except (TypeError, ValueError):
+            good = False
+        if not good:
+            raise DataError("reference is no array of numbers of shape (rows,) or (rows, columns)")
+        x = np.array(given, dtype=np.float64).reshape(len(given), -1)
+        bad = np.flatnonzero(~np.isfinite(x).all(axis=1))
+        if bad.size:
+            raise DataError(f"reference is not finite at row {bad[0]} ({bad.size} such rows in all)")
+        taps = self.impulses(rate)
+        rest = x[0]
+        shaped = np.column_stack([_through(column, taps) for column in (x - rest).T]) + rest
+        return np.asarray(shaped.reshape(given.shape), dtype=np.float64)
+
+    def to_dict(self) -> dict[str, Any]:
+        """For JSON."""
+        return {
+            "kind": self.kind,
+            "times": list(self.times),
+            "amplitudes": list(self.amplitudes),
+            "modes": [[m.frequency, m.damping] for m in self.modes],
+            "worst": self.worst,
+        }
+
+    def __str__(self) -> str:
+        steps = ", ".join(f"{a:.4g} at {t:.4g} s" for a, t in zip(self.amplitudes, self.times, strict=True))
+        within = "" if self.worst is None else f"; within their intervals at most {100 * self.worst:.2g} % is left"
+        shown = ", ".join(map(str, self.modes))
+        return f"{self.kind.upper()} shaper of {shown}: {steps}{within}"
+
+
+def input_shaper(
+    model: Solved | complex,
+    kind: Literal["zv", "zvd"] = "zv",
+    *,
+    modes_shaped: int = 1,
+    coupling: Literal["simulated", "measured"] = "simulated",
+) -> Shaper:
+    """Input shaper from the poles of a model, whatever its orders.
+
+    Parameters
+    ----------
+    model
+        An identified model, of which the least damped modes are shaped; or a pole [rad/s] such as ``-2 + 17j``.
+    kind
+        ``"zv"`` (Smith's posicast; half a period of delay) or ``"zvd"`` (a period; an error of the pole counts to
+        second order alone).
+    modes_shaped
+        How many modes, the least damped first. Every one of them adds its delay.
+    coupling
+        ``"simulated"``: poles of the equations together. ``"measured"``: of each alone, as where a stiff loop moves a
+        hub that a link hangs on.
+
+    Returns
+    -------
+    Shaper
+
+    Raises
+    ------
+    ModelError
+        A model that is not stable, has friction, or has fewer modes that swing; poles so uncertain that a fifth of the
+        vibration may be left.
+
+    Notes
+    -----
+    Singer and Seering (1990), doi:10.1115/1.2894142. A fractional model has a power of time beside its swings, which no
+    shaper cancels; it is no vibration.
+    """
+    check_choice("kind", kind, KINDS)
+    count = whole_number(modes_shaped)
+    if count is None or count < 1:
+        raise ModelError(f"modes_shaped = {shown(modes_shaped)} is no number of modes; give a whole number from 1")
+    if isinstance(model, (complex, float, int, np.number)):
+        every: tuple[Mode, ...] = (_mode_of(model),)
+    else:
+        every = modes(model, coupling=coupling)
+    growing = [m for m in every if m.grows or m.damping <= 0.0]
+    if growing:
+        raise ModelError(
+            f"the model is not stable ({growing[0]}): what no loop holds cannot be shaped; close a loop around it, and "
+            "shape the poles of the loop"
+        )
+    swings = sorted((m for m in every if m.swings), key=lambda m: m.damping)
+    if len(swings) < count:
+        raise ModelError(
+            f"the model has {len(swings)} modes that swing, and {shown(count)} are to be shaped; what relaxes "
+            "needs no shaper"
+        )
+    chosen = tuple(swings[:count])
+    times, amplitudes = np.zeros(1), np.ones(1)
+    for mode in chosen:
+        half, kept = _half(mode)
+        for _ in range(KINDS[kind]):
+            times = np.concatenate([times, times + half])
+            amplitudes = np.concatenate([amplitudes, amplitudes * kept]) / (1.0 + kept)
+    instants, place = np.unique(np.round(times, 15), return_inverse=True)
+    summed = np.bincount(place, weights=amplitudes)
+    worst = _worst(np.asarray(instants, dtype=np.float64), np.asarray(summed, dtype=np.float64), chosen)
+    if worst is not None and not worst <= WIDEST:
+        widest = max(chosen, key=lambda m: (m.frequency_error or 0.0) / m.frequency + (m.damping_error or 0.0))
+        raise ModelError(
+            f"the intervals are too wide to design on: within those of the mode at "
+            f"{with_error(widest.frequency, widest.frequency_error)} rad/s, damping "
+            f"{with_error(widest.damping, widest.damping_error)}, a {kind} shaper may leave {100 * worst:.0f} % of the "
+            f"vibration, more than {100 * WIDEST:.0f} %; identify from a longer run, or from one that excites this mode"
+            + (", or use kind='zvd'" if kind == "zv" else "")
+        )
+    return Shaper(kind, chosen, tuple(instants.tolist()), tuple(summed.tolist()), worst)
+
+
+def left_over(times: Floats, amplitudes: Floats, frequency: ArrayLike, damping: ArrayLike) -> Floats:
+    """Amplitude of the vibration after the last impulse over that after one impulse of sum 1 at its instant."""
+    w, z = np.broadcast_arrays(np.asarray(frequency, dtype=np.float64), np.asarray(damping, dtype=np.float64))
+    pole = w * (-z + 1j * np.sqrt(np.maximum(1.0 - z * z, 0.0)))
+    left = np.sum(amplitudes * np.exp(pole[..., None] * (times[-1] - times)), axis=-1)
+    return np.asarray(np.abs(left), dtype=np.float64)
+
+
+def _through(x: Floats, taps: Floats) -> Floats:
+    """What comes out of a filter of a few impulses, as long as what goes in."""
+    out = np.zeros(len(x))
+    for at in np.flatnonzero(taps[: len(x)]):
+        out[at:] += taps[at] * x[: len(x) - at]
+    return out
+
+
+def _mode_of(given: complex | np.number[Any]) -> Mode:
+    try:
+        pole = complex(given)
+        size = abs(pole)
+    except (TypeError, ValueError, OverflowError):
+        pole, size = complex("nan"), math.nan
+    low, high = POLES
+    if not (low <= abs(pole.imag) and size <= high):
+        raise ModelError(f"pole = {shown(given)} does not swing; give one such as -2 + 17j [rad/s]")
+    slow = abs(pole.real)
+    return Mode(complex(pole.real, abs(pole.imag)), size, -pole.real / size, 1 / slow if slow else math.inf, True)
+
+
+def _half(mode: Mode) -> tuple[float, float]:
+    """Half a period of a mode [s], and what is left of a swing after it."""
+    half = math.pi / mode.pole.imag
+    return half, math.exp(mode.pole.real * half)
+
+
+def _sampled(mode: Mode, step: float) -> Floats:
+    """The zero-vibration shaper of a mode at its samples: 1 + K e^(-s half) = 0 at its pole, exactly."""
+    half, kept = _half(mode)
+    whole = math.floor(half / step)
+    rest = half - whole * step
+    # a + b e^(-s step) = e^(-s rest) at the pole; both are positive below half the sampling rate.
+    decay, turn = mode.pole.real, mode.pole.imag
+    later = math.exp(decay * (step - rest)) * math.sin(turn * rest) / math.sin(turn * step)
+    sooner = math.exp(-decay * rest) * math.sin(turn * (step - rest)) / math.sin(turn * step)
+    taps = np.zeros(whole + 2)
+    taps[0] = 1.0
+    taps[whole] += kept * sooner
+    taps[whole + 1] += kept * later
+    return np.asarray(taps / taps.sum())
+
+
+def _worst(times: Floats, amplitudes: Floats, chosen: tuple[Mode, ...]) -> float | None:
+    """Largest share that is left over the intervals of the modes' frequencies and dampings."""
+    worst: float | None = None
+    for mode in chosen:
+        if mode.frequency_error is None or mode.damping_error is None:
+            continue
+        across = NORMAL_95 * np.linspace(-1.0, 1.0, GRID)
+        w = np.maximum(mode.frequency + mode.frequency_error * across, 1e-6 * mode.frequency)
+        z = np.clip(mode.damping + mode.damping_error * across, -0.99, 0.99)
+        left = left_over(times, amplitudes, w[:, None], z)
+        worst = max(worst or 0.0, float(np.max(np.where(np.isfinite(left), left, np.inf))))
+    return worst

@@ -1,0 +1,264 @@
+"""Inverse dynamics: the reference with which a loop moves a tip along a path, by the exact response of its model."""
+
+from __future__ import annotations
+
+import math
+from dataclasses import dataclass, replace
+from typing import Any, Protocol
+
+import numpy as np
+from numpy.typing import ArrayLike
+
+from ftlm.control.arguments import SIZES, drawn_from, largest, positive, sums
+from ftlm.control.fractional_pid import known_least
+from ftlm.control.stability_margins import JudgedLoop, Plant
+from ftlm.errors import DataError, ModelError
+from ftlm.model.model import Solved
+from ftlm.utils.validation import Complex, Floats, real_number, shown
+
+#: The transform is so many times as long as the path, under a weight that falls to exp(-FALLS) over it: what was long
+#: ago is then not what comes again, which a memory without end would never forget.
+LONGER, FALLS = 8, 28.0
+#: A reference that is so many times as large as the move grows without end.
+GROWN = 20.0
+#: Longest path that is inverted [rows].
+MOST = 100_000
+#: A reference that begins further off than this share of the move needs a longer rest before the path.
+UNREST = 1e-3
+#: More than this share of what a path itself as the reference leaves, and the intervals are too wide.
+SHARE_LEFT = 0.5
+
+
+class Loop(Protocol):
+    """A designed loop."""
+
+    @property
+    def rate(self) -> float:
+        """Samples per second."""
+
+    @property
+    def plants(self) -> tuple[Plant, ...]:
+        """What it moves, an output each."""
+
+    def acting(self, w: Floats | Complex) -> tuple[tuple[str, ...], Complex, Complex]:
+        """Outputs it reads, its response to each of them, shape (outputs, W), and to the reference, (W,)."""
+
+
+@dataclass(frozen=True)
+class PlannedMove:
+    """A reference that moves what was asked for along a path.
+
+    Parameters
+    ----------
+    reference
+        For the loop, a row a sample.
+    path
+        What is to be followed.
+    command
+        What the loop will ask for, as its linear model has it.
+    outputs
+        The model's outputs on the way.
+    left
+        RMS of what is off the path after its end, beyond which no more than one sample in forty of the model's numbers
+        is; None where it has no covariance.
+    plain
+        The same at the model's values if the path itself were the reference.
+    """
+
+    reference: Floats
+    path: Floats
+    command: Floats
+    outputs: dict[str, Floats]
+    left: float | None
+    plain: float
+
+    def to_dict(self) -> dict[str, Any]:
+        """For JSON, without the rows."""
+        return {
+            "rows": len(self.path),
+            "largest_command": float(np.max(np.abs(self.command))),
+            "left": self.left,
+            "plain": self.plain,
+        }
+
+    def __str__(self) -> str:
+        most = f"largest command {np.max(np.abs(self.command)):.3g}"
+        within = "" if self.left is None else f", at most {self.left:.2g} off it afterwards within the intervals"
+        return (
+            f"a path of {np.ptp(self.path):.4g} in {len(self.path)} samples: {most}{within}; the path itself as the "
+            f"reference would leave {self.plain:.2g}"
+        )
+
+
+def smooth_move(
+    size: float, duration: float, rate: float = 500.0, *, before: float = 0.3, after: float = 1.2
+) -> Floats:
+    """A path from rest to rest whose speed, acceleration and jerk are 0 at both ends: a polynomial of degree 7.
+
+    Parameters
+    ----------
+    size
+        Of the move, in the unit of what moves.
+    duration
+        Of it [s].
+    rate
+        Samples per second.
+    before, after
+        Rest on both sides [s].
+
+    Raises
+    ------
+    ModelError
+        Numbers that are none, a move of fewer than ten samples.
+    """
+    reach = real_number("size", size)
+    if not math.isfinite(reach):
+        raise ModelError(f"size = {shown(size)} is not a finite number")
+    times = positive("duration", duration), positive("rate", rate)
+    rests = [real_number(n, v) for n, v in (("before", before), ("after", after))]
+    if not all(0 <= r < math.inf for r in rests):
+        raise ModelError(f"before = {before!r} and after = {after!r} are not seconds from 0")
+    if times[0] * times[1] < 10:
+        raise ModelError(
+            f"duration = {shown(duration)} s has fewer than ten samples at {times[1]:g} Hz; give it more time"
+        )
+    rows = (sum(rests) + times[0]) * times[1] + 1
+    if rows > MOST:
+        raise ModelError(f"a move of {rows:.4g} samples is longer than {MOST}; give it less time")
+    s = np.clip((np.arange(round(rows)) / times[1] - rests[0]) / times[0], 0.0, 1.0)
+    return np.asarray(reach * s**4 * (35.0 - 84.0 * s + 70.0 * s**2 - 20.0 * s**3))
+
+
+def inverse(
+    design: Loop, path: ArrayLike, *, of: str | None = None, limit: float = math.inf, samples: int = 40, seed: int = 0
+) -> PlannedMove:
+    """Find the reference with which a designed loop moves a sum of outputs, such as a tip, along a path.
+
+    Parameters
+    ----------
+    design : PidDesign or LqgDesign
+        The loop; its model's response is inverted as it is, fractional, with delay, hold and the controller as it runs.
+    path : array_like
+        What is to be followed, one row a sample at the loop's rate; at rest at both ends, and before its move for as
+        long as the reference has to begin earlier.
+    of : str, optional
+        An output of the model or a sum such as ``"theta11 + theta12"``, as the loop reads them; where the model has one
+        output alone it needs no name.
+    limit
+        Largest command.
+    samples, seed
+        Of the model's numbers, from their covariance, 0 to 10000.
+
+    Returns
+    -------
+    PlannedMove
+
+    Raises
+    ------
+    DataError
+        A path that is none.
+    ModelError
+        A path that needs more than the limit, or a reference that moves before the path's first row; intervals so wide
+        that more than half may be left of what the path itself as the reference leaves.
+
+    Notes
+    -----
+    In the frequency domain, where a tip that first moves backwards has a bounded inverse, which begins before the path
+    does: Bayo (1987), doi:10.1002/rob.4620040406.
+    """
+    if not isinstance(design, JudgedLoop):
+        raise ModelError(f"design is a {type(design).__name__}, no PidDesign or LqgDesign; design a loop first")
+    rows = _path(path)
+    count, start = drawn_from(samples, seed)
+    most = largest(limit)
+    names = tuple(p.output for p in design.plants)
+    row = sums("of", names[0] if of is None and len(names) == 1 else of, names)
+    size = 1 << math.ceil(math.log2(LONGER * len(rows)))
+    # On a line right of all poles and left of the zeros that a tip has there: s = jw, its real part above 0.
+    fall = FALLS * design.rate / size
+    w: Complex = np.asarray(2.0 * math.pi * np.fft.rfftfreq(size, 1.0 / design.rate) - 1j * fall, dtype=np.complex128)
+    inside = w.real < 0.999 * math.pi * design.rate
+    weight = np.exp(-fall * np.arange(size) / design.rate)
+    heard, acts, asks = design.acting(w[inside])
+
+    def moved(model: Solved) -> tuple[Complex, Complex]:
+        """Command and outputs of the closed loop by the reference."""
+        held = np.array([replace(p, model=model).response(w[inside]) for p in design.plants])
+        loop = np.sum([a * held[names.index(o)] for o, a in zip(heard, acts, strict=True)], axis=0)
+        command = asks / (1.0 + loop)
+        return command, held * command
+
+    command, outputs = moved(design.plants[0].model)
+    held = np.concatenate([rows, np.full(size - len(rows), rows[-1])]) - rows[0]
+    spectrum = np.fft.rfft(held * weight)[inside]
+    needed = spectrum / (row @ outputs)
+
+    def back(part: Complex) -> Floats:
+        every = np.zeros(len(w), dtype=complex)
+        every[inside] = part
+        return np.asarray((np.fft.irfft(every, size) / weight)[: len(rows)])
+
+    reference = back(needed) + rows[0]
+    move = float(np.ptp(rows))
+    off = float(np.max(np.abs(reference[:1] - rows[0])))
+    if off > UNREST * move:
+        raise ModelError(
+            f"the reference has to begin before the path does: at its first row it is {off:.3g} away from rest, more "
+            f"than {UNREST:g} of the move; let the path rest longer before its move"
+        )
+    asked = back(needed * command)
+    if not np.max(np.abs(reference - rows[0])) < GROWN * move:
+        raise ModelError(
+            "the reference grows beyond all bounds: what is asked for begins with a move the other way that is slower "
+            "than the path; give it more time, or ask for another output"
+        )
+    if np.max(np.abs(asked)) > most:
+        at = int(np.argmax(np.abs(asked)))
+        raise ModelError(
+            f"the path needs a command of {np.max(np.abs(asked)):.3g} at {at / design.rate:.4g} s, over the limit of "
+            f"{most:g}; give it more time, or a smaller move"
+        )
+    ends = int(np.flatnonzero(np.abs(rows - rows[-1]) > UNREST * move)[-1]) + 1
+    plain = _off(back(spectrum * (row @ outputs)) + rows[0], rows, ends)
+    left = [
+        _off(back(needed * (row @ moved(one.model)[1])) + rows[0], rows, ends)
+        for one in design.plants[0].samples(count, start)
+    ]
+    worst = float(np.quantile(left, 0.975)) if left else None
+    if worst is not None and not worst <= SHARE_LEFT * plain:
+        raise ModelError(
+            f"the intervals are too wide to design on: within them {worst:.2g} may be off the path after its end, and "
+            f"the path itself as the reference leaves {plain:.2g}; {known_least(design.plants[0].model)}; identify "
+            "from a longer or richer run (ftlm design-input lays it out)"
+        )
+    ways = {n: back(needed * line) for n, line in zip(names, outputs, strict=True)}
+    return PlannedMove(reference, rows, asked, ways, worst, plain)
+
+
+def _path(path: ArrayLike) -> Floats:
+    """A path as numbers, shape (rows,)."""
+    try:
+        raw = np.asarray(path)
+        good = raw.dtype.kind in "fiu" and raw.ndim == 1 and 16 <= raw.size <= MOST
+    except (TypeError, ValueError):
+        good = False
+    if not good:
+        raise DataError(f"path is no array of 16 to {MOST} numbers, one a sample")
+    rows = np.array(raw, dtype=np.float64)
+    bad = np.flatnonzero(~np.isfinite(rows))
+    if bad.size:
+        raise DataError(f"path is not finite at row {bad[0]} ({bad.size} such rows in all)")
+    large = np.flatnonzero(np.abs(rows) > SIZES[1])
+    if large.size:
+        raise DataError(f"path is beyond {SIZES[1]:g} at row {large[0]} ({large.size} such rows in all); scale it")
+    if np.ptp(rows) < SIZES[0]:
+        raise DataError("path stands still: there is nothing to follow")
+    for where, pair in (("begin", rows[:2]), ("end", rows[-2:])):
+        if abs(pair[1] - pair[0]) > UNREST * np.ptp(rows):
+            raise DataError(f"path does not {where} at rest; repeat its {'first' if where == 'begin' else 'last'} row")
+    return rows
+
+
+def _off(found: Floats, rows: Floats, ends: int) -> float:
+    """RMS of what is off a path behind its end."""
+    return float(np.sqrt(np.mean(np.square((found - rows)[min(ends, len(rows) - 1) :]))))

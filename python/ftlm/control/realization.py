@@ -1,0 +1,314 @@
+"""A model as a few poles: rational functions fitted to its exact response, and the same sampled, with their errors."""
+
+from __future__ import annotations
+
+import importlib
+import math
+import warnings
+from collections.abc import Iterator, Sequence
+from contextlib import contextmanager
+from dataclasses import dataclass
+from typing import Any
+
+import numpy as np
+
+from ftlm.analysis.poles import modes
+from ftlm.control.stability_margins import Plant
+from ftlm.errors import ModelError
+from ftlm.utils.validation import Complex, Floats, real_number, shown, whole_number, words_of
+
+#: Frequencies at which the exact response is fitted; the fit is judged between them, too.
+FITTED = 120
+#: Rounds in which poles move, and the share of themselves below which they stand still.
+ROUNDS, STILL = 30, 1e-6
+#: A pole that adds less than this share to every output at every frequency is none.
+NOTHING = 1e-6
+#: One closer to 0 than this share of the band's lower end is an integral.
+AT_ORIGIN = 1e-3
+#: Errors up to which poles are added, gain [dB] and phase [degrees], and the most of them.
+GAIN_DB, PHASE_DEGREES = 0.1, 1.0
+FEWEST, MOST = 2, 30
+#: Errors beyond which nothing is designed on it.
+COARSE_DB, COARSE_DEGREES = 1.0, 6.0
+
+
+@dataclass(frozen=True)
+class Realisation:
+    """A model from one input as a linear system of whole order, continuous and sampled.
+
+    Parameters
+    ----------
+    outputs, input
+        Names.
+    rate
+        Samples per second; the input is held between them.
+    band
+        Where it was fitted [rad/s].
+    poles
+        In the plane of s [rad/s], one of each pair; of a hub that integrates one is 0.
+    a, b, c
+        State space of the samples: x' = a x + b u, y = c x.
+    gain_error, phase_error
+        Largest errors over the band of each output against the model's exact response [dB], [degrees].
+    """
+
+    outputs: tuple[str, ...]
+    input: str
+    rate: float
+    band: tuple[float, float]
+    poles: tuple[complex, ...]
+    a: Floats
+    b: Floats
+    c: Floats
+    gain_error: dict[str, float]
+    phase_error: dict[str, float]
+
+    @property
+    def states(self) -> int:
+        """Number of states."""
+        return len(self.a)
+
+    def response(self, w: Floats) -> Complex:
+        """Of its samples to a held input, at frequencies [rad/s], shape (outputs, W)."""
+        z = np.exp(1j * np.asarray(w, dtype=np.float64) / self.rate)
+        system = z[:, None, None] * np.eye(self.states) - self.a
+        states = np.linalg.solve(system, np.broadcast_to(self.b, (z.size, *self.b.shape)))[:, :, 0]
+        return np.asarray((states @ self.c.T).T)
+
+    def __str__(self) -> str:
+        gain, phase = max(self.gain_error.values()), max(self.phase_error.values())
+        return (
+            f"{self.states} states for {self.band[0]:.3g} to {self.band[1]:.3g} rad/s: within {gain:.2g} dB and "
+            f"{phase:.2g} degrees of the model"
+        )
+
+
+def realised(plants: Sequence[Plant], band: tuple[float, float] | None, poles: int | None) -> Realisation:
+    """Fit a system of whole order to the exact response of outputs to one input, and sample it.
+
+    Parameters
+    ----------
+    plants
+        Of one model, input and rate: one for each output.
+    band
+        Frequencies (low, high) [rad/s]; default from a five-thousandth to an eighth of half the rate.
+    poles
+        Their number besides that of an integral; default as many as bring the error below 0.1 dB and 1 degree.
+
+    Raises
+    ------
+    ModelError
+        A band or a number that is none, python-control that is not installed, a fit off by more than 1 dB or 6 degrees.
+
+    Notes
+    -----
+    Poles in common by vector fitting: Gustavsen and Semlyen (1999), doi:10.1109/61.772353, relative errors weighed
+    alike. Sampled under a hold by python-control.
+    """
+    low, high = _band(band, plants[0].rate)
+    if poles is None:
+        counts = list(range(2, MOST + 1, 2))
+    else:
+        count = whole_number(poles)
+        if count is None or not FEWEST <= count <= MOST:
+            raise ModelError(f"poles = {shown(poles)} is no whole number from {FEWEST} to {MOST}")
+        counts = [count]
+    library = python_control()
+    w = np.geomspace(low, high, FITTED)
+    with solving(f"no response from {low:.3g} to {high:.3g} rad/s", "use a narrower band"):
+        exact = np.array([p.exact(w) for p in plants])
+    own = [m.pole for m in modes(plants[0].model, coupling=plants[0].coupling) if m.swings and low < m.frequency < high]
+    integrates = [p.integrates() > 0.5 for p in plants]
+    best: Realisation | None = None
+    for count in counts:
+        with solving(f"no {count} poles from {low:.3g} to {high:.3g} rad/s", "use a narrower band"):
+            found = _fit(np.asarray(1j * w, dtype=np.complex128), exact, integrates, _begun(own, low, high, count))
+            made = _sampled(library, plants, (low, high), *found)
+        if best is None or _worst(made) < _worst(best):
+            best = made
+        if _worst(best) <= 1.0:
+            break
+    assert best is not None
+    gain, phase = max(best.gain_error.values()), max(best.phase_error.values())
+    if not (gain <= COARSE_DB and phase <= COARSE_DEGREES):
+        raise ModelError(
+            f"{best.states} states are off by up to {gain:.2g} dB and {phase:.2g} degrees between {low:.3g} and "
+            f"{high:.3g} rad/s, so nothing is designed on them; use a narrower band"
+            + ("" if poles is None else ", or more poles")
+        )
+    return best
+
+
+@contextmanager
+def solving(what: str, way_out: str) -> Iterator[None]:
+    """Put into words what floating point does not carry: numbers beyond it, matrices that are singular in it."""
+    with np.errstate(over="raise", divide="raise", invalid="raise"), warnings.catch_warnings():
+        # SciPy warns of a matrix whose solution has no digits.
+        warnings.simplefilter("error", RuntimeWarning)
+        try:
+            yield
+        except ModelError:
+            raise
+        except (np.linalg.LinAlgError, ArithmeticError, ValueError, RuntimeWarning) as error:
+            raise ModelError(f"{what} ({words_of(error, 200)}); {way_out}") from None
+
+
+def python_control() -> Any:
+    """The package python-control, or how to get it."""
+    try:
+        return importlib.import_module("control")
+    except ImportError:
+        raise ModelError("python-control is not installed; pip install 'ftlm[control]'") from None
+
+
+def _band(band: tuple[float, float] | None, rate: float) -> tuple[float, float]:
+    half = math.pi * rate
+    if band is None:
+        return half / 5000.0, half / 8.0
+    try:
+        low, high = (real_number("band", b) for b in band)
+    except (TypeError, ValueError):
+        raise ModelError(f"band = {shown(band)} is no pair of frequencies; give (low, high) in rad/s") from None
+    if not (math.isfinite(low) and 0 < low < high <= half / 2):
+        raise ModelError(
+            f"band = ({low:g}, {high:g}) rad/s is no interval up to a quarter of the rate, {half / 2:g} rad/s"
+        )
+    return low, high
+
+
+def _begun(own: Sequence[complex], low: float, high: float, count: int) -> Complex:
+    """Poles to begin with, one of each pair: the model's own swings, and relaxations spread over the band."""
+    pairs = list(own)[: count // 2]
+    real = -np.geomspace(low, high, count - 2 * len(pairs))
+    return np.asarray([*pairs, *real.tolist()], dtype=np.complex128)
+
+
+def _basis(s: Complex, poles: Complex) -> Complex:
+    """1/(s - p) of every pole, of a pair its real and its imaginary part, shape (S, number of poles)."""
+    columns = []
+    for p in poles:
+        one = 1.0 / (s - p)
+        if p.imag == 0:
+            columns.append(one)
+        else:
+            other = 1.0 / (s - p.conjugate())
+            columns += [one + other, 1j * (one - other)]
+    return np.array(columns).T
+
+
+def _system(poles: Complex) -> tuple[Floats, Floats]:
+    """The state space whose outputs the columns of :func:`_basis` are."""
+    size = int(np.sum(np.where(poles.imag == 0, 1, 2)))
+    a, b = np.zeros((size, size)), np.zeros((size, 1))
+    at = 0
+    for p in poles:
+        if p.imag == 0:
+            a[at, at], b[at, 0] = p.real, 1.0
+            at += 1
+        else:
+            a[at : at + 2, at : at + 2] = [[p.real, p.imag], [-p.imag, p.real]]
+            b[at, 0] = 2.0
+            at += 2
+    return a, b
+
+
+def _fit(s: Complex, exact: Complex, integrates: Sequence[bool], poles: Complex) -> tuple[Complex, Floats, bool]:
+    """Poles and, by output, the residues of each, the integral's first."""
+    weight = 1.0 / np.abs(exact)
+    for _ in range(ROUNDS):
+        basis = _basis(s, poles)
+        blocks, right = [], []
+        width = basis.shape[1]
+        each = width + 1
+        for i, (line, w) in enumerate(zip(exact, weight, strict=True)):
+            block = np.zeros((s.size, each * len(exact) + width), dtype=complex)
+            block[:, i * each] = 1.0 / s if integrates[i] else 0.0
+            block[:, i * each + 1 : (i + 1) * each] = basis
+            block[:, each * len(exact) :] = -line[:, None] * basis
+            blocks.append(block * w[:, None])
+            right.append(line * w)
+        matrix, vector = np.concatenate(blocks), np.concatenate(right)
+        scale = np.maximum(np.linalg.norm(matrix, axis=0), 1e-300)
+        solved = _least(matrix / scale, vector) / scale
+        a, b = _system(poles)
+        moved = np.linalg.eigvals(a - b @ solved[None, each * len(exact) :])
+        # A stable model has no poles on the right; where noise of the fit puts one, it is mirrored.
+        moved = -np.abs(moved.real) + 1j * moved.imag
+        before, poles = poles, np.array(sorted(moved[moved.imag >= 0], key=lambda p: (p.imag == 0, abs(p))))
+        if len(before) == len(poles) and np.max(np.abs(before - poles) / np.abs(poles)) < STILL:
+            break
+    residues = _residues(s, exact, integrates, poles)
+    # Of a model with fewer poles than were asked for the others do nothing, and no observer would find their states.
+    # Nor those of a second integral beside the one that is there.
+    at, kept = 1, []
+    slow = AT_ORIGIN * float(np.min(s.imag)) if any(integrates) else 0.0
+    for p in poles:
+        wide = 1 if p.imag == 0 else 2
+        part = residues[:, at : at + wide] @ _basis(s, np.array([p])).T
+        kept.append(bool(np.max(np.abs(part) * weight) > NOTHING and abs(p) > slow))
+        at += wide
+    if not all(kept) and any(kept):
+        poles = poles[kept]
+        residues = _residues(s, exact, integrates, poles)
+    return poles, residues, any(integrates)
+
+
+def _least(matrix: Complex, vector: Complex) -> Floats:
+    """Real numbers that solve complex equations best: by the triangle of the equations, which is small."""
+    both = np.column_stack([matrix, vector])
+    triangle = np.asarray(np.linalg.qr(np.concatenate([both.real, both.imag]), mode="r"), dtype=np.float64)
+    return np.asarray(np.linalg.lstsq(triangle[:, :-1], triangle[:, -1])[0])
+
+
+def _residues(s: Complex, exact: Complex, integrates: Sequence[bool], poles: Complex) -> Floats:
+    """Residues of an integral and of the columns of :func:`_basis`, by output."""
+    basis = _basis(s, poles)
+    residues = np.zeros((len(exact), basis.shape[1] + 1))
+    for i, line in enumerate(exact):
+        matrix = (np.column_stack([1.0 / s, basis]) if integrates[i] else basis) / np.abs(line)[:, None]
+        scale = np.linalg.norm(matrix, axis=0)
+        ones = line / np.abs(line)
+        found = _least(matrix / scale, ones) / scale
+        residues[i, -len(found) :] = found
+    return residues
+
+
+def _sampled(
+    library: Any, plants: Sequence[Plant], band: tuple[float, float], poles: Complex, residues: Floats, integral: bool
+) -> Realisation:
+    """The fitted system at its samples, and how far off it is."""
+    a, b = _system(poles)
+    c = residues[:, 1:]
+    if integral:
+        a = np.pad(a, ((1, 0), (1, 0)))
+        b = np.vstack([[[1.0]], b])
+        c = residues
+        poles = np.append(0.0, poles)
+    rate = plants[0].rate
+    system = library.sample_system(library.ss(a, b, c, np.zeros((len(c), 1))), 1.0 / rate, "zoh")
+    # States of like size: what is weighed against each other is then nothing that units make.
+    size = np.maximum(np.sqrt(np.sum(c * c, axis=0)), 1e-300)
+    made = Realisation(
+        tuple(p.output for p in plants),
+        plants[0].input,
+        rate,
+        band,
+        tuple(complex(p) for p in poles),
+        np.asarray(system.A) * size[:, None] / size,
+        np.asarray(system.B) * size[:, None],
+        c / size,
+        {},
+        {},
+    )
+    w = np.geomspace(*band, 2 * FITTED - 1)
+    quotient = made.response(w) / np.array([p.held(w) for p in plants])
+    for name, line in zip(made.outputs, quotient, strict=True):
+        made.gain_error[name] = float(np.max(np.abs(20.0 * np.log10(np.abs(line)))))
+        made.phase_error[name] = float(np.degrees(np.max(np.abs(np.angle(line)))))
+    return made
+
+
+def _worst(made: Realisation) -> float:
+    """Its errors in terms of those that are aimed at."""
+    worst = max(max(made.gain_error.values()) / GAIN_DB, max(made.phase_error.values()) / PHASE_DEGREES)
+    return worst if math.isfinite(worst) else math.inf

@@ -1,0 +1,240 @@
+"""Loops on a model's exact frequency response: whether they are stable, and how far from not being so."""
+
+from __future__ import annotations
+
+import math
+from dataclasses import dataclass, fields, replace
+from typing import Any, Literal
+
+import numpy as np
+
+from ftlm.analysis.frequency_response import (
+    frequency_response,
+    model_numbers,
+    response_inputs,
+    transfer_functions,
+    value_at,
+    with_numbers,
+)
+from ftlm.analysis.poles import stability
+from ftlm.errors import ModelError
+from ftlm.model.model import Solved
+from ftlm.utils.validation import Complex, Floats
+
+#: Frequencies of a Nyquist curve, from a thousandth of the crossover to half the sampling rate.
+POINTS = 1500
+BELOW = 1e-3
+
+
+@dataclass(frozen=True)
+class Margins:
+    """How far a loop is from instability.
+
+    Parameters
+    ----------
+    stable
+        Whether the closed loop is stable, by the argument principle on 1 + L.
+    crossover
+        Highest frequency at which abs(L) = 1 [rad/s]; NaN where there is none.
+    phase
+        Smallest phase margin of all crossovers [degrees].
+    gain
+        Smallest factor by which the loop's gain may rise or fall before the phase is -180 degrees at 1.
+    sensitivity
+        Largest abs(1/(1 + L)).
+    """
+
+    stable: bool
+    crossover: float
+    phase: float
+    gain: float
+    sensitivity: float
+
+    def __str__(self) -> str:
+        if not self.stable:
+            return "not stable"
+        return (
+            f"crossover {self.crossover:.4g} rad/s, phase margin {self.phase:.3g} degrees, gain margin "
+            f"{self.gain:.3g}, largest sensitivity {self.sensitivity:.3g}"
+        )
+
+
+class JudgedLoop:
+    """What is told of a loop: its margins at the values of a model's numbers, and at samples of them."""
+
+    nominal: Margins
+    samples: tuple[Margins, ...]
+
+    @property
+    def kept(self) -> float:
+        """Share of the samples whose loop is stable; 1 where there are none."""
+        return sum(m.stable for m in self.samples) / len(self.samples) if self.samples else 1.0
+
+    def within(self, what: Literal["crossover", "phase", "gain", "sensitivity"]) -> tuple[float, float]:
+        """Where 95 % of the samples have a margin."""
+        if not self.samples:
+            value = getattr(self.nominal, what)
+            return value, value
+        low, high = np.quantile([getattr(m, what) for m in self.samples], [0.025, 0.975])
+        return float(low), float(high)
+
+    def _margins(self) -> dict[str, Any]:
+        """Margins at the values and over samples, for JSON."""
+        told = [{f.name: getattr(m, f.name) for f in fields(m)} for m in (self.nominal, *self.samples)]
+        for one in told:
+            one |= {n: v if math.isfinite(v) else None for n, v in one.items()}
+        return {"nominal": told[0], "samples": told[1:]}
+
+    def _judged(self) -> list[str]:
+        """Lines that say so."""
+        lines = [f"at the values: {self.nominal}"]
+        if self.samples:
+            phase, gain, peak = (self.within(n) for n in ("phase", "gain", "sensitivity"))
+            lines.append(
+                f"over the intervals ({len(self.samples)} samples, {100 * self.kept:.0f} % stable), 95 % between: "
+                f"phase margin {phase[0]:.3g} and {phase[1]:.3g} degrees, gain margin {gain[0]:.3g} and {gain[1]:.3g}, "
+                f"largest sensitivity {peak[0]:.3g} and {peak[1]:.3g}"
+            )
+        return lines
+
+
+@dataclass(frozen=True)
+class Plant:
+    """One input and one output of a model behind a sampled loop.
+
+    Parameters
+    ----------
+    model
+        The model.
+    output, input
+        Names.
+    rate
+        Of the loop [Hz]: an answer acts a sample later and is held.
+    coupling, sensor
+        See :func:`ftlm.analysis.frequency_response`.
+    """
+
+    model: Solved
+    output: str
+    input: str
+    rate: float
+    coupling: str
+    sensor: bool = False
+
+    def exact(self, w: Floats | Complex) -> Complex:
+        """Response of the model at frequencies [rad/s], which may be complex: s = jw."""
+        if np.iscomplexobj(w):
+            transfer = transfer_functions(self.model, coupling=self.coupling)
+            s: Complex = np.asarray(1j * np.asarray(w), dtype=np.complex128)
+            above, below = (
+                value_at({p: c for c, p in pairs}, s)
+                for pairs in (transfer.numerators[self.output, self.input], transfer.denominator[self.output])
+            )
+            return np.asarray(above / below * np.exp(-s * transfer.delay[self.input]) * self._seen(s))
+        inputs = response_inputs(self.model, coupled=self.coupling == "simulated")
+        every = frequency_response(self.model, w, coupling=self.coupling, sensor=self.sensor)
+        return np.asarray(every[self.model.outputs.index(self.output), inputs.index(self.input)])
+
+    def _seen(self, s: Complex) -> Complex:
+        """What the sensor filter makes of it."""
+        passed = self.model.structure.sensor_filter if self.sensor else None
+        if passed is None:
+            return np.ones_like(s)
+        above, below = (value_at({o: c for c, o in part}, s) for part in (passed.numerator, passed.denominator))
+        power = (self.output in passed.signals) - (self.input in passed.signals)
+        return np.asarray((above / below) ** power)
+
+    def held(self, w: Floats | Complex) -> Complex:
+        """The same behind the hold of a sampled input, below half the rate."""
+        turn = 1j * w / self.rate
+        return np.asarray(self.exact(w) * -np.expm1(-turn) / turn)
+
+    def response(self, w: Floats | Complex) -> Complex:
+        """The same behind the loop's sample of delay, too."""
+        return np.asarray(self.held(w) * np.exp(-1j * w / self.rate))
+
+    def integrates(self) -> float:
+        """Order of the plant's own integral."""
+        transfer = transfer_functions(self.model, coupling=self.coupling)
+        above = transfer.numerators[self.output, self.input]
+        if not above:
+            raise ModelError(f"{self.input} does not reach {self.output} in this model")
+        return transfer.denominator[self.output][-1][1] - above[-1][1]
+
+    def grows(self) -> float:
+        """Number of unstable poles; NaN where one is on the axis."""
+        found = stability(self.model, coupling=self.coupling)
+        return math.nan if found.on_axis else found.unstable_poles
+
+    def reached(self) -> bool:
+        """Whether the input does anything to the output."""
+        return bool(transfer_functions(self.model, coupling=self.coupling).numerators[self.output, self.input])
+
+    def check_stable(self) -> None:
+        """Refuse a model that is not stable; an integral is."""
+        grows = self.grows()
+        if grows != 0:
+            why = "a pole is on the imaginary axis" if math.isnan(grows) else f"{grows:g} of its poles are on the right"
+            raise ModelError(
+                f"the model is not stable ({why}): a loop that holds it cannot be judged by its margins; stabilise "
+                "it first, and identify what is then there"
+            )
+
+    def samples(self, count: int, seed: int) -> list[Plant]:
+        """Plants as the covariance of the model's numbers has them; none where it has no covariance."""
+        estimate = self.model.estimate
+        if estimate is None or estimate.covariance is None:
+            return []
+        matrix = np.asarray(estimate.covariance, dtype=np.float64)
+        # A number that hardly anything tells has an infinite variance; it is drawn as wide as numbers go.
+        matrix = np.nan_to_num(matrix, nan=0.0, posinf=1e12, neginf=-1e12)
+        values, vectors = np.linalg.eigh((matrix + matrix.T) / 2)
+        spread = vectors * np.sqrt(np.maximum(values, 0.0))
+        drawn = np.random.default_rng(seed).standard_normal((count, len(values))) @ spread.T
+        centre = model_numbers(self.model)
+        return [replace(self, model=with_numbers(self.model, centre + d)) for d in drawn]
+
+
+def grid(crossover: float, rate: float) -> Floats:
+    """Frequencies of a Nyquist curve [rad/s]."""
+    return np.geomspace(BELOW * crossover, 0.999 * math.pi * rate, POINTS)
+
+
+def margins_of(loop: Complex, w: Floats, integrates: float, grows: float = 0.0) -> Margins:
+    """Margins of a loop's response on a fine grid.
+
+    Parameters
+    ----------
+    loop
+        L(jw), shape (W,).
+    w
+        Frequencies, rising [rad/s].
+    integrates
+        Order with which L grows towards 0.
+    grows
+        Unstable poles of L.
+    """
+    if not np.isfinite(loop).all() or math.isnan(grows):
+        return Margins(False, math.nan, math.nan, math.nan, math.inf)
+    difference = 1.0 + loop
+    turned = np.unwrap(np.angle(difference))
+    # Upper half of the contour, and of the small circle around the origin.
+    closed = grows + integrates / 2.0 - (turned[-1] - turned[0]) / math.pi
+    size, phase = np.log(np.abs(loop)), np.unwrap(np.angle(loop))
+    at = np.flatnonzero(np.sign(size[:-1]) != np.sign(size[1:]))
+    share = size[at] / (size[at] - size[at + 1])
+    phases = np.degrees(phase[at] + share * (phase[at + 1] - phase[at]))
+    crossings = np.exp(np.log(w[at]) + share * np.log(w[at + 1] / w[at]))
+    away = np.abs((phases + 360.0) % 360.0 - 180.0)
+    turns = np.floor((phase / math.pi + 1.0) / 2.0)
+    cut = np.flatnonzero(turns[:-1] != turns[1:])
+    edge = math.pi * (2.0 * np.maximum(turns[cut], turns[cut + 1]) - 1.0)
+    part = (edge - phase[cut]) / (phase[cut + 1] - phase[cut])
+    gains = np.exp(np.abs(size[cut] + part * (size[cut + 1] - size[cut])))
+    return Margins(
+        bool(round(closed) == 0),
+        float(crossings[-1]) if at.size else math.nan,
+        float(np.min(away, initial=180.0)),
+        float(np.min(gains, initial=math.inf)),
+        float(np.max(1.0 / np.abs(difference))),
+    )

@@ -1,0 +1,307 @@
+"""Frames of pandas and polars and datasets of xarray, into runs and out of them."""
+
+from __future__ import annotations
+
+import hashlib
+import importlib
+import io
+import itertools
+import json
+import math
+import os
+from collections.abc import Hashable, Mapping, Sequence
+from dataclasses import dataclass, field, fields
+from pathlib import Path
+from typing import Any, cast
+
+import numpy as np
+
+from ftlm.data.construction import Asked
+from ftlm.data.run import Measured
+from ftlm.data.sampling import as_seconds, grid_of, unread
+from ftlm.data.units import is_time_name, time_unit_of
+from ftlm.errors import DataError, ModelError
+from ftlm.utils.files import RUN, check_new, write_atomically
+from ftlm.utils.validation import CSV_TIME, Floats, is_run_name, listed, names_to_columns, nearest
+
+
+def asked_of_frame(
+    frame: object,
+    *,
+    time: Hashable | None,
+    step: float | None,
+    inputs: object,
+    outputs: object,
+    time_unit: str | None,
+    window: Sequence[float | None] | None,
+    **more: Any,
+) -> Asked:
+    """Take columns of a frame; see :meth:`ftlm.Run.from_frame`."""
+    columns, index = _columns_of(frame), _index_of(frame)
+
+    def pick(column: Hashable, thing: str) -> object:
+        count = columns.count(column)
+        if count == 0 and index is not None and column == index[0]:
+            return index[1]
+        if count == 0:
+            raise DataError(
+                f"column {column!r} ({thing}) is not in the frame{nearest(column, columns)}; "
+                f"the columns are {listed(columns)}; for the index of a pandas frame use frame.reset_index()"
+            )
+        if count > 1:
+            raise DataError(f"column {column!r} ({thing}) is there {count} times; rename all but one")
+        return cast("Mapping[Any, object]", frame)[column]
+
+    label, clock = "time" if time is None else f"time (column {time!r})", None
+    if time is not None:
+        clock = pick(time, "time")
+    elif step is None and index is not None and _is_clock(*index):
+        time, clock = index
+        label = "time (the index)" if time is None else f"time (the index {time!r})"
+    wanted = [names_to_columns(argument, given) for argument, given in (("inputs", inputs), ("outputs", outputs))]
+    labels = {s: f"signal {s!r} (column {column!r})" for part in wanted for s, column in part.items()}
+    given_inputs, given_outputs = ({s: pick(c, f"signal {s!r}") for s, c in part.items()} for part in wanted)
+    if isinstance(time, str):
+        unit, said = time_unit_of(time, label, time_unit)
+    else:
+        unit, said = time_unit or "s", ()
+    return Asked(
+        given_inputs,
+        given_outputs,
+        step=step,
+        time=clock,
+        time_unit=unit,
+        window=window,
+        labels=labels,
+        facts=said,
+        time_label=label,
+        **more,
+    )
+
+
+def _columns_of(frame: object) -> list[Hashable]:
+    if isinstance(frame, Mapping):
+        # Of a dataset of xarray, too, whose coordinates are columns like the others.
+        return list(getattr(frame, "variables", frame))
+    # A lazy polars frame is told by its collect(); asking it for its columns would already start work.
+    columns = None if hasattr(frame, "collect") else getattr(frame, "columns", None)
+    if columns is None:
+        columns = getattr(getattr(frame, "dtype", None), "names", None)
+    if columns is None or not hasattr(frame, "__getitem__"):
+        raise DataError(
+            f"frame is a {type(frame).__name__}; pass a pandas or polars DataFrame (collect() a lazy one first), "
+            "a dict of arrays or a structured array"
+        )
+    return list(columns)
+
+
+def _index_of(frame: object) -> tuple[Hashable, object] | None:
+    """Name and values of what the rows of a frame are known by; None where there is no such thing, or several."""
+    sizes = getattr(frame, "sizes", None)
+    if isinstance(frame, Mapping) and isinstance(sizes, Mapping):
+        only = next(iter(sizes), None)
+        return (only, cast("Any", frame)[only]) if len(sizes) == 1 and only in getattr(frame, "coords", ()) else None
+    index = getattr(frame, "index", None)
+    if index is None or callable(index) or getattr(index, "nlevels", 1) != 1:
+        return None
+    return getattr(index, "name", None), index
+
+
+def _is_clock(name: Hashable, values: object) -> bool:
+    """Whether an index is the time: it holds dates, or is called so."""
+    return (isinstance(name, str) and is_time_name(name)) or as_seconds(values, "time (the index)") is not None
+
+
+def frame_of(run: Measured) -> Any:
+    """Return a run as a pandas frame over its time."""
+    pandas = _library("pandas")
+    index = pandas.Index(run.start + run.time, name=CSV_TIME)
+    frame = pandas.DataFrame({name: run[name].copy() for name in run.signals}, index=index)
+    frame.attrs = {**_told(run), "units": run.units, "intersample": dict(run.intersample)}
+    return frame
+
+
+def dataset_of(run: Measured) -> Any:
+    """Return a run as an xarray dataset over its time."""
+    xarray = _library("xarray")
+    signals = {}
+    for name in run.signals:
+        role = {"role": "input", "intersample": run.intersample[name]} if name in run.inputs else {"role": "output"}
+        signals[name] = (CSV_TIME, run[name].copy(), {"units": run.units[name], **role})
+    clock = (CSV_TIME, run.start + run.time, {"units": "s"})
+    return xarray.Dataset(signals, coords={CSV_TIME: clock}, attrs=_told(run))
+
+
+def _told(run: Measured) -> dict[str, Any]:
+    told = {"name": run.name, "inputs": list(run.inputs), "outputs": list(run.outputs), "step": run.step}
+    return {**told, "warnings": list(run.warnings)}
+
+
+def _library(name: str) -> Any:
+    try:
+        return importlib.import_module(name)
+    except ImportError:
+        raise ModelError(f"{name} is not installed; pip install {name}") from None
+
+
+CSV_MARK = "# ftlm-run "
+CSV_VERSION = 1
+BOM = b"\xef\xbb\xbf"
+#: Most bytes of the line; a reader that knew none would take a file without a line's end into memory.
+LONGEST_HEADER = 1 << 20
+#: What a file says of rows at times of their own, which it does not hold.
+LEFT_BEHIND = "written on its grid: the times at which outputs were read stayed behind"
+#: What must be told, as JSON gives it; the rows themselves say when they start.
+_KINDS: dict[str, type] = {
+    "name": str,
+    "step": float,
+    "inputs": list,
+    "outputs": list,
+    "units": dict,
+    "intersample": dict,
+    "warnings": list,
+    "about": dict,
+    "missing": list,
+}
+#: ... and what may be left out.
+_OPTIONAL: dict[str, Any] = {"about": {}, "missing": []}
+
+
+@dataclass(frozen=True)
+class Header:
+    """What the first line of a csv file or the metadata of a parquet file says: ``VERSION JSON``, keys as here."""
+
+    name: str
+    step: float
+    start: float
+    inputs: tuple[str, ...]
+    outputs: tuple[str, ...]
+    units: dict[str, str]
+    intersample: dict[str, str]
+    warnings: tuple[str, ...]
+    about: dict[str, Any] = field(default_factory=dict)
+    missing: tuple[str, ...] = ()
+
+    @classmethod
+    def of(cls, run: Measured) -> Header:
+        """Return the header of a run."""
+        return cls(
+            run.name,
+            run.step,
+            run.start,
+            run.inputs,
+            run.outputs,
+            run.units,
+            dict(run.intersample),
+            run.facts if run.readings is None else (*run.facts, LEFT_BEHIND),
+            run.about,
+            tuple(n for n in run.outputs if unread(run[n]).any()),
+        )
+
+    def text(self) -> str:
+        """Write it."""
+        told = {f.name: getattr(self, f.name) for f in fields(self) if f.name not in _OPTIONAL or getattr(self, f.name)}
+        words = json.dumps(told, ensure_ascii=False, allow_nan=False)
+        # Half of a pair, which no file can hold, is written as JSON escapes it.
+        return f"{CSV_VERSION} {words.encode('utf-8', 'backslashreplace').decode()}"
+
+    def line(self) -> str:
+        """Write it as the first line of a text file, or refuse what no reader would take for one."""
+        line = f"{CSV_MARK}{self.text()}\n"
+        size = len(line.encode())
+        if size > LONGEST_HEADER:
+            raise DataError(
+                f"run {self.name!r}: names, warnings and what it is about take {size} bytes, more than the "
+                f"{LONGEST_HEADER} of the first line of a csv file; write it as .parquet"
+            )
+        return line
+
+    @classmethod
+    def read(cls, path: Path, where: str, text: str) -> Header:
+        """Read what a file says in one place, and refuse a damaged header or one of a later version."""
+        version, _, body = text.partition(" ")
+        if version.strip() != str(CSV_VERSION):
+            raise DataError(
+                f"{path.name}: {where}: the format ftlm-run {version.strip()[:20]!r} is not known here; use a newer "
+                "ftlm, or remove the line and name the columns"
+            )
+        try:
+            return _checked(json.loads(body))
+        except (ValueError, KeyError, TypeError, RecursionError) as error:
+            raise DataError(
+                f"{path.name}: {where} is a damaged ftlm header ({str(error)[:100]}); restore it, or remove the line "
+                "and name the columns"
+            ) from None
+
+
+def _checked(told: Any) -> Header:
+    values: dict[str, Any] = {}
+    for key, kind in _KINDS.items():
+        value = told.get(key, _OPTIONAL[key]) if key in _OPTIONAL else told[key]
+        if not isinstance(value, kind):
+            raise ValueError(f"{key!r} is {str(value)[:40]!r}")
+        values[key] = tuple(value) if isinstance(value, list) else value
+    header = Header(start=0.0, **values)
+    words = (header.inputs, header.outputs, header.warnings, header.units.values(), header.intersample.values())
+    if not is_run_name(header.name) or not math.isfinite(header.step):
+        raise ValueError("its name or step cannot be used")
+    if not all(isinstance(word, str) for word in itertools.chain.from_iterable(words)):
+        raise ValueError("a name, unit or warning is not text")
+    return header
+
+
+def header_of_line(path: Path, line: bytes) -> Header | None:
+    """Return what the first line of a text file says, if ftlm wrote it."""
+    text = line.removeprefix(BOM).decode("utf-8", errors="replace")
+    return Header.read(path, "line 1", text.removeprefix(CSV_MARK)) if text.startswith(CSV_MARK) else None
+
+
+def write_csv(run: Measured, path: str | os.PathLike[str], *, force: bool) -> None:
+    """Write a run as text; see :meth:`ftlm.Run.to_csv`."""
+    check_new(path, force=force, words=RUN)
+    columns = _columns(run)
+    rows = map(",".join, zip(*(map(repr, column.tolist()) for column in columns.values()), strict=True))
+    text = Header.of(run).line() + "\n".join([",".join(columns), *rows, ""])
+    write_atomically(path, text.encode(), force=force, words=RUN)
+
+
+def write_parquet(run: Measured, path: str | os.PathLike[str], *, force: bool) -> None:
+    """Write a run as a parquet file; see :meth:`ftlm.Run.to_parquet`."""
+    target = check_new(path, force=force, words=RUN)
+    try:
+        pyarrow = importlib.import_module("pyarrow")
+        parquet = importlib.import_module("pyarrow.parquet")
+    except ImportError:
+        raise DataError(f"{str(target)!r}: parquet needs pyarrow; run: pip install 'ftlm[parquet]'") from None
+    columns, header = _columns(run), Header.of(run).text()
+    check = f"{run.length} {digest(columns, header)}"
+    table = pyarrow.table(columns).replace_schema_metadata({"ftlm-run": header, "ftlm-check": check})
+    content = io.BytesIO()
+    # Checksums of pages, and one of all rows: the footer, which says how many there are, has none of its own.
+    parquet.write_table(table, content, write_page_checksum=True)
+    write_atomically(target, content.getvalue(), force=force, words=RUN)
+
+
+def digest(columns: Mapping[str, Floats], header: str) -> str:
+    """Checksum of a run's columns in their order and of its header; `files/reader.py` computes it as well."""
+    made = hashlib.sha256(header.encode())
+    for name, values in columns.items():
+        made.update(f"\0{name}\0{len(values)}\0".encode())
+        made.update(np.ascontiguousarray(values, dtype="<f8").tobytes())
+    return made.hexdigest()
+
+
+def _columns(run: Measured) -> dict[str, Floats]:
+    return {CSV_TIME: _source_time(run)} | {name: run[name] for name in run.signals}
+
+
+def _source_time(run: Measured) -> Floats:
+    """Source time of every row, in digits that read well."""
+    exact = run.start + grid_of(run.length, run.step)
+    # Nine digits below the step read well, and the exact step stands in the header.
+    digits = 9 - math.floor(math.log10(run.step))
+    if not 0 <= digits <= 15 or np.abs(exact).max() * 10.0**digits >= 2.0**53:
+        return exact
+    rounded = np.round(exact, digits)
+    rounded[0] = run.start
+    return rounded

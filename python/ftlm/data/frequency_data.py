@@ -1,0 +1,234 @@
+"""Measured frequency responses: gain and phase of one output from one input, or an impedance."""
+
+from __future__ import annotations
+
+import math
+from collections.abc import Sequence
+from dataclasses import dataclass, field
+
+import numpy as np
+from numpy.typing import ArrayLike
+
+from ftlm.errors import DataError
+from ftlm.utils.validation import Complex, Floats, as_floats, real_number
+
+#: Units in which a person writes frequencies, and their angular frequency [rad/s]. A lower-case m is a thousandth.
+FREQUENCY_UNITS: dict[str, float] = {
+    "rad/s": 1.0,
+    "Hz": 2 * math.pi,
+    "kHz": 2e3 * math.pi,
+    "MHz": 2e6 * math.pi,
+    "mHz": 2e-3 * math.pi,
+}
+
+
+@dataclass(frozen=True, eq=False)
+class FrequencyData:
+    """A measured frequency response of one output from one input; :meth:`from_arrays` makes one of arrays.
+
+    Parameters
+    ----------
+    frequency
+        Angular frequencies [rad/s], shape (N,), finite, above 0, in the order of the file.
+    response
+        Complex response, shape (N,), finite: output over input.
+    deviation
+        Standard deviation of the real part and of the imaginary part at each frequency, shape (N,), above 0; None where
+        nobody states it.
+    output, input
+        What the response is of and from; "" for those of the only equation.
+    unit
+        Of the response, such as "Ω".
+    name
+        What reports call it.
+    warnings
+        What was assumed of the file.
+
+    Raises
+    ------
+    DataError
+        No frequency, shapes that differ, frequencies or deviations that are not finite and above 0, a response that is
+        not finite.
+    """
+
+    frequency: Floats
+    response: Complex
+    deviation: Floats | None = None
+    output: str = ""
+    input: str = ""
+    unit: str = ""
+    name: str = "data"
+    warnings: tuple[str, ...] = field(default=())
+
+    def __post_init__(self) -> None:
+        frequency = _column(f"{self.name}: frequency", self.frequency)
+        if frequency.size == 0:
+            raise DataError(f"{self.name}: there is no frequency, 0 rows; give at least one")
+        _refuse(~(frequency > 0), frequency, f"{self.name}: frequency", "is not above 0; leave such rows out")
+        if np.asarray(self.response).dtype.kind not in "fiubc":
+            raise DataError(f"{self.name}: response holds {np.asarray(self.response).dtype} values; give numbers")
+        response = np.array(self.response, dtype=np.complex128)
+        if response.shape != frequency.shape:
+            raise DataError(
+                f"{self.name}: response has shape {response.shape}, frequency {frequency.shape}; give one value each"
+            )
+        _refuse(~np.isfinite(response), response, f"{self.name}: response", "is not finite; leave such rows out")
+        object.__setattr__(self, "frequency", _fixed(frequency))
+        object.__setattr__(self, "response", _fixed(response))
+        if self.deviation is not None:
+            deviation = _column(f"{self.name}: deviation", self.deviation)
+            if deviation.ndim == 1 and deviation.size != frequency.size:
+                raise DataError(
+                    f"{self.name}: deviation has {deviation.size} values, frequency {frequency.size}; give one each"
+                )
+            words = "is not above 0; leave such rows out, or weight without deviations"
+            _refuse(~(deviation > 0), deviation, f"{self.name}: deviation", words)
+            object.__setattr__(self, "deviation", _fixed(deviation))
+
+    @classmethod
+    def from_arrays(
+        cls,
+        frequency: ArrayLike,
+        response: ArrayLike,
+        *,
+        frequency_unit: str = "rad/s",
+        deviation: ArrayLike | None = None,
+        output: str = "",
+        input: str = "",
+        unit: str = "",
+        name: str = "data",
+    ) -> FrequencyData:
+        """Frequency data of arrays.
+
+        Parameters
+        ----------
+        frequency
+            Shape (N,), above 0.
+        response
+            Complex, shape (N,).
+        frequency_unit
+            ``"rad/s"``, ``"Hz"``, ``"kHz"``, ``"MHz"`` or ``"mHz"``.
+        deviation, output, input, unit, name
+            See :class:`FrequencyData`.
+
+        Raises
+        ------
+        DataError
+            See :class:`FrequencyData`, and a unit that is not known.
+        """
+        factor = frequency_factor(frequency_unit)
+        omega = _column(f"{name}: frequency", frequency) * factor
+        known = None if deviation is None else np.asarray(deviation)
+        return cls(omega, np.asarray(response), known, output, input, unit, name)
+
+    @property
+    def gain(self) -> Floats:
+        """Size of the response [dB]."""
+        with np.errstate(divide="ignore"):
+            return np.asarray(20.0 * np.log10(np.abs(self.response)))
+
+    @property
+    def phase(self) -> Floats:
+        """Phase [degrees], without jumps from one frequency to the next higher one."""
+        order = np.argsort(self.frequency, kind="stable")
+        out = np.empty(order.size)
+        out[order] = np.degrees(np.unwrap(np.angle(self.response[order])))
+        return out
+
+    def slice(self, low: float | None = None, high: float | None = None) -> FrequencyData:
+        """Only what was measured from one angular frequency to another, both included.
+
+        Parameters
+        ----------
+        low, high
+            Ends [rad/s]; by default the first and the last.
+
+        Raises
+        ------
+        DataError
+            An end that is no number, or nothing between them.
+        """
+        ends = [
+            default if end is None else real_number(name, end)
+            for name, end, default in (("low", low, 0.0), ("high", high, math.inf))
+        ]
+        kept = (self.frequency >= ends[0]) & (self.frequency <= ends[1])
+        if not kept.any():
+            raise DataError(
+                f"{self.name}: nothing was measured from {ends[0]:g} to {ends[1]:g} rad/s; it reaches from "
+                f"{self.frequency.min():.5g} to {self.frequency.max():.5g} rad/s"
+            )
+        deviation = None if self.deviation is None else self.deviation[kept]
+        return FrequencyData(
+            self.frequency[kept],
+            self.response[kept],
+            deviation,
+            self.output,
+            self.input,
+            self.unit,
+            self.name,
+            self.warnings,
+        )
+
+    @property
+    def pair(self) -> str:
+        """What it is of and from, in words."""
+        return f"{self.output} from {self.input}" if self.output and self.input else self.name
+
+    def __str__(self) -> str:
+        low, high = float(self.frequency.min()), float(self.frequency.max())
+        size = np.abs(self.response)
+        unit = f" {self.unit}" if self.unit else ""
+        pair = f" of {self.output} from {self.input}" if self.output and self.input else ""
+        known = "with" if self.deviation is not None else "without"
+        return "\n".join(
+            [
+                f"{self.name}: frequency response{pair}, {self.frequency.size} frequencies from {low:.5g} to "
+                f"{high:.5g} rad/s ({low / (2 * math.pi):.4g} to {high / (2 * math.pi):.4g} Hz)",
+                f"  size {size.min():.5g} to {size.max():.5g}{unit}, {known} standard deviations",
+                *(f"  note: {w}" for w in self.warnings),
+            ]
+        )
+
+
+def as_frequency_data(data: object) -> tuple[FrequencyData, ...]:
+    """One record or several as a tuple; refuses everything else."""
+    items = (data,) if isinstance(data, FrequencyData) else data
+    if not isinstance(items, Sequence) or isinstance(items, str):
+        raise DataError(
+            f"data is {type(data).__name__}; give frequency data, as load_frequency or FrequencyData.from_arrays makes"
+        )
+    for k, item in enumerate(items):
+        if not isinstance(item, FrequencyData):
+            raise DataError(f"data[{k}] is {type(item).__name__}; give frequency data, such as load_frequency returns")
+    if not items:
+        raise DataError("data is empty; give at least one frequency response")
+    return tuple(items)
+
+
+def frequency_factor(unit: str) -> float:
+    """Angular frequency [rad/s] of one unit of frequency."""
+    if unit not in FREQUENCY_UNITS:
+        raise DataError(f"frequency_unit={unit!r} is unknown; the known ones are {', '.join(FREQUENCY_UNITS)}")
+    return FREQUENCY_UNITS[unit]
+
+
+def _column(name: str, values: object) -> Floats:
+    array = as_floats(name, values)
+    if array.ndim != 1:
+        raise DataError(f"{name} has shape {array.shape}; give a vector")
+    _refuse(~np.isfinite(array), array, name, "is not finite; leave such rows out")
+    return array
+
+
+def _refuse(bad: np.ndarray, values: np.ndarray, name: str, way_out: str) -> None:
+    if np.any(bad):
+        at = int(np.argmax(bad))
+        what, _, rest = way_out.partition(";")
+        raise DataError(f"{name} {what}: {values[at]} at row {at}, {int(np.sum(bad))} in all;{rest}")
+
+
+def _fixed(values: np.ndarray) -> np.ndarray:
+    kept = values.copy()
+    kept.setflags(write=False)
+    return kept

@@ -1,0 +1,129 @@
+"""The reference of a closed loop as instrument: inputs replaced by the part of them that it explains."""
+
+from __future__ import annotations
+
+import math
+from collections.abc import Sequence
+from dataclasses import replace
+
+import numpy as np
+
+from ftlm.data.run import Run
+from ftlm.errors import DataError, ModelError
+from ftlm.estimation.estimators import Fit
+from ftlm.structure.structure import Structure
+from ftlm.utils.linalg import solved
+from ftlm.utils.statistics import autoregression, is_constant
+from ftlm.utils.validation import Floats, nearest
+from ftlm.validation.residual_tests import LAGS, past_columns
+
+#: How many samples of a reference may stand by themselves, one for so many rows of the shortest run at least; those
+#: before are averaged over blocks, each wider by a factor.
+DENSE = (3, 6, 12, 25, 50, 100)
+ROWS_A_SAMPLE = 15
+#: A first stage whose F is below this makes a weak instrument (Staiger and Stock, doi:10.2307/2171753).
+WEAK = 10.0
+
+
+def driven_by(runs: Sequence[Run], structure: Structure, reference: str) -> tuple[list[Run], list[str]]:
+    """Runs whose inputs are what a reference explains of them, and what to beware of.
+
+    The controller and the loop are one linear law from reference to input, fitted by least squares over all runs, as in
+    the first of two stages (Van den Hof and Schrama, An indirect method for transfer function estimation from closed
+    loop data, Automatica 29, 1993, 1523-1527). What noise puts into an input is not in its answer to the reference.
+
+    Raises
+    ------
+    ModelError
+        A reference that is no signal's name, or a signal of the model.
+    DataError
+        A reference that a run does not have, or that does not move; no input.
+    """
+    if not isinstance(reference, str):
+        raise ModelError(f"reference is {type(reference).__name__}, not the name of a signal of the runs")
+    if reference in structure.signals:
+        raise ModelError(
+            f"reference={reference!r} is a signal of the model; a reference drives the loop from outside, and the "
+            "model does not read it"
+        )
+    for run in runs:
+        if run.readings is not None:
+            raise DataError(
+                f"run {run.name!r} has rows with times of their own, but the answer of an input to reference= is found "
+                "on regular ones; give regular rows"
+            )
+        if reference not in run:
+            raise DataError(
+                f"run {run.name!r} has no signal {reference!r}{nearest(reference, run.signals)} for reference=; it has "
+                f"{', '.join(run.signals)}"
+            )
+    inputs = [s for s in structure.signals if s in runs[0].inputs]
+    if not inputs:
+        raise DataError(
+            f"reference={reference!r}: the model reads no input of run {runs[0].name!r} that it could drive"
+        )
+    moves = [run[reference] for run in runs]
+    if is_constant(moves):
+        raise DataError(f"reference={reference!r} does not move, so it explains nothing; record one that does")
+    shortest = min(run.length for run in runs)
+    ends = np.cumsum([run.length for run in runs])[:-1]
+    laws = [
+        _columns(moves, shortest, dense) for dense in DENSE if dense == DENSE[0] or dense * ROWS_A_SAMPLE < shortest
+    ]
+    answers: dict[str, list[Floats]] = {}
+    warnings = []
+    for name in inputs:
+        measured = np.concatenate([run[name] for run in runs])
+        # Every coefficient too many takes a share of the noise with it: the least Bayesian criterion.
+        fits = [columns @ solved(columns, measured, 1e-10) for columns in laws]
+        costs = [_criterion(measured - fit, columns.shape[1]) for fit, columns in zip(fits, laws, strict=True)]
+        best = int(np.argmin(costs))
+        answers[name] = np.split(fits[best], ends)
+        found = strength(answers[name], np.split(measured - fits[best], ends), laws[best].shape[1])
+        if found < WEAK:
+            warnings.append(
+                f"{reference} says little of {name} beside the noise in it (F = {found:.2g}, {WEAK:g} are needed): a "
+                "weak instrument, with which estimates are biased and their intervals too narrow; move the reference "
+                "more, or longer"
+            )
+    return [_answering(run, k, answers) for k, run in enumerate(runs)], warnings
+
+
+def strength(answers: Sequence[Floats], missed: Sequence[Floats], coefficients: int) -> float:
+    """F of the first stage: what the answers have for each coefficient over what slow noise gives to each."""
+    colour = autoregression(missed, LAGS)
+    errors = np.concatenate([np.convolve(e - np.mean(e), colour, "valid") for e in missed])
+    level = float(np.mean(errors**2)) / max(float(np.sum(colour)) ** 2, 1e-12)
+    power = sum(float(np.var(a)) * a.size for a in answers)
+    return power / coefficients / level if level > 0 else math.inf
+
+
+def _columns(moves: Sequence[Floats], shortest: int, dense: int) -> Floats:
+    """The past of a reference as regressors, and a level for every run."""
+    parts = [np.stack(past_columns(r, 0, shortest // 2, dense=dense), axis=1) for r in moves]
+    levels = np.repeat(np.eye(len(moves)), [r.size for r in moves], axis=0)
+    return np.hstack([np.concatenate(parts), levels])
+
+
+def _criterion(missed: Floats, coefficients: int) -> float:
+    power = float(np.mean(missed**2))
+    return missed.size * math.log(max(power, 1e-300)) + coefficients * math.log(missed.size)
+
+
+def _answering(run: Run, number: int, answers: dict[str, list[Floats]]) -> Run:
+    return Run.from_arrays(
+        step=run.step,
+        inputs={n: answers[n][number] if n in answers else run[n] for n in run.inputs},
+        outputs={n: run[n] for n in run.outputs},
+        units={n: u for n, u in run.units.items() if u},
+        intersample=run.intersample,
+        name=run.name,
+        missing="weight",
+    )
+
+
+def by_reference(fit: Fit, reference: str, warnings: Sequence[str]) -> Fit:
+    """A fit with a reference as instrument, told as one."""
+    # The noise of a loop is coloured, and no sign of what the model leaves out; intervals count it.
+    own = [w for w in fit.warnings if "are not white" not in w]
+    return replace(fit, warnings=[*own, *warnings], settings={**fit.settings, "reference": reference})

@@ -1,0 +1,656 @@
+"""Profile likelihood: intervals where the cost around a joint fit's optimum is no parabola.
+
+For each value of one number all others are fitted anew; the interval holds the values at which the cost has risen by no
+more than noise explains (Venzon & Moolgavkar, doi:10.2307/2347496; Raue et al., doi:10.1093/bioinformatics/btp358).
+"""
+
+from __future__ import annotations
+
+import contextlib
+import math
+import threading
+from collections.abc import Callable, Generator, Sequence
+from dataclasses import dataclass, replace
+from statistics import NormalDist
+from typing import Any
+
+import numpy as np
+
+from ftlm.data.run import Run
+from ftlm.errors import ConvergenceError, FtlmError, ModelError
+from ftlm.estimation.free_parameters import FreeProblem
+from ftlm.estimation.objective import Attempt, Grid, covariance, covariance_of
+from ftlm.estimation.output_error import JointFit, ProfileInterval, fit_output_error
+from ftlm.estimation.result import Judged
+from ftlm.order_search.options import Intervals, Loss
+from ftlm.utils.linalg import dot, projections, singular
+from ftlm.utils.resources import pool
+from ftlm.utils.validation import Floats, real_number
+
+#: The quadratic picture fails for a number where either end of its interval is off by more than this share, as one
+#: linear step of all others tells.
+BENT = 0.1
+#: An end is found where the root of the rise is as near to its threshold, and Newton's next step a smaller share of the
+#: way from the optimum.
+NEAR = 0.1
+FOUND = 0.02
+#: A valley is looked at on half as fine a grid where its optimum is no further off than so many standard errors, or
+#: than this share of the numbers themselves.
+NEARBY, ALIKE = 2.0, 1e-3
+#: Evaluations of one refit, and refits an end at most.
+LAP = 120
+REFITS = 40
+#: Free runs below which an end is not gone on with.
+LEAST_SHARE = 10
+#: An end that far out, in half-widths of the quadratic interval, is none: the cost does not rise.
+FARTHEST = 1e3
+#: The first step is that of the quadratic picture or the number itself, but not below this share of the former; a
+#: bracket is narrow where it is FOUND of the value inside it, or of this share of the way.
+LEAST_WAY = 0.01
+FINEST = 0.1
+#: Least and most growth of the way from the optimum in a step.
+LEAST_GROWTH, GROWTH = 1.1, 4.0
+#: Share of the threshold to which a refit is minimised, and by which a lower cost is another optimum.
+EXACT = 1e-4
+LOWER = 0.02
+#: The others are tried by powers of the number where one moves by more than this share of itself, to no more than this
+#: power.
+BY_POWERS, STEEPEST = 0.3, 4.0
+#: The cost levels off where its root rises by half of what it did before or less, and would stay this share below.
+LEVEL_OFF, BELOW = 0.5, 0.05
+#: A lower optimum is another fit where the sum of squares falls by more than this share of a standard error's.
+WORTH = 0.1
+#: How often the search goes on from a lower optimum that it came upon.
+DESCENTS = 5
+#: Directions in which other numbers move nothing, as a share of the largest.
+FLAT = 1e-12
+
+
+class _LowerError(Exception):
+    """A refit whose cost is below the optimum's."""
+
+    def __init__(self, attempt: Attempt) -> None:
+        super().__init__()
+        self.attempt = attempt
+        self.evaluations = int(attempt.outcome["evaluations"])
+
+
+@dataclass(frozen=True)
+class Valley:
+    """The cost of a joint fit around its optimum, on its last grid.
+
+    Parameters
+    ----------
+    grid, best
+        The grid, each output weighing as its residuals ask for, and the optimum there.
+    shift
+        From there to the estimate, the limit for step 0.
+    bread
+        Inverse of the cost's curvature.
+    errors, units
+        Standard errors, and by how much the sum of squares rises at one standard error of each: the noise's variance,
+        widened for coloured residuals, so that a parabola gives the quadratic interval.
+    """
+
+    grid: Grid
+    best: Attempt
+    shift: Floats
+    bread: Floats
+    errors: Floats
+    units: Floats
+
+    @classmethod
+    def of(cls, joint: JointFit, problem: FreeProblem, runs: Sequence[Run]) -> Valley:
+        """The valley in which a fit ended."""
+        weights = [1.0 / max(joint.noise[o], 1e-300) for o in problem.structure.outputs]
+        # Where a growing optimum was left, its valley is not this one.
+        steady = joint.growth is not None and not joint.growth.kept
+        grid = Grid(problem, runs, weights, joint.refinement, shares=joint.shares, steady=steady)
+        if joint.settled and joint.refinement > 1:
+            # Half as fine a grid moved the optimum by less than its errors, and how steep it is by less still.
+            with contextlib.suppress(FtlmError):
+                coarse = replace(grid, every=joint.refinement // 2)
+                found = cls.at(coarse, joint.on_grid, np.zeros(len(problem.names)))
+                near = np.maximum(NEARBY * found.errors, ALIKE * np.abs(joint.on_grid))
+                if found.best.converged and np.all(np.abs(found.best.values - joint.on_grid) <= near):
+                    return replace(found, shift=joint.values - found.best.values)
+        return cls.at(grid, joint.on_grid, joint.values - joint.on_grid)
+
+    @classmethod
+    def at(cls, grid: Grid, values: Floats, shift: Floats) -> Valley:
+        """The valley below a point."""
+        best = grid.descend(_attempt(grid, values), LAP, plain=True)
+        bread = covariance_of(np.asarray(best.outcome["jacobian"]), [], 1.0)
+        spread = np.diag(covariance(best, grid))
+        with np.errstate(invalid="ignore", divide="ignore"):
+            return cls(grid, best, shift, bread, np.sqrt(spread), spread / np.diag(bread))
+
+    @property
+    def names(self) -> list[str]:
+        """Everything that is free."""
+        return self.grid.problem.names
+
+    def seen(self, i: int) -> bool:
+        """Whether the runs see a number at all."""
+        return bool(0 < self.errors[i] < math.inf and 0 < self.units[i] < math.inf)
+
+    def rise(self, i: int, squares: float) -> float:
+        """By how many standard deviations a sum of squares is above the optimum's."""
+        return math.sqrt(max(squares - 2.0 * float(self.best.outcome["cost"]), 0.0) / float(self.units[i]))
+
+    def bent(self, i: int, width: float) -> float:
+        """By which share an end of the quadratic interval is off, as far as one evaluation at each end tells.
+
+        Both ends are moved along the direction of the conditional optimum; there all other numbers follow by one linear
+        step. Infinite where an end is out of bounds or has no finite free run.
+        """
+        if not self.seen(i):
+            return 0.0
+        worst = 0.0
+        for side in (-1.0, 1.0):
+            ends = self.best.values
+            ends[i] += side * width * self.errors[i]
+            low, high = self.grid.problem.all_bounds[i]
+            if not low <= ends[i] <= high:
+                return math.inf
+            try:
+                there = self._evaluated(i, self._along(i, self.best.values, self.bread[:, i], float(ends[i])))
+            except FtlmError:
+                return math.inf
+            left = _left(there, i)
+            with np.errstate(over="ignore"):
+                worst = max(worst, abs(self.rise(i, dot(left, left)) / width - 1.0))
+        return worst
+
+    def end(self, i: int, side: float, width: float, stop: threading.Event | None = None) -> Search:
+        """The search for the end of a number's interval on one side, by Newton's method between in and out.
+
+        It asks, as a generator, for the free runs that it may have taken in all by the next refit, tells whenever these
+        do not suffice how many it took, and returns the end.
+
+        At a refit the cost's slope along the number alone is the slope of the profile; the root of its rise is linear
+        where the cost is a parabola, so that one refit finds the end there.
+        """
+        start, sigma = float(self.best.values[i]), float(self.errors[i])
+        limit = self.grid.problem.all_bounds[i][0 if side < 0 else 1]
+        # In a valley without end standard errors are no measure of it.
+        first = min(sigma * width, max(abs(start), LEAST_WAY * sigma * width))
+        farthest = min(FARTHEST * first, abs(limit - start))
+        within, inside, outside = self.best, 0.0, math.inf
+        way, points, evaluations = min(first, farthest), [], 0
+        reached, gained = 0.0, math.inf
+        allowed = yield 0
+        for _ in range(REFITS):
+            if not way > inside:
+                break
+            if stop is not None and stop.is_set():
+                raise KeyboardInterrupt
+            origin = within
+            while True:
+                lap = max(min(LAP, allowed - evaluations), 0)
+                try:
+                    there, following = self.refitted(i, start + side * way, origin, lap) if lap > 0 else None, math.inf
+                except _LowerError as lower:
+                    lower.evaluations += evaluations
+                    raise
+                took = lap if there is None else int(there.outcome["evaluations"])
+                evaluations += took
+                if lap == LAP or took < lap:
+                    break
+                # Cut short, a refit tells nothing, and goes on from where it was.
+                origin = there or origin
+                allowed = yield evaluations
+            rise, near = math.inf, False
+            if there is not None:
+                rise = self.rise(i, 2.0 * float(there.outcome["cost"]))
+                points.append((start + side * way + float(self.shift[i]), rise**2))
+                slope = side * _slope(there, i) / (float(self.units[i]) * rise) if rise > 0 else 0.0
+                following = way + (width - rise) / slope if slope > 0 else math.inf
+                near = abs(rise / width - 1.0) <= NEAR
+                if near and abs(following - way) <= FOUND * way and inside < following <= farthest:
+                    return End(start + side * following, points, evaluations)
+            if there is None or rise > width:
+                if way >= outside:
+                    # Followed closely, it is out as well: the profile jumps here, or the free run ends.
+                    break
+                outside = way
+            else:
+                inside, within = way, there
+                if way >= outside:
+                    # What stood for the outside was a refit that had lost its way.
+                    outside = math.inf
+                if way >= farthest:
+                    break
+            closed = math.isfinite(outside)
+            size = max(min(outside, abs(start + side * inside)), FINEST * outside) if closed else 0.0
+            narrow = closed and outside - inside <= FOUND * size
+            if near and not narrow and inside < following < min(outside, farthest):
+                # Newton's next step is worth more there than one of a size given beforehand.
+                way = following
+            elif not closed:
+                gain, reached = rise - reached, rise
+                if gain <= LEVEL_OFF * gained and rise + gain < (1.0 - BELOW) * width and way > GROWTH * first:
+                    break
+                gained = gain
+                way = min(max(following, LEAST_GROWTH * way), GROWTH * way, farthest)
+            elif narrow:
+                way = outside
+            else:
+                margin = 0.05 * (outside - inside)
+                following = following if inside < following < outside else _middle(start, side, inside, outside)
+                way = min(max(following, inside + margin), outside - margin)
+        # An end between two points of which the outer one has a cost; else the cost never rose that far.
+        risen = math.isfinite(outside) and any(r >= width**2 for _, r in points)
+        return End(start + side * outside if risen else side * math.inf, points, evaluations)
+
+    def refitted(self, i: int, value: float, near: Attempt, lap: int = LAP) -> Attempt | None:
+        """The optimum of all others at a value of one number, followed from a point nearby; None where there is none.
+
+        Raises
+        ------
+        _LowerError
+            It lies below the optimum.
+        """
+        rise = float(self.units[i])
+        least = 2.0 * float(self.best.outcome["cost"])
+        for point in self._starts(i, value, near):
+            try:
+                there = self._descended(i, point, lap, EXACT * rise / max(least, rise))
+            except FtlmError:
+                continue
+            if 2.0 * float(there.outcome["cost"]) < least - LOWER * rise:
+                raise _LowerError(there)
+            return there
+        return None
+
+    def _starts(self, i: int, value: float, near: Attempt) -> list[Floats]:
+        """Where the others may be at a value of one number, the likeliest first.
+
+        Along the tangent, or, where that moves them by much, all or orders by powers of the number if that costs less:
+        valleys without end are bent like d mu = const, d + a = const.
+        """
+        values, tangent = near.values, _tangent(near, i)
+        orders = len(self.grid.problem.orders)
+        still = self._along(i, values, np.zeros_like(tangent), value)
+        points = [self._along(i, values, tangent, value), still]
+        # Of numbers that nothing tells a tangent has no end; a point there is none, and has no cost.
+        with np.errstate(over="ignore", invalid="ignore"):
+            moves = np.abs(tangent * (value - values[i])) > BY_POWERS * np.abs(values)
+            if value * values[i] > 0 and moves.any():
+                powers = tangent * values[i] / np.where(values, values, 1.0)
+                power = values * (value / values[i]) ** np.clip(powers, -STEEPEST, STEEPEST)
+                mixed = np.where(np.arange(values.size) < orders, power, values + tangent * (value - values[i]))
+                for towards in (power, mixed):
+                    towards[i] = value
+                    points.append(self._along(i, values, towards - values, value))
+        return sorted(points, key=lambda p: self._cost(i, p)) if len(points) > 2 else points
+
+    def _cost(self, i: int, values: Floats) -> float:
+        """Cost at a point; infinite where it has no finite free run."""
+        try:
+            return float(self._descended(i, values, 0, EXACT).outcome["cost"])
+        except FtlmError:
+            return math.inf
+
+    def _along(self, i: int, values: Floats, direction: Floats, value: float) -> Floats:
+        """A point with a value of one number, the others moved along, as far as bounds and orders allow."""
+        at = values.copy()
+        at[i] = value
+        if not direction[i]:
+            return at
+        with np.errstate(over="ignore", invalid="ignore"):
+            towards = values + direction / direction[i] * (value - values[i])
+        towards[i] = value
+        point = self.grid.problem.feasible(at, towards)
+        point[i] = value
+        return point
+
+    def _evaluated(self, i: int, values: Floats) -> Attempt:
+        return self._descended(i, values, 1, EXACT)
+
+    def _descended(self, i: int, values: Floats, evaluations: int, tolerance: float) -> Attempt:
+        return self.grid.descend(_attempt(self.grid, values), evaluations, plain=True, held=i, tolerance=tolerance)
+
+
+#: A search for an end: it yields the free runs it took, is sent how many it may have taken, and returns the end.
+Search = Generator[int, int, "End"]
+
+
+@dataclass(frozen=True)
+class End:
+    """One end of an interval: its value on the grid, the points on the way, free runs."""
+
+    value: float
+    points: list[tuple[float, float]]
+    evaluations: int
+
+
+@dataclass(frozen=True)
+class Profiles:
+    """Profile intervals of some numbers, and the lower optimum that the search for them may have come upon.
+
+    Parameters
+    ----------
+    intervals
+        By name.
+    lower
+        Values of everything free at an optimum that is lower than the fit's; None where there is none worth a fit.
+    left
+        Names of numbers whose profile would have taken more free runs than were allowed.
+    evaluations
+        Free runs that all of it took.
+    """
+
+    intervals: dict[str, ProfileInterval]
+    lower: Floats | None = None
+    left: tuple[str, ...] = ()
+    evaluations: int = 0
+
+
+def profiled(
+    valley: Valley,
+    names: Sequence[str],
+    level: float,
+    *,
+    threads: int = 1,
+    progress: Callable[[int, int], None] | None = None,
+    most: int | None = None,
+) -> Profiles:
+    """Profile intervals of some of a fit's numbers.
+
+    Every end is followed from the optimum by itself, so that the figures do not depend on the number of threads. A
+    number that the runs do not see has the whole line for its interval.
+
+    Parameters
+    ----------
+    valley
+        Where the fit ended.
+    names
+        Numbers by name.
+    level
+        Probability between 0 and 1.
+    threads, progress
+        Threads, and what is called with (ends found, ends in all).
+    most
+        Free runs for all ends together, those from lower optima on the way included; None for as many as they need.
+        They are dealt out evenly, and what an end does not need goes to those that are not found yet.
+
+    Raises
+    ------
+    KeyboardInterrupt
+        Ctrl-C, within one refit.
+    """
+    start, spent = valley, 0
+    for _ in range(DESCENTS):
+        ends, took = _ends(valley, names, level, threads, progress, None if most is None else most - spent)
+        spent += took
+        below = [e.attempt for e in ends.values() if isinstance(e, _LowerError)]
+        if not below:
+            break
+        # What was the limit for step 0 of another optimum is none of this one.
+        valley = Valley.at(valley.grid, below[0].values, np.zeros_like(valley.shift))
+    fall = 2.0 * (float(start.best.outcome["cost"]) - float(valley.best.outcome["cost"]))
+    known = valley.units[np.isfinite(valley.units)]
+    lower = valley.best.values if known.size and fall > WORTH * float(np.median(known)) else None
+    found: dict[str, ProfileInterval] = {}
+    left = tuple(n for n in names if any(ends.get((n, side), 0) is None for side in (-1.0, 1.0)))
+    for name in (n for n in names if n not in left):
+        both = [e for e in (ends.get((name, side)) for side in (-1.0, 1.0)) if isinstance(e, End)]
+        if len(both) < 2:
+            found[name] = ProfileInterval(-math.inf, math.inf, level)
+            continue
+        i = valley.names.index(name)
+        first, last = valley.grid.problem.all_bounds[i]
+        low, high = (e.value + float(valley.shift[i]) for e in both)
+        low, high = (min(max(v, first), last) if math.isfinite(v) else v for v in (low, high))
+        points = tuple(sorted([*both[0].points, *both[1].points]))
+        found[name] = ProfileInterval(low, high, level, points, sum(e.evaluations for e in both))
+    return Profiles(found, lower, left, spent)
+
+
+def _ends(
+    valley: Valley,
+    names: Sequence[str],
+    level: float,
+    threads: int,
+    progress: Callable[[int, int], None] | None,
+    most: int | None,
+) -> tuple[dict[tuple[str, float], End | _LowerError | None], int]:
+    """Both ends of every number that the runs see, and the free runs that they took.
+
+    The first of them whose way leads to a lower optimum is the last: all others would be ends around another one.
+    """
+    width, stop = half_width(level), threading.Event()
+    asked = [(n, side) for n in names if valley.seen(valley.names.index(n)) for side in (-1.0, 1.0)]
+    searches = {one: valley.end(valley.names.index(one[0]), one[1], width, stop) for one in asked}
+    for search in searches.values():
+        next(search)
+
+    def followed(one: tuple[str, float], allowed: int) -> int | End | _LowerError:
+        try:
+            return searches[one].send(allowed)
+        except StopIteration as found:
+            end: End = found.value
+            return end
+        except _LowerError as lower:
+            return lower
+
+    out: dict[tuple[str, float], End | _LowerError | None] = dict.fromkeys(asked)
+    took = dict.fromkeys(asked, 0)
+    left = asked
+    with pool(max(threads, 1)) as workers:
+        try:
+            while left:
+                share = LAP * REFITS * 2 if most is None else (most - sum(took.values())) // len(left)
+                if share < LEAST_SHARE:
+                    break
+                # In whole rounds, so that what an end may take does not depend on the number of threads.
+                allowed = [took[o] + share for o in left]
+                asked_now = [
+                    workers.submit(followed, one, most_now) for one, most_now in zip(left, allowed, strict=True)
+                ]
+                for one, future in zip(left, asked_now, strict=True):
+                    found = future.result()
+                    if isinstance(found, int):
+                        took[one] = found
+                        continue
+                    out[one], took[one] = found, found.evaluations
+                    if isinstance(found, _LowerError):
+                        stop.set()
+                        workers.shutdown(cancel_futures=True)
+                        return out, sum(took.values())
+                    if progress is not None:
+                        progress(sum(e is not None for e in out.values()), len(asked))
+                left = [o for o in left if out[o] is None]
+        except BaseException:
+            stop.set()
+            raise
+    return out, sum(took.values())
+
+
+def bent_numbers(valley: Valley, level: float) -> list[str]:
+    """Numbers for which the quadratic picture fails, by two evaluations each."""
+    width = half_width(level)
+    return [n for i, n in enumerate(valley.names) if valley.bent(i, width) > BENT]
+
+
+def half_width(level: float) -> float:
+    """Half-width of an interval of this probability in standard deviations."""
+    return NormalDist().inv_cdf(0.5 + 0.5 * level)
+
+
+def _attempt(grid: Grid, values: Floats) -> Attempt:
+    orders, coefficients, inputs = grid.problem.split(values.tolist())
+    return Attempt(orders, coefficients, "profile", {}, inputs)
+
+
+def _middle(start: float, side: float, inside: float, outside: float) -> float:
+    """The middle of a bracket, by its ratio where the values differ by one."""
+    near, far = start + side * inside, start + side * outside
+    if near * far > 0:
+        return side * (math.copysign(math.sqrt(near * far), near) - start)
+    return 0.5 * (inside + outside)
+
+
+def _slope(attempt: Attempt, i: int) -> float:
+    """Half the derivative of the sum of squares with respect to one number; 0 where it is beyond the numbers."""
+    # Near where a free run has no value its derivatives overflow: they tell no step.
+    with np.errstate(over="ignore", invalid="ignore"):
+        slope = dot(np.asarray(attempt.outcome["jacobian"])[i], np.asarray(attempt.outcome["residuals"]))
+    return slope if math.isfinite(slope) else 0.0
+
+
+def _span(attempt: Attempt, i: int) -> tuple[Any, Floats]:
+    """Singular value decomposition of the other numbers' sensitivities, rows of unit length, and these lengths."""
+    others = np.delete(np.asarray(attempt.outcome["jacobian"]), i, axis=0)
+    # Far out, sensitivities may be so large that their squares are no numbers.
+    length = np.abs(others).max(axis=1, initial=0.0)
+    length = np.where(length > 0, length, 1.0)
+    length = length * np.maximum(np.linalg.norm(others / length[:, None], axis=1), 1.0)
+    tall, sizes, square = singular((others / length[:, None]).T)
+    kept = sizes > FLAT * sizes.max(initial=0.0)
+    return (square.T[:, kept], sizes[kept], tall.T[kept]), length
+
+
+def _left(attempt: Attempt, i: int) -> Floats:
+    """Residuals once all other numbers follow by one linear step."""
+    residuals = np.asarray(attempt.outcome["residuals"])
+    (_, _, right), _ = _span(attempt, i)
+    return np.asarray(residuals - right.T @ projections(right.T, residuals))
+
+
+def _tangent(attempt: Attempt, i: int) -> Floats:
+    """How all numbers move along the profile when one moves by 1."""
+    (left, sizes, right), length = _span(attempt, i)
+    along = np.asarray(attempt.outcome["jacobian"])[i]
+    with np.errstate(over="ignore"):
+        others = -(left @ (projections(right.T, along) / sizes)) / length
+    return np.insert(others, i, 1.0)
+
+
+#: Level of the intervals that are printed.
+PRINTED = 0.95
+#: A lower optimum is spoken of where the residuals of an output fall by this share.
+TOLD = 1e-3
+#: How often a fit goes on from a lower optimum that its intervals came upon.
+REFITS_INTERVALS = 2
+#: Pulses that may be spent on profiles nobody asked for, all numbers together, and free runs that an end is worth
+#: beginning with. Where an order is free, a pulse costs so many of running sums.
+UNASKED, FEWEST = 6_000_000, 20
+FRACTIONAL = 3
+
+
+def with_intervals(
+    joint: JointFit,
+    problem: FreeProblem,
+    runs: Sequence[Run],
+    intervals: Intervals,
+    *,
+    threads: int = 1,
+    progress: Callable[[int, int], None] | None = None,
+    loss: Loss = "squares",
+) -> tuple[JointFit, list[str]]:
+    """A joint fit with the intervals that were asked for, and what is to be said of them.
+
+    ``"auto"`` profiles the numbers for which the quadratic picture fails, ``"profile"`` all. Where that leads to an
+    optimum below the fit's, the fit is done again from there.
+    """
+    fitted = len(joint.names) + joint.initial_terms
+    # Where no more samples are left over than numbers were fitted, the residuals do not tell what noise explains.
+    if intervals == "quadratic" or (intervals == "auto" and joint.samples < 2 * fitted):
+        return joint, []
+    warnings: list[str] = []
+    spent = 0
+    for turn in range(REFITS_INTERVALS + 1):
+        try:
+            valley = Valley.of(joint, problem, runs)
+        except FtlmError:
+            # No finite free run where the weights of the last descent are taken anew: what is known stays.
+            return joint, warnings
+        names = valley.names if intervals == "profile" else bent_numbers(valley, PRINTED)
+        pulses, least = joint.samples * joint.refinement, FEWEST * 2 * len(names)
+        pulses *= FRACTIONAL if joint.orders else 1
+        allowed = (UNASKED - spent) // pulses
+        if intervals == "auto" and least > allowed:
+            found = Profiles({}, None, tuple(names))
+            break
+        most = None if intervals == "profile" else allowed
+        found = profiled(valley, names, PRINTED, threads=threads, progress=progress, most=most)
+        spent += found.evaluations * pulses
+        if found.lower is None or turn == REFITS_INTERVALS:
+            break
+        if not is_lower(valley.grid, joint.on_grid, found.lower):
+            # What only this grid carries is a mode of the scheme; along it the cost tells nothing of the numbers.
+            return joint, warnings
+        start = dict(zip(problem.names, found.lower.tolist(), strict=True))
+        tried, level = len(joint.starts), joint.noise
+        try:
+            again = fit_output_error(runs, problem.structure, threads=threads, start=start, loss=loss)
+        except FtlmError:
+            break
+        if all(v > (1.0 - TOLD) * level[o] for o, v in again.noise.items()):
+            joint = replace(again, starts=joint.starts, origin=joint.origin)
+            continue
+        joint = replace(again, origin="a lower optimum that the search for its intervals came upon")
+        before, after = (", ".join(f"{o} {v:.4g}" for o, v in noise.items()) for noise in (level, joint.noise))
+        warnings = [
+            f"none of {tried} starts led to this optimum, but the search for intervals did (residuals {before} before, "
+            f"{after} now): there may be others"
+        ]
+    if found.left:
+        warnings.append(
+            f"the cost is no parabola along {', '.join(found.left)}, and its profile there would take long: these "
+            "intervals are rough; intervals='profile' finds them"
+        )
+    return replace(joint, profiles=found.intervals), warnings
+
+
+def is_lower(grid: Grid, before: Floats, after: Floats) -> bool:
+    """Whether one point costs less than another on the next finer grid as well.
+
+    There they are only evaluated: a mode of the scheme would settle on that grid anew.
+    """
+    finer, costs = grid.finer, []
+    for values in (before, after):
+        orders, coefficients, inputs = grid.problem.split(values.tolist())
+        try:
+            there = finer.descend(Attempt(orders, coefficients, "finer grid", {}, inputs), 1, plain=True)
+        except FtlmError:
+            return False
+        costs.append(float(there.outcome["cost"]))
+    return costs[1] < costs[0]
+
+
+def valley_of(result: Judged) -> Valley:
+    """The cost around the optimum of a result by output error."""
+    if result.joint is None or result.task is None:
+        raise ModelError(f"method {result.method!r} has no likelihood to profile; identify by method='output-error'")
+    problem = FreeProblem.of(replace(result.task.structure, initial=result.joint.initial))
+    return Valley.of(result.joint, problem, result.task.runs)
+
+
+def profile(
+    result: Judged, names: Sequence[str], level: float, threads: int, progress: Callable[[int, int], None] | None
+) -> dict[str, ProfileInterval]:
+    """Profile intervals of a result's numbers; see :meth:`ftlm.Identification.profile`."""
+    if "reference" in result.settings:
+        raise ModelError(
+            "a fit with reference= is where residuals are orthogonal to instruments, and no minimum of a cost: it has "
+            "no profile; use its standard errors"
+        )
+    valley = valley_of(result)
+    unknown = [n for n in names if n not in valley.names]
+    if unknown:
+        others = f", nor {len(unknown) - 1} more" if len(unknown) > 1 else ""
+        raise ModelError(f"{unknown[0]!r}{others} is no free number of this fit; it has {', '.join(valley.names)}")
+    probability = real_number("level", level)
+    if not 0.0 < probability < 1.0:
+        raise ModelError(f"level = {level} is no probability between 0 and 1, such as 0.95")
+    asked = list(dict.fromkeys(names)) or valley.names
+    found = profiled(valley, asked, probability, threads=threads, progress=progress)
+    if found.lower is not None:
+        raise ConvergenceError(
+            "the profile leads to an optimum below this fit's, so its estimates are not the likeliest; identify again "
+            "with intervals='profile', which goes on from there"
+        )
+    return found.intervals

@@ -1,0 +1,155 @@
+"""A joint fit's cost around its optimum, over the two orders that its runs tell apart least."""
+
+from __future__ import annotations
+
+import math
+from dataclasses import dataclass, replace
+
+import numpy as np
+
+from ftlm.errors import FtlmError, ModelError
+from ftlm.estimation.free_parameters import FreeProblem
+from ftlm.estimation.objective import Attempt, Grid
+from ftlm.estimation.output_error import JointFit
+from ftlm.estimation.result import Judged, Task
+from ftlm.svg.heat_map import Landscape
+from ftlm.utils.linalg import dot, projections, singular
+from ftlm.utils.validation import Floats
+
+#: Points a side of a joint fit's landscape, and its half-width in standard errors.
+SIDE, HALF_WIDTH = 11, 4.0
+#: Evaluations that find the optimum of the fit's last grid.
+REFITS = 20
+
+
+def correlated_orders(result: Judged) -> tuple[str, str, float] | None:
+    """The two orders of a joint fit that its runs tell apart least, and their correlation.
+
+    Parameters
+    ----------
+    result
+        By output error.
+
+    Returns
+    -------
+    tuple or None
+        None with fewer than two free orders, or where no correlation is known.
+    """
+    if result.joint is None:
+        return None
+    names = list(result.joint.orders)
+    sizes = np.abs(result.joint.correlation[: len(names), : len(names)])
+    sizes = np.where(np.isfinite(sizes) & ~np.eye(len(names), dtype=bool), sizes, -1.0)
+    if len(names) < 2 or sizes.max() < 0:
+        return None
+    i, j = sorted(int(k) for k in np.unravel_index(int(np.argmax(sizes)), sizes.shape))
+    return names[i], names[j], float(result.joint.correlation[i, j])
+
+
+def output_error_landscape(
+    result: Judged, orders: tuple[str, str] | None = None, *, refit: bool = True
+) -> Landscape | None:
+    """Cost of a joint output-error fit over two of its orders, four standard errors around the optimum.
+
+    Parameters
+    ----------
+    result
+        By output error.
+    orders
+        Names of the two; by default those that the runs tell apart least.
+    refit
+        Whether all other orders, coefficients and delays follow by one linear step from the optimum; otherwise they
+        are held.
+
+    Returns
+    -------
+    Landscape or None
+        Scores are 1 plus what the sum of squares, weighted by the noise, exceeds its smallest value by; for white
+        residuals the 95 % region of both orders ends at 7. None where two orders have no finite standard error.
+
+    Raises
+    ------
+    ModelError
+        A name that is no free order.
+    """
+    joint, task, pair = result.joint, result.task, orders
+    chosen = correlated_orders(result)
+    if joint is None or task is None or (pair is None and chosen is None):
+        return None
+    first, second = pair or chosen[:2]  # type: ignore[index]
+    names = list(joint.orders)
+    if first == second or first not in names or second not in names:
+        raise ModelError(f"a landscape needs two different free orders; this fit has {', '.join(names)}")
+    errors = joint.standard_errors
+    if not all(0 < errors[n] < math.inf for n in (first, second)):
+        return None
+    around = Around.of(joint, task, (first, second), refit=refit)
+    bounds = dict(zip(around.grid.problem.orders, around.grid.problem.bounds, strict=True))
+    axes = []
+    for name, k in zip((first, second), around.at, strict=True):
+        low, high = around.centre[k] - HALF_WIDTH * errors[name], around.centre[k] + HALF_WIDTH * errors[name]
+        axes.append(np.linspace(max(low, bounds[name][0]), min(high, bounds[name][1]), SIDE))
+    scores = np.array([[around.cost(x, y) for x in axes[0]] for y in axes[1]])
+    least = min(around.rest(around.best), float(scores.min()))
+    kept = "All other numbers refitted, by one linear step." if refit else "All other numbers held at the optimum."
+    i, j = names.index(first), names.index(second)
+    return Landscape(
+        (first, second),
+        axes[0],
+        axes[1],
+        1.0 + scores - least,
+        kept,
+        "1 + increase of the weighted sum of squares",
+        float(joint.correlation[i, j]),
+    )
+
+
+@dataclass(frozen=True)
+class Around:
+    """A joint fit around its optimum: the grid it ended on, the best point there, and what all but two numbers span."""
+
+    grid: Grid
+    best: Attempt
+    at: list[int]
+    basis: Floats | None
+
+    @classmethod
+    def of(cls, joint: JointFit, task: Task, names: tuple[str, str], *, refit: bool) -> Around:
+        """The optimum of the last grid; the estimate is extrapolated to step 0, so it is close by."""
+        problem = FreeProblem.of(replace(task.structure, initial=joint.initial))
+        weights = [1.0 / joint.noise[o] for o in problem.structure.outputs]
+        grid = Grid(problem, task.runs, weights, joint.refinement, shares=joint.shares)
+        best = _moved(grid, joint.values, REFITS)
+        at = [problem.names.index(n) for n in names]
+        others = np.delete(np.asarray(best.outcome["jacobian"]), at, axis=0)
+        size = np.linalg.norm(others, axis=1, keepdims=True)
+        spanned = refit and bool(others.size)
+        scaled = others / np.where(size > 0, size, 1.0)
+        return cls(grid, best, at, singular(scaled.T)[0].T if spanned else None)
+
+    @property
+    def centre(self) -> Floats:
+        """Values of everything free at the best point."""
+        return self.best.values
+
+    def rest(self, attempt: Attempt) -> float:
+        """Sum of squares that is left of an attempt's residuals once all other numbers follow."""
+        residuals = np.asarray(attempt.outcome["residuals"])
+        if self.basis is not None:
+            residuals = residuals - self.basis.T @ projections(self.basis.T, residuals)
+        return dot(residuals, residuals)
+
+    def cost(self, x: float, y: float) -> float:
+        """The same where the two numbers are moved; infinite where that has no finite free run."""
+        values = self.centre.copy()
+        values[self.at] = x, y
+        try:
+            return self.rest(_moved(self.grid, values, 1))
+        except FtlmError:
+            return math.inf
+
+
+def _moved(grid: Grid, values: Floats, evaluations: int) -> Attempt:
+    """Descend from given values of everything free."""
+    orders, coefficients, inputs = grid.problem.split(values.tolist())
+    return grid.descend(Attempt(orders, coefficients, "landscape", {}, inputs), evaluations, plain=True)

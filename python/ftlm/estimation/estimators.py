@@ -1,0 +1,422 @@
+"""A joint fit whose residuals are orthogonal to instruments, not to sensitivities: what a closed loop needs."""
+
+from __future__ import annotations
+
+import contextlib
+import math
+import os
+from collections.abc import Callable, Mapping, Sequence
+from concurrent.futures import Executor
+from dataclasses import asdict, dataclass, field, replace
+from typing import Any
+
+import numpy as np
+
+from ftlm.data.run import Run
+from ftlm.errors import FtlmError, ModelError
+from ftlm.estimation.confidence_intervals import with_intervals
+from ftlm.estimation.free_parameters import FreeProblem, known_starts, values_of_model
+from ftlm.estimation.genetic import Genetic, genetic_search
+from ftlm.estimation.linear import estimate_coefficients, step_bias
+from ftlm.estimation.model_checks import broken_law, irregular, uncertain
+from ftlm.estimation.nuisance_parameters import errors_with_orders, fit_any_start
+from ftlm.estimation.objective import Attempt, Grid, long_run
+from ftlm.estimation.output_error import JointFit
+from ftlm.estimation.result import Task
+from ftlm.model.model import Model, Solved
+from ftlm.order_search.checkpoint import Store
+from ftlm.order_search.options import Intervals, Loss, Settings
+from ftlm.order_search.result import SearchResult
+from ftlm.order_search.search import announce, make_job, run_job
+from ftlm.progress import Course
+from ftlm.simulation.discretization import prepare
+from ftlm.structure.order_grid import Lattice
+from ftlm.structure.structure import History, Initial, Structure
+from ftlm.utils.linalg import length, orthonormal, projections
+from ftlm.utils.validation import Floats
+from ftlm.validation.comparison import compare_means
+
+#: Most steps, and how often one is halved.
+STEPS = 40
+HALVINGS = 6
+#: A step that moves no number by this share of its standard error ends them.
+STILL = 1e-3
+#: What is left of an instrument below this share is rounding.
+ALIKE = 1e-12
+#: Least pulses a sample interval: the estimates are those of one grid.
+EVERY = 2
+
+
+def instrumented(joint: JointFit, problem: FreeProblem, runs: Sequence[Run], answers: Sequence[Run]) -> JointFit:
+    """Solve for zero correlation of the residuals with sensitivities simulated from clean inputs.
+
+    Residuals e are of the runs as they were measured, so nothing of the input is left out of the model; sensitivities
+    are of the answers of the inputs to a reference, which noise is no part of. Where they are orthogonal, feedback of
+    noise biases nothing, however well the answers are known (Young, Recursive Estimation and Time-Series Analysis,
+    2011, chapters 7 and 9). Gauss-Newton from the fit to the answers; the covariance is robust to coloured residuals.
+    """
+    weights = [1.0 / max(joint.noise[o], 1e-300) for o in problem.structure.outputs]
+    every = max(joint.refinement, EVERY)
+    measured, clean = (Grid(problem, each, weights, every=every) for each in (runs, answers))
+    values, converged = joint.values, False
+    here = _moment(measured, clean, values)
+    for _ in range(STEPS):
+        attempt, slopes, instruments = here
+        residuals = np.asarray(attempt.outcome["residuals"])
+        bread = np.linalg.pinv(instruments @ slopes.T)
+        step = -bread @ (instruments @ residuals)
+        errors = np.sqrt(np.diag(_covariance(measured, attempt, bread @ instruments)))
+        if np.all(np.abs(step) <= STILL * errors):
+            converged = True
+            break
+        level = _size(here)
+        for halving in range(HALVINGS):
+            tried = problem.feasible(values, values + 0.5**halving * step)
+            try:
+                there = _moment(measured, clean, tried)
+            except FtlmError:
+                # No finite free run that far.
+                continue
+            if _size(there) < level:
+                values, here = tried, there
+                break
+        else:
+            break
+    attempt, slopes, instruments = here
+    covariance = _covariance(measured, attempt, np.linalg.pinv(instruments @ slopes.T) @ instruments)
+    orders, coefficients, inputs = problem.split(values.tolist())
+    levels = measured.levels(attempt)
+    return replace(
+        joint,
+        orders=dict(zip(problem.orders, orders, strict=True)),
+        coefficients=dict(zip(problem.coefficients, coefficients, strict=True)),
+        inputs=dict(zip((item.name for item in problem.inputs), inputs, strict=True)),
+        covariance=covariance,
+        noise={o: level / w for (o, level), w in zip(levels.items(), weights, strict=True)},
+        cost=float(attempt.outcome["cost"]),
+        residuals=measured.residuals(attempt),
+        refinement=every,
+        converged=converged,
+    )
+
+
+def _moment(measured: Grid, clean: Grid, values: Floats) -> tuple[Attempt, Floats, Floats]:
+    """Residuals and sensitivities on the measured inputs, and sensitivities on the clean ones."""
+    orders, coefficients, inputs = measured.problem.split(values.tolist())
+    start = Attempt(orders, coefficients, "instruments", {}, inputs)
+    at = measured.descend(start, 1, plain=True)
+    instruments = clean.descend(start, 1, plain=True)
+    return at, np.asarray(at.outcome["jacobian"]), np.asarray(instruments.outcome["jacobian"])
+
+
+def _size(moment: tuple[Attempt, Floats, Floats]) -> float:
+    """What of the residuals lies in the span of the instruments."""
+    attempt, _, instruments = moment
+    basis = orthonormal(instruments.T, ALIKE)
+    return length(projections(basis, np.asarray(attempt.outcome["residuals"])))
+
+
+def _covariance(grid: Grid, attempt: Attempt, influence: Floats) -> Floats:
+    """Covariance of the numbers from the influence of each residual on each."""
+    series = [residuals for part in grid.residuals(attempt) for residuals in part.values()]
+    return long_run(influence, series)
+
+
+#: Most pulses a run on which instrumental variables end where m is not given.
+MOST_PULSES = 1 << 14
+#: Seeds of the genetic algorithm whose errors differ by more than this factor have not all found the optimum.
+SCATTERED = 1.2
+Told = Callable[[int, int], None] | None
+
+
+@dataclass(frozen=True)
+class Fit:
+    """What an estimator came to, before anybody has judged it.
+
+    Parameters
+    ----------
+    task
+        What was asked, as the estimator took it.
+    method
+        The estimator.
+    model
+        Its numbers.
+    parameters
+        How many of them were free.
+    settings
+        What they depend on besides the task.
+    warnings
+        What the estimator itself knows against them.
+    searches, errors, joint, covariance
+        Order searches, standard errors of coefficients at the orders found, the joint fit, and the covariance of the
+        model's numbers, where the estimator has them.
+    """
+
+    task: Task
+    method: str
+    model: Model
+    parameters: int
+    settings: dict[str, Any]
+    warnings: list[str]
+    searches: dict[str, SearchResult] = field(default_factory=dict)
+    errors: Mapping[str, float] = field(default_factory=dict)
+    joint: JointFit | None = None
+    covariance: tuple[tuple[float, ...], ...] | None = None
+
+
+def solved(task: Task, method: str, structure: Structure, orders: Mapping[str, float], m: int, **about: Any) -> Model:
+    """The task's structure as a model, once everything in it is a number."""
+    units = {n: u for n, u in task.runs[0].units.items() if n in structure.signals}
+    told = {"method": method, "runs": ", ".join(r.name for r in task.runs), **about}
+    return Model(structure, orders=orders, units=units, m=m, about=told)
+
+
+def in_words(initial: Initial) -> str:
+    """Decided initial terms as settings name them."""
+    if isinstance(initial, History):
+        return f"history, {len(initial)} powers of t up to {initial[-1]:g}"
+    return initial if isinstance(initial, str) else f"t^{list(initial)}"
+
+
+def offset_setting(structure: Structure) -> dict[str, str]:
+    """The setting that an offset is, if there is one."""
+    return {} if structure.offset == "none" else {"offset": structure.offset}
+
+
+def loss_setting(joint: JointFit) -> dict[str, Any]:
+    """The loss, where it is another one than squares, and what it did."""
+    return {} if joint.robust is None else {"loss": "huber", **asdict(joint.robust)}
+
+
+def by_output_error(
+    task: Task,
+    m: int | None,
+    threads: int,
+    progress: Told,
+    answers: Sequence[Run] | None = None,
+    loss: Loss = "squares",
+    intervals: Intervals = "auto",
+    begin: Solved | Mapping[str, float] | None = None,
+    more: Mapping[str, float] | None = None,
+    alone: bool = False,
+) -> Fit:
+    """Orders and coefficients together by joint output error; answers of the inputs to a reference are instruments.
+
+    Alone, what begins is the only start, which somebody knows to be near.
+    """
+    # An order with one value is known.
+    known = {n: v[0] for n, v in task.structure.order_values.items() if len(v) == 1}
+    structure = task.structure.with_orders(known)
+    record = prepare(task.runs, structure.as_given(), m, power_of_two=False, gaps=True)[0]
+    start = record.initial
+    begins: list[dict[str, float]] = []
+    if begin is not None:
+        free = FreeProblem.of(replace(structure, initial="rest"))
+        given = values_of_model(free, begin, more or {}) if isinstance(begin, Solved) else begin
+        begins = known_starts(free, given)
+    # A fit that is made twice, with a history or without, is rare; profiles of intervals take a third, where they do.
+    course = Course(progress)
+    joint = fit_any_start(
+        answers or task.runs,
+        structure,
+        start,
+        threads=threads,
+        progress=course.until(0.7, 0.9),
+        loss=loss,
+        known=begins,
+        alone=alone,
+    )
+    course.at(0.7)
+    problem = FreeProblem.of(replace(structure, initial=joint.initial))
+    lower: list[str] = []
+    if answers is not None:
+        joint = instrumented(joint, problem, task.runs, answers)
+    else:
+        joint, lower = with_intervals(
+            joint, problem, task.runs, intervals, threads=threads, progress=course.until(1.0, 0.9), loss=loss
+        )
+    course.at(1.0)
+    warnings = [*lower, *uncertain(joint, problem), *irregular(task.runs, joint, problem)]
+    if start == "rest" and joint.initial != "rest":
+        # The first value alone would tell a comparison otherwise.
+        structure = replace(structure, initial="history")
+        warnings.append(
+            f"{', '.join(r.name for r in task.runs)}: the first values look like rest, but the residuals of a fit from "
+            "rest ask for what was before; initial='history' was used"
+        )
+    orders, coefficients = list(joint.orders.values()), list(joint.coefficients.values())
+    identified = structure.with_orders(joint.orders).with_coefficients(problem.named(coefficients))
+    moved = problem.number_jacobian(orders, coefficients)
+    with np.errstate(invalid="ignore", over="ignore"):
+        # Of directions that the runs do not see covariances are no numbers, or beyond them; then none is given.
+        spread = moved @ joint.covariance @ moved.T
+    return Fit(
+        Task(task.runs, structure),
+        "output-error",
+        solved(task, "output-error", identified.with_inputs(joint.inputs), {**known, **joint.orders}, record.m),
+        len(joint.names),
+        {
+            "method": "output-error",
+            "m": record.m,
+            "initial": in_words(joint.initial),
+            "refinement": joint.refinement,
+            "starts": len(joint.starts),
+            "noise": joint.noise,
+            "converged": joint.converged,
+            **offset_setting(structure),
+            **loss_setting(joint),
+        },
+        warnings,
+        joint=joint,
+        covariance=tuple(tuple(row) for row in spread.tolist()) if np.all(np.isfinite(spread)) else None,
+    )
+
+
+def by_lattice(
+    task: Task,
+    settings: Settings,
+    m: int | None,
+    progress: Told,
+    store: str | os.PathLike[str] | None,
+    executor: Executor | None,
+) -> Fit:
+    """Orders from the lattice, coefficients by the estimator that ranked them."""
+    method, structure = settings.coefficients, task.structure
+    searches = searched(task, settings, m, progress, store, executor) if structure.order_names else {}
+    orders = {n: v for search in searches.values() for n, v in search.orders.items()}
+    rank = 1
+    if "stage" in searches and method == "instrumental-variables" and structure.coupling == "simulated":
+        rank = coupled_rank(task, settings, m, searches["stage"])
+        orders = searches["stage"].table[rank - 1].orders
+    if m is None and method == "instrumental-variables":
+        # Coefficients without the bias of noise show that of the step: all samples, once the orders are found.
+        m = min(MOST_PULSES, *(run.length - 1 for run in task.runs))
+    at_orders = structure.with_orders(orders)
+    fit = estimate_coefficients(task.runs, at_orders, settings, m)
+    errors: Mapping[str, float] = fit.errors
+    free = structure.with_orders({n: v for n, v in orders.items() if n in settled(task)})
+    if free.order_names and fit.errors:
+        # At orders that are themselves estimates, those of the coefficients alone are too sure.
+        errors = errors_with_orders(task.runs, free, {**orders, **fit.values}) or {}
+    model = solved(task, method, at_orders.with_coefficients(fit.values), orders, fit.m, **settings.to_dict())
+    edges = [(n, v) for search in searches.values() for n, v in search.edges.items()]
+    return Fit(
+        task,
+        method,
+        model,
+        len(orders) + len(fit.values),
+        {
+            **settings.to_dict(),
+            "m": fit.m,
+            "initial": in_words(fit.initial),
+            **({"rank": rank} if rank > 1 else {}),
+            **offset_setting(structure),
+        },
+        [
+            *fit.warnings,
+            *step_bias(task.runs, at_orders, settings, fit),
+            *broken_law(model),
+            *(f"order {n} = {v:g} is on the edge of its interval; widen it" for n, v in edges),
+        ],
+        searches,
+        errors,
+    )
+
+
+def settled(task: Task) -> set[str]:
+    """Orders of which the lattice has one value, so that they are no estimates."""
+    parts = task.structure.parts().values() if task.structure.order_names else []
+    axes = [(task.lattice_of(part) or Lattice()).values(part) for part in parts]
+    return {n for values in axes for n, v in values.items() if len(v) == 1}
+
+
+def searched(
+    task: Task,
+    settings: Settings,
+    m: int | None,
+    progress: Told,
+    store: str | os.PathLike[str] | None,
+    executor: Executor | None,
+) -> dict[str, SearchResult]:
+    """Order searches of all parts of a structure, by name, in one store."""
+    jobs = {
+        name: make_job(task.runs, part, task.lattice_of(part), m=m, progress=progress, **asdict(settings))
+        for name, part in task.structure.parts().items()
+    }
+    with contextlib.ExitStack() as stack:
+        requests = [job.request(name) for name, job in jobs.items()]
+        kept = None if store is None else stack.enter_context(Store(store, requests))
+        announce(progress, list(jobs.values()), kept)
+        return {
+            name: run_job(job, store=kept, number=number, executor=executor)
+            for number, (name, job) in enumerate(jobs.items())
+        }
+
+
+def coupled_rank(task: Task, settings: Settings, m: int | None, search: SearchResult) -> int:
+    """Rank of the kept row whose coupled free run is the likeliest; the table ranks equations one by one.
+
+    Among orders that the equations one by one hardly tell apart, the run of the whole from the inputs alone decides:
+    by the sum of ln NR over outputs, the likelihood of white noise of unknown size.
+    """
+    best, rank = math.inf, 1
+    for row in search.table:
+        at_orders = task.structure.with_orders(row.orders)
+        try:
+            fit = estimate_coefficients(task.runs, at_orders, settings, m)
+            comparison = compare_means(Model(at_orders.with_coefficients(fit.values), m=fit.m), task.runs, m=fit.m)
+        except FtlmError:
+            # It has a score in the table, but no model.
+            continue
+        cost = sum(math.log(max(f.nr, 1e-300)) for f in comparison.output_error.values())
+        if cost < best:
+            best, rank = cost, row.rank
+    return rank
+
+
+def by_genetic_algorithm(task: Task, settings: Genetic, norm: str, m: int | None, threads: int, progress: Told) -> Fit:
+    """Orders and coefficients by a genetic algorithm: each equation alone, or all under their order law."""
+    structure = task.structure
+    parts = {"stage": structure} if structure.has_order_law else {o: structure.equation(o) for o in structure.outputs}
+    free = {name: (*part.order_names, *part.coefficient_names) for name, part in parts.items()}
+    names = [n for own in free.values() for n in own]
+    strange = [n for n in settings.bounds if n not in names]
+    if strange:
+        raise ModelError(f"bounds of {strange[0]!r}: there is no such number; free are {', '.join(names)}")
+    record = prepare(task.runs, structure, m, power_of_two=True)[0]
+    ends = {}
+    for name, part in parts.items():
+        own = replace(settings, bounds={n: b for n, b in settings.bounds.items() if n in free[name]})
+        records = prepare(task.runs, part, record.m, power_of_two=True)
+        ends[name] = genetic_search(
+            records, part, task.lattice_of(part), own, norm=norm, threads=threads, progress=progress
+        )
+    orders = {n: v for end in ends.values() for n, v in end.orders.items()}
+    coefficients = {n: v for end in ends.values() for n, v in end.coefficients.items()}
+    bounds = {n: b for end in ends.values() for n, b in end.bounds.items()}
+    seeds, identified = list(settings.seeds), structure.with_orders(orders).with_coefficients(coefficients)
+    model = solved(task, "genetic", identified, orders, record.m, seeds=str(seeds))
+    warnings = broken_law(model)
+    for name, (low, high) in bounds.items():
+        value = {**orders, **coefficients}[name]
+        if min(value - low, high - value) < 1e-3 * (high - low) and value not in (0.0, 2.0):
+            warnings.append(f"{name} = {value:.4g} is on its bound for the genetic algorithm; widen it")
+    for name, end in ends.items():
+        low, high = min(end.errors.values()), max(end.errors.values())
+        if high > SCATTERED * low:
+            warnings.append(
+                f"{name}: the seeds of the genetic algorithm end at errors from {low:.4g} to {high:.4g}; "
+                "it has not found the optimum of each"
+            )
+    used = {
+        "method": "genetic",
+        "norm": norm,
+        "m": record.m,
+        "initial": "rest",
+        "seeds": seeds,
+        "population": settings.population,
+        "bounds": {n: list(b) for n, b in bounds.items()},
+        "errors": {name: {str(seed): e for seed, e in end.errors.items()} for name, end in ends.items()},
+        "evaluations": {name: sum(end.evaluations.values()) for name, end in ends.items()},
+    }
+    return Fit(task, "genetic", model, len(orders) + len(coefficients), used, warnings)

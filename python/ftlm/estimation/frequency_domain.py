@@ -1,0 +1,874 @@
+"""Equations as frequency responses of free orders, coefficients and delays, with exact derivatives."""
+
+from __future__ import annotations
+
+import itertools
+import math
+from collections.abc import Callable, Mapping, Sequence
+from dataclasses import dataclass, replace
+from statistics import NormalDist
+from typing import Literal
+
+import numpy as np
+from numpy.typing import ArrayLike, NDArray
+
+from ftlm.data.frequency_data import FrequencyData, as_frequency_data
+from ftlm.errors import ConvergenceError, DataError, ModelError
+from ftlm.estimation.frequency_result import FrequencyIdentification
+from ftlm.estimation.levenberg_marquardt import Fitted, damped
+from ftlm.estimation.objective import covariance_of
+from ftlm.model.model import Estimate, Model
+from ftlm.progress import Course, Progress
+from ftlm.structure.equation import Equation, Term
+from ftlm.structure.order import MAX_EXCESS, MAX_ORDER, MIN_INPUT_ORDER, SEARCHED_ORDER, Order, Values
+from ftlm.structure.parser import equation
+from ftlm.structure.structure import Structure
+from ftlm.utils.files import LOG
+from ftlm.utils.resources import between, expected
+from ftlm.utils.statistics import ROUNDING, chi_squared_99, is_white
+from ftlm.utils.validation import Complex, Floats, as_floats, check_known
+
+#: Least of a highest order, and what an own order stays below it: closer, a term says what the left side says.
+LEAST_ORDER, GAP = 0.01, 0.005
+
+
+@dataclass(frozen=True)
+class Measured:
+    """One record in a unit of time of its own, its weights beside it."""
+
+    output: int
+    input: str
+    frequency: Floats
+    response: Complex
+    weight: Floats
+
+
+class ResponseProblem:
+    """A structure and records, in numbers that are near 1: time is counted in 1/`unit` of a second.
+
+    Numbers stand in the order of `names`: free orders, free coefficients, free delays.
+    """
+
+    def __init__(self, structure: Structure, records: Sequence[FrequencyData], weights: Sequence[Floats]) -> None:
+        self.structure = structure
+        self.orders = structure.order_names
+        self.coefficients = tuple(dict.fromkeys(structure.coefficient_names))
+        self.delays = tuple(item.signal for item in structure.free_inputs)
+        self.names = (*self.orders, *self.coefficients, *(item.name for item in structure.free_inputs))
+        every = np.concatenate([r.frequency for r in records])
+        self.unit = float(np.exp(np.mean(np.log(every))))
+        self.records = [
+            Measured(structure.outputs.index(r.output), r.input, r.frequency / self.unit, r.response, w)
+            for r, w in zip(records, weights, strict=True)
+        ]
+        self.known_delays = {name: value * self.unit for name, value in structure.delay.items()}
+        self._place = {name: k for k, name in enumerate(self.orders)}
+        at = len(self.orders)
+        self._coefficient = {name: at + k for k, name in enumerate(self.coefficients)}
+        self._delay = {name: at + len(self.coefficients) + k for k, name in enumerate(self.delays)}
+        #: Of each free coefficient, its term with its equation.
+        self.term_of = {t.coefficient: (e, t) for e in structure.equations for t in e.terms}
+
+    def order_at(self, order: Order, values: Floats) -> float:
+        """Value of an order."""
+        return order.constant + math.fsum(w * float(values[self._place[n]]) for n, w in order.weights)
+
+    def scaled(self, values: Floats) -> Floats:
+        """Numbers in seconds as numbers of this problem's unit of time."""
+        return self._turned(values, -1.0)
+
+    def in_seconds(self, values: Floats) -> Floats:
+        """Numbers of this problem as numbers in seconds."""
+        return self._turned(values, 1.0)
+
+    def _turned(self, values: Floats, way: float) -> Floats:
+        out = values.astype(np.float64).copy()
+        for name, at in self._coefficient.items():
+            item, term = self.term_of[name]
+            power = self.order_at(item.order, values) - self.order_at(term.order, values)
+            out[at] *= self.unit ** (way * power)
+        for at in self._delay.values():
+            out[at] *= self.unit**-way
+        return out
+
+    def slopes_in_seconds(self, values: Floats, slopes: Floats) -> Floats:
+        """Columns of slopes by this problem's numbers as slopes by numbers in seconds."""
+        out = slopes.copy()
+        log = np.log(self.unit)
+        for name, at in self._coefficient.items():
+            item, term = self.term_of[name]
+            power = self.order_at(item.order, values) - self.order_at(term.order, values)
+            # c' = c unit^-(alpha - order): by c itself, and by each order at a fixed c.
+            for order, sign in ((item.order, -1.0), (term.order, 1.0)):
+                for n, w in order.weights:
+                    out[:, self._place[n]] += sign * w * log * float(values[at]) * slopes[:, at]
+            out[:, at] *= self.unit**-power
+        for at in self._delay.values():
+            out[:, at] *= self.unit
+        return out
+
+    def coefficient(self, term: Term, item: Equation, values: Floats) -> float:
+        """Value of a term's coefficient in this unit of time."""
+        if isinstance(term.coefficient, str):
+            return term.factor * float(values[self._coefficient[term.coefficient]])
+        power = self.order_at(item.order, values) - self.order_at(term.order, values)
+        return float(term.fixed or 0.0) * math.pow(self.unit, -power)
+
+    def shift(self, signal: str, values: Floats) -> float:
+        """Delay of an input in this unit of time."""
+        at = self._delay.get(signal)
+        return self.known_delays.get(signal, 0.0) if at is None else float(values[at])
+
+    def responses(self, values: Floats, *, slopes: bool = True) -> list[tuple[Complex, Complex | None]]:
+        """Response of the model at every record, and its slopes by all numbers (a column each)."""
+        return [self._response(record, values, slopes) for record in self.records]
+
+    def _response(self, record: Measured, values: Floats, slopes: bool) -> tuple[Complex, Complex | None]:
+        s = 1j * record.frequency
+        log = np.log(s)
+        items, names = self.structure.equations, self.structure.outputs
+        matrix = np.zeros((s.size, len(items), len(items)), dtype=np.complex128)
+        right = np.zeros((s.size, len(items)), dtype=np.complex128)
+        powers: dict[tuple[int, int], Complex] = {}
+        for i, item in enumerate(items):
+            powers[i, -1] = np.exp(self.order_at(item.order, values) * log)
+            matrix[:, i, i] += powers[i, -1]
+            for k, term in enumerate(item.terms):
+                if term.signal not in names and term.signal != record.input:
+                    continue
+                powers[i, k] = np.exp(self.order_at(term.order, values) * log)
+                part = self.coefficient(term, item, values) * powers[i, k]
+                if term.signal in names:
+                    matrix[:, i, names.index(term.signal)] -= part
+                else:
+                    right[:, i] += part
+        late = np.exp(-s * self.shift(record.input, values))
+        try:
+            whole = np.linalg.solve(matrix, (right * late[:, None])[..., None])[..., 0]
+            unit = np.zeros((s.size, len(items), 1), dtype=np.complex128)
+            unit[:, record.output] = 1.0
+            ahead = np.linalg.solve(matrix.transpose(0, 2, 1), unit)[..., 0] if slopes else None
+        except np.linalg.LinAlgError:
+            nothing = np.full(s.size, np.nan, dtype=np.complex128)
+            return nothing, np.full((s.size, len(self.names)), np.nan, dtype=np.complex128) if slopes else None
+        response = np.asarray(whole[:, record.output], dtype=np.complex128)
+        if ahead is None:
+            return response, None
+        out = np.zeros((s.size, len(self.names)), dtype=np.complex128)
+        for i, item in enumerate(items):
+            for n, w in item.order.weights:
+                out[:, self._place[n]] -= w * log * ahead[:, i] * powers[i, -1] * whole[:, i]
+            for k, term in enumerate(item.terms):
+                if (i, k) not in powers:
+                    continue
+                signal = whole[:, names.index(term.signal)] if term.signal in names else late
+                size = self.coefficient(term, item, values)
+                moved = ahead[:, i] * powers[i, k] * signal
+                for n, w in term.order.weights:
+                    out[:, self._place[n]] += w * size * log * moved
+                if not isinstance(term.coefficient, str):
+                    # A known coefficient is one in seconds: in this unit it follows the orders.
+                    for its, sign in ((item.order, -1.0), (term.order, 1.0)):
+                        for n, w in its.weights:
+                            out[:, self._place[n]] += sign * w * np.log(self.unit) * size * moved
+                else:
+                    out[:, self._coefficient[term.coefficient]] += term.factor * moved
+        if record.input in self._delay:
+            out[:, self._delay[record.input]] = -s * response
+        return response, out
+
+    def residuals(self, values: Floats, *, slopes: bool = True) -> tuple[Floats, Floats]:
+        """Weighted residuals, real parts of all records and then imaginary parts, and their slopes."""
+        left, steep = [], []
+        with np.errstate(all="ignore"):
+            for record, (response, moved) in zip(self.records, self.responses(values, slopes=slopes), strict=True):
+                left.append((response - record.response) * record.weight)
+                if moved is not None:
+                    steep.append(moved * record.weight[:, None])
+        flat = np.concatenate(left)
+        jacobian = np.concatenate(steep) if steep else np.zeros((flat.size, 0), dtype=np.complex128)
+        return np.concatenate([flat.real, flat.imag]), np.concatenate([jacobian.real, jacobian.imag])
+
+    def constraints(self) -> tuple[Floats, Floats, list[str]]:
+        """Rows and limits of what orders and delays keep to, rows @ values <= limits, and what each says."""
+        rows: list[Floats] = []
+        limits: list[float] = []
+        words: list[str] = []
+
+        def keep(order: Order, most: float, text: str, sign: float = 1.0) -> None:
+            row = np.zeros(len(self.names))
+            for n, w in order.weights:
+                row[self._place[n]] += sign * w
+            if np.any(row):
+                rows.append(row)
+                limits.append(most - sign * order.constant)
+                words.append(text)
+
+        for item in self.structure.equations:
+            keep(item.order, MAX_ORDER, f"the highest order of {item.output} is at most 10")
+            keep(item.order, -LEAST_ORDER, f"the highest order of {item.output} is above 0", -1.0)
+            for term in item.terms:
+                own = term.signal == item.output
+                name = str(term.order)
+                low, above = (0.0, -GAP) if own else (MIN_INPUT_ORDER, MAX_EXCESS - GAP)
+                keep(term.order, -low, f"order {name} is from {low:g} on", -1.0)
+                both = dict(term.order.weights)
+                for n, w in item.order.weights:
+                    both[n] = both.get(n, 0.0) - w
+                over = tuple(sorted((n, w) for n, w in both.items() if w))
+                gap = Order(term.order.constant - item.order.constant, over)
+                keep(gap, above, f"order {name} stays below {item.order} of {item.output}{'' if own else ' + 1'}")
+        for name, values in self.structure.order_values.items():
+            if name in self._place:
+                keep(Order(0.0, ((name, 1.0),)), values[-1], f"{name} is at most {values[-1]:g}")
+                keep(Order(0.0, ((name, 1.0),)), -values[0], f"{name} is from {values[0]:g} on", -1.0)
+        for free in self.structure.free_inputs:
+            for sign, end in ((1.0, free.bounds[1]), (-1.0, free.bounds[0])):
+                row = np.zeros(len(self.names))
+                row[self._delay[free.signal]] = sign
+                rows.append(row)
+                limits.append(sign * end * self.unit)
+                words.append(f"{free.words} is {'at most' if sign > 0 else 'at least'} {end:g} s")
+        table = np.array(rows) if rows else np.zeros((0, len(self.names)))
+        return table, np.array(limits), words
+
+    def searched(self) -> dict[str, tuple[float, ...] | tuple[float, float]]:
+        """Values of each free order on its lattice, or the interval in which a search looks of itself."""
+        out: dict[str, tuple[float, ...] | tuple[float, float]] = {}
+        for name in self.orders:
+            if name in self.structure.order_values:
+                out[name] = tuple(self.structure.order_values[name])
+                continue
+            own = [e.order for e in self.structure.equations if name in e.order.names]
+            out[name] = (0.1, self._highest()) if own else (0.0, self._highest())
+        return out
+
+    def _highest(self) -> float:
+        """Highest order that a search tries of itself."""
+        orders = [o for e in self.structure.equations for o in (e.order, *(t.order for t in e.terms))]
+        return max([SEARCHED_ORDER, *(o.constant for o in orders if not o.names)])
+
+
+#: Points of orders and delays that are tried, frequencies that are looked at, reweightings, and starts that are kept.
+MOST_POINTS, MOST_FREQUENCIES, REWEIGHTED, KEPT = 3000, 160, 4, 8
+#: Points whose true cost is computed, corners of one own term that are tried besides, and at how many points.
+JUDGED, CORNERS, CORNERED = 60, 14, 120
+
+
+def starts(problem: ResponseProblem) -> list[Floats]:
+    """Numbers to start from, the most promising first; all within the inequalities."""
+    points = _points(problem)
+    found = _solved(problem, points) if problem.coefficients else list(points)
+    judged = []
+    for values in found:
+        left, _ = problem.residuals(values, slopes=False)
+        cost = float(left @ left)
+        if np.isfinite(cost):
+            judged.append((cost, values))
+    judged.sort(key=lambda pair: pair[0])
+    kept: list[Floats] = []
+    first, last = len(problem.orders), len(problem.orders) + len(problem.coefficients)
+    free = [k for k in range(len(problem.names)) if not first <= k < last]
+    for _, values in judged:
+        if all(np.max(np.abs(values[free] - other[free]), initial=0.0) > 0.1 for other in kept) or not kept:
+            kept.append(values)
+        if len(kept) == KEPT:
+            break
+    return kept
+
+
+def _points(problem: ResponseProblem) -> Floats:
+    """Orders and delays that are tried, a row each, coefficients 0."""
+    axes = list(problem.searched().values())
+    given = [n in problem.structure.order_values for n in problem.orders]
+    delays = [(item.bounds[0] * problem.unit, item.bounds[1] * problem.unit) for item in problem.structure.free_inputs]
+    # A delay that is off by a third of a period at the highest frequency still leads downhill.
+    fastest = max(float(r.frequency.max()) for r in problem.records)
+    fine = [int(np.clip(np.ceil((high - low) * fastest / 2.0) + 1, 2, 60)) for low, high in delays]
+    room = max(MOST_POINTS // int(np.prod(fine, initial=1)), 60)
+    count = len(axes)
+    lattice = int(np.prod([len(a) if g else 1 for a, g in zip(axes, given, strict=True)], initial=1))
+    free = count - sum(given)
+    each = int(np.floor((room / max(lattice, 1)) ** (1.0 / free))) if free and lattice <= room else 0
+    if (free and each < 4) or (not free and lattice > room):
+        # Too many axes for a lattice: points that fill the box evenly, the same every time.
+        spread = _halton(room, count)
+        columns = [
+            np.asarray(a)[(spread[:, k] * len(a)).astype(int)] if g else a[0] + spread[:, k] * (a[1] - a[0])
+            for k, (a, g) in enumerate(zip(axes, given, strict=True))
+        ]
+        orders = np.stack(columns, axis=1)
+    else:
+        sides = [a if g else np.linspace(a[0], a[1], min(each, 31)) for a, g in zip(axes, given, strict=True)]
+        orders = _product(sides)
+    late = _product([np.linspace(a, b, n) for (a, b), n in zip(delays, fine, strict=True)])
+    table = np.zeros((len(orders) * len(late), len(problem.names)))
+    table[:, :count] = np.repeat(orders, len(late), axis=0)
+    table[:, len(problem.names) - len(delays) :] = np.tile(late, (len(orders), 1))
+    rows, limits, _ = problem.constraints()
+    inside = np.all(table @ rows.T <= limits + 1e-12, axis=1)
+    kept: Floats = table[inside]
+    return kept
+
+
+def _product(sides: Sequence[Sequence[float] | Floats]) -> Floats:
+    """Every point of a lattice, a row each; a lattice without axes has one."""
+    rows = list(itertools.product(*sides))
+    return np.array(rows, dtype=np.float64).reshape(len(rows), len(sides))
+
+
+def _halton(count: int, width: int) -> Floats:
+    """Points that fill a unit box evenly, by radical inverses in the first primes."""
+    primes = [p for p in range(2, 300) if all(p % q for q in range(2, int(p**0.5) + 1))][:width]
+    out = np.zeros((count, width))
+    for k, base in enumerate(primes):
+        index, share = np.arange(1, count + 1), 1.0
+        while np.any(index):
+            share /= base
+            out[:, k] += share * (index % base)
+            index = index // base
+    return out
+
+
+def _solved(problem: ResponseProblem, points: Floats) -> list[Floats]:
+    """Coefficients at every point, one equation after the other; the most promising points only."""
+    slow = points[np.unique(np.linspace(0, len(points) - 1, min(CORNERED, len(points))).astype(int))]
+    points, corners = np.concatenate([points, np.repeat(slow, CORNERS, axis=0)]), _corners(problem, len(points), slow)
+    table = points.copy()
+    total = np.zeros(len(points))
+    for i, item in enumerate(problem.structure.equations):
+        names = [n for n in item.coefficient_names if n in problem.coefficients]
+        records = [r for r in problem.records if r.output == i]
+        if not records:
+            continue
+        answers, cost = _equation(problem, i, names, [_thinned_levy(r) for r in records], points, corners)
+        for k, name in enumerate(names):
+            table[:, problem.names.index(name)] = answers[:, k]
+        total += np.where(np.isfinite(cost), cost, np.inf)
+    best = np.argsort(total, kind="stable")[:JUDGED]
+    return [table[k] for k in best if np.isfinite(total[k])]
+
+
+def _corners(problem: ResponseProblem, first: int, slow: Floats) -> Floats:
+    """Where an own term turns the response over, for points after the first; NaN where nothing is said.
+
+    Where noise hides a small arc, reweighted least squares are biased and their own terms far too small or too large.
+    Given the slowest of them, what is left is hardly so.
+    """
+    every = np.concatenate([r.frequency for r in problem.records])
+    tried = np.geomspace(every.min(), every.max(), CORNERS)
+    return np.concatenate([np.full(first, np.nan), np.tile(tried, len(slow))])
+
+
+def _thinned_levy(record: Measured) -> Measured:
+    """A record of no more frequencies than a start needs, spread over its order."""
+    order = np.argsort(record.frequency, kind="stable")
+    if order.size > MOST_FREQUENCIES:
+        order = order[np.linspace(0, order.size - 1, MOST_FREQUENCIES).astype(int)]
+    return Measured(record.output, record.input, record.frequency[order], record.response[order], record.weight[order])
+
+
+def _equation(
+    problem: ResponseProblem,
+    place: int,
+    names: Sequence[str],
+    records: Sequence[Measured],
+    points: Floats,
+    corners: Floats,
+) -> tuple[Floats, Floats]:
+    """Coefficients of one equation at every point, and the cost that they leave."""
+    item = problem.structure.equations[place]
+    alpha = _orders(problem, item.order.constant, item.order.weights, points)
+    columns: dict[str, list[Complex]] = {n: [] for n in names}
+    own: dict[str, list[Complex]] = {}
+    wanted, below = [], []
+    for record in records:
+        log = np.log(1j * record.frequency)
+        late = np.exp(-1j * record.frequency * _shifts(problem, record.input, points)[:, None])
+        known = np.exp(alpha[:, None] * log)
+        below.append(known)
+        goal = known * record.response
+        for term in item.terms:
+            signal = _signal(problem, record, term.signal, late)
+            power = np.exp(_orders(problem, term.order.constant, term.order.weights, points)[:, None] * log)
+            if isinstance(term.coefficient, str):
+                columns[term.coefficient].append(term.factor * power * signal)
+                if term.signal == item.output:
+                    own.setdefault(term.coefficient, []).append(term.factor * power)
+            else:
+                gap = alpha - _orders(problem, term.order.constant, term.order.weights, points)
+                size = float(term.fixed or 0.0) * problem.unit ** -gap[:, None]
+                goal = goal - size * power * signal
+                if term.signal == item.output:
+                    below[-1] = below[-1] - size * power
+        wanted.append(goal)
+    weight = np.concatenate([r.weight for r in records])
+    goal, known = np.concatenate(wanted, axis=1), np.concatenate(below, axis=1)
+    left = np.stack([np.concatenate(columns[n], axis=1) for n in names], axis=2) if names else None
+    ours = {n: np.concatenate(parts, axis=1) for n, parts in own.items()}
+    slowest = _slowest(problem, item, points)
+    bottom = 1.0 + np.abs(known) + 0j
+    answers = np.zeros((len(points), len(names)))
+    cost = np.full(len(points), np.inf)
+    with np.errstate(all="ignore"):
+        for _ in range(REWEIGHTED):
+            scaled = weight / np.abs(bottom)
+            if left is not None:
+                answers = _least_squares(left * scaled[..., None], goal * scaled)
+                if slowest is not None:
+                    k, power = names.index(slowest[0]), slowest[1]
+                    given = np.isfinite(corners)
+                    held = -(corners[given] ** power[given])
+                    rest = goal[given] - left[given][:, :, k] * held[:, None]
+                    others = np.delete(left[given], k, axis=2)
+                    solved = _least_squares(others * scaled[given][..., None], rest * scaled[given])
+                    answers[given] = np.insert(solved, k, held, axis=1)
+            bottom = known - sum((answers[:, [names.index(n)]] * part for n, part in ours.items()), 0.0 * known)
+            missed = goal if left is None else goal - np.einsum("bnp,bp->bn", left, answers)
+            cost = np.sum(np.abs(missed / bottom * weight) ** 2, axis=1)
+    return answers, cost
+
+
+def _slowest(problem: ResponseProblem, item: Equation, points: Floats) -> tuple[str, Floats] | None:
+    """The free own term of an equation that acts at the lowest frequencies, and by how much its order is lower."""
+    own = [t for t in item.terms if t.signal == item.output and isinstance(t.coefficient, str) and t.factor == 1]
+    if not own:
+        return None
+    alpha = _orders(problem, item.order.constant, item.order.weights, points)
+    gaps = [alpha - _orders(problem, t.order.constant, t.order.weights, points) for t in own]
+    at = int(np.argmax([float(np.mean(g)) for g in gaps]))
+    return str(own[at].coefficient), gaps[at]
+
+
+def _least_squares(left: Complex, right: Complex) -> Floats:
+    """Real answers to complex equations, for every point; directions that nothing tells are left at 0."""
+    lengths = np.sqrt(np.sum(np.abs(left) ** 2, axis=1))
+    unit = np.where((lengths > 0) & np.isfinite(lengths), lengths, 1.0)
+    scaled = np.nan_to_num(left / unit[:, None, :])
+    normal = np.einsum("bnp,bnq->bpq", scaled.conj(), scaled).real
+    moment = np.einsum("bnp,bn->bp", scaled.conj(), np.nan_to_num(right)).real
+    inverse = np.linalg.pinv(normal, rcond=1e-13, hermitian=True)
+    answers: Floats = np.einsum("bpq,bq->bp", inverse, moment) / unit
+    return answers
+
+
+def _orders(problem: ResponseProblem, constant: float, weights: Sequence[tuple[str, float]], points: Floats) -> Floats:
+    total = np.full(len(points), constant)
+    for name, weight in weights:
+        total = total + weight * points[:, problem.orders.index(name)]
+    return total
+
+
+def _shifts(problem: ResponseProblem, signal: str, points: Floats) -> Floats:
+    if signal in problem.delays:
+        return np.asarray(points[:, len(problem.orders) + len(problem.coefficients) + problem.delays.index(signal)])
+    return np.full(len(points), problem.known_delays.get(signal, 0.0))
+
+
+def _signal(problem: ResponseProblem, record: Measured, name: str, late: Complex) -> Complex | float:
+    """What a term reads: a measured response, the input itself, or nothing."""
+    outputs = problem.structure.outputs
+    if name not in outputs:
+        return late if name == record.input else 0.0
+    if outputs.index(name) == record.output:
+        return record.response
+    other = next((r for r in problem.records if r.output == outputs.index(name) and r.input == record.input), None)
+    if other is None:
+        return 0.0
+    # Between measured frequencies, where there are other ones; a start needs no more.
+    order = np.argsort(other.frequency, kind="stable")
+    at, x = np.log(record.frequency), np.log(other.frequency[order])
+    values = other.response[order]
+    return np.interp(at, x, values.real) + 1j * np.interp(at, x, values.imag)
+
+
+Weights = Literal["auto", "relative", "uniform", "deviation"]
+#: Two fits whose sums of squares differ by no more than this share ended at one optimum.
+SAME = 1e-6
+#: Residuals below this share of the response leave nothing to gain.
+FLOOR = 1e-13
+#: Frequencies of a record on which starts race.
+RACING = 800
+#: Shares of the whole that are done once starts are found, and once they have raced.
+STARTED, RACED = 0.25, 0.85
+#: Fits took between these multiples of what their numbers and frequencies let expect.
+CAME_TO = (0.4, 4.0)
+#: Lags at which residuals are looked at, from one frequency to the next.
+LAGS = 8
+
+
+def identify_frequency(
+    data: FrequencyData | Sequence[FrequencyData],
+    structure: Structure | str,
+    *,
+    weights: Weights | ArrayLike = "auto",
+    orders: Mapping[str, Values] | None = None,
+    fixed: Mapping[str, float] | None = None,
+    delay: Mapping[str, float | tuple[float, float]] | None = None,
+    start: Mapping[str, float] | None = None,
+    progress: Callable[[int, int], None] | None = None,
+) -> FrequencyIdentification:
+    """Identify orders, coefficients and delays of equations from a measured frequency response or impedance.
+
+    The same equations as of runs over time: ``"D^alpha y = a0 y + b0 u"`` has the response
+    b0 / ((jω)^α - a0), and ``"D^alpha U = a U + r D^alpha I + b I"`` is a resistor before a depressed arc. Starts come
+    by themselves, from linear least squares over the lattice of orders; then all numbers move together, by damped least
+    squares of the complex residuals with exact derivatives.
+
+    Parameters
+    ----------
+    data
+        One record, or several: of other outputs and inputs, or of other bands.
+    structure
+        What to identify; see :func:`ftlm.equation`. Several outputs follow together from the inputs.
+    weights
+        ``"deviation"``: residuals over the records' standard deviations. ``"relative"``: over the size of the response
+        at each frequency, as noise in proportion to the size asks for. ``"uniform"``: as they are. ``"auto"``
+        (default): deviation where all records have one, else relative. An array, of one record: a standard deviation
+        of real and imaginary part for each frequency.
+    orders, fixed, delay
+        See :func:`ftlm.equation`: lattices of orders bound them, too; a delay (least, largest) is estimated.
+    start
+        Values of free numbers by name to start from besides; what it leaves out is 1, 0 of a delay.
+    progress
+        Called with parts done and parts in all.
+
+    Returns
+    -------
+    FrequencyIdentification
+        Prints well; ``.model`` simulates over time, draws and saves.
+
+    Raises
+    ------
+    DataError
+        Data that are none, of signals that the equations do not have, too few for the free numbers, or of size 0 under
+        relative weights.
+    ModelError
+        A structure with nothing free, friction, limits of inputs, an offset, a sensor filter or a law of coefficients;
+        weights or names that are not known.
+    ConvergenceError
+        No start with a finite response.
+    """
+    wanted = _structure(structure, orders, fixed, delay)
+    records = _fitting(as_frequency_data(data), wanted)
+    kind, weight = _weights(records, weights)
+    problem = ResponseProblem(wanted, records, weight)
+    count, numbers = 2 * sum(r.frequency.size for r in records), len(problem.names)
+    if count <= numbers:
+        raise DataError(
+            f"{count // 2} frequencies give {count} numbers, and {numbers} are free ({', '.join(problem.names)}); "
+            "measure more frequencies, or fix numbers"
+        )
+    if isinstance(progress, Progress):
+        progress.expect("the fit", *between(expected(0.007 * numbers**2 + 2e-6 * numbers * count, 1), CAME_TO))
+    course = Course(progress)
+    rows, limits, words = problem.constraints()
+    LOG.info("identifying %s from %s", ", ".join(problem.names), ", ".join(r.name for r in records))
+    total = sum(float(np.sum(np.abs(r.response * w) ** 2)) for r, w in zip(records, weight, strict=True))
+    # Starts race on no more frequencies than tell them apart; the best goes on with all.
+    few, light = zip(*(_thinned(r, w) for r, w in zip(records, weight, strict=True)), strict=True)
+    racing = problem if count <= 2 * RACING else ResponseProblem(wanted, few, light)
+    begun = [*_begun(racing, start, *racing.constraints()[:2]), *starts(racing)]
+    course.at(STARTED)
+    fits = []
+    for values in begun:
+        fits.append(_fit(racing, values, *racing.constraints()[:2], FLOOR**2 * total))
+        course.at(STARTED + (RACED - STARTED) * len(fits) / len(begun))
+    fits = [f for f in fits if math.isfinite(f.cost)]
+    if not fits:
+        raise ConvergenceError(
+            "no start has a finite response: the lattice of orders is empty or singular; widen orders=, or give start="
+        )
+    first = min(fits, key=lambda f: f.cost)
+    reached = sum(f.cost <= first.cost * (1 + SAME) + 1e4 * FLOOR**2 * total for f in fits)
+    # A last race from where the best ended, so that what a wall had cut goes on.
+    best = _fit(problem, problem.scaled(racing.in_seconds(first.values)), rows, limits, FLOOR**2 * total)
+    if racing is problem and first.cost < best.cost:
+        best = first
+    course.at(1.0)
+    held = [words[k] for k in best.held]
+    result = _result(problem, records, best, kind, (reached, len(fits)), held, exact=best.cost <= ROUNDING**2 * total)
+    LOG.info("identified: %s", result.verdict())
+    for warning in result.warnings:
+        LOG.warning("%s", warning)
+    return result
+
+
+def _structure(
+    structure: Structure | str,
+    orders: Mapping[str, Values] | None,
+    fixed: Mapping[str, float] | None,
+    delay: Mapping[str, float | tuple[float, float]] | None,
+) -> Structure:
+    """What is to be identified, all of its outputs together; refuses what a frequency response does not know."""
+    wanted = equation(structure) if isinstance(structure, str) else structure
+    if not isinstance(wanted, Structure):
+        raise ModelError(f"structure is {type(structure).__name__}; give an equation: 'D^alpha y = a0 y + b0 u'")
+    if fixed:
+        check_known("fixed coefficient", fixed, wanted.coefficient_names)
+    wanted = wanted.with_delays(delay or {}).with_orders(orders or {}).with_coefficients(fixed or {})
+    lacking = "which a frequency response does not know"
+    if wanted.has_friction:
+        raise ModelError(f"the equations have friction, {lacking}; identify runs over time, or leave it out")
+    if wanted.limits:
+        raise ModelError(f"{wanted.limits[0].signal} saturates or has a dead zone, {lacking}; identify runs over time")
+    if wanted.offset != "none":
+        raise ModelError(f"the equations have an offset, {lacking}; leave '+ c' out, or offset=")
+    if wanted.sensor_filter is not None:
+        raise ModelError("the structure has a sensor filter; divide the data by its response, and leave it out")
+    if wanted.coefficient_law:
+        raise ModelError("the structure has a law of its coefficients, which this fit does not keep; leave laws= out")
+    if not (wanted.order_names or wanted.coefficient_names or wanted.free_inputs):
+        raise ModelError("nothing is free: every order, coefficient and delay is a number; name what is unknown")
+    return replace(wanted, coupling="simulated", initial="auto")
+
+
+def _fitting(records: Sequence[FrequencyData], structure: Structure) -> list[FrequencyData]:
+    """The records with the names of what they are of; refuses those of other signals, and equations without any."""
+    outputs = structure.outputs
+    inputs = tuple(s for s in structure.signals if s not in outputs)
+    if not inputs:
+        raise ModelError(f"the equations of {', '.join(outputs)} have no input; add what drives them, as in '+ b0 u'")
+    found = []
+    for record in records:
+        own = {"output": record.output, "input": record.input}
+        for side, known in (("output", outputs), ("input", inputs)):
+            if not own[side]:
+                if len(known) > 1:
+                    raise DataError(
+                        f"{record.name} does not say its {side}, and the equations have {', '.join(known)}; say "
+                        f"{side}= when loading it"
+                    )
+                own[side] = known[0]
+            elif own[side] not in known:
+                raise DataError(
+                    f"{record.name} has the {side} {own[side]!r}, which is no {side} of the equations; these have "
+                    f"{', '.join(known)}: write the equation in the names of the data, or say {side}= when loading"
+                )
+        found.append(replace(record, output=own["output"], input=own["input"]))
+    for output in outputs:
+        if not any(r.output == output for r in found):
+            raise DataError(f"no record is of {output}, which has an equation; give one, or leave the equation out")
+    for name in inputs:
+        if not any(r.input == name for r in found):
+            raise DataError(f"no record is from {name}, an input of the equations; give one, or leave it out")
+    return found
+
+
+def _weights(records: Sequence[FrequencyData], weights: object) -> tuple[str, list[Floats]]:
+    """What residuals are multiplied by."""
+    if not isinstance(weights, str):
+        if len(records) > 1:
+            raise ModelError("weights= as an array are of one record; give each record its deviation instead")
+        (record,) = records
+        return "deviation", [1.0 / _stated(record, weights)]
+    if weights not in ("auto", "relative", "uniform", "deviation"):
+        raise ModelError(
+            f"weights={weights!r} is not known; use 'auto', 'relative', 'uniform', 'deviation' or standard deviations"
+        )
+    known = [r.deviation for r in records]
+    if weights == "deviation" or (weights == "auto" and all(d is not None for d in known)):
+        without = [r.name for r, d in zip(records, known, strict=True) if d is None]
+        if without:
+            raise DataError(f"{without[0]} states no standard deviation; use weights='relative' or give deviation=")
+        return "deviation", [1.0 / d for d in known if d is not None]
+    if weights == "uniform":
+        return "uniform", [np.ones(r.frequency.size) for r in records]
+    for record in records:
+        size = np.abs(record.response)
+        if not np.all(size > 0):
+            at = int(np.argmin(size))
+            raise DataError(
+                f"{record.name}: the response is 0 at row {at}, {int(np.sum(size == 0))} in all, and has no relative "
+                "weight; leave such rows out, or use weights='uniform'"
+            )
+    return "relative", [1.0 / np.abs(r.response) for r in records]
+
+
+def _stated(record: FrequencyData, weights: object) -> Floats:
+    """Standard deviations that stand in the place of a record's own."""
+    given = as_floats("weights", weights)
+    if given.shape != record.frequency.shape:
+        raise DataError(f"weights has shape {given.shape}, the data {record.frequency.shape}; give one deviation each")
+    return np.asarray(replace(record, deviation=given).deviation)
+
+
+def _thinned(record: FrequencyData, weight: Floats) -> tuple[FrequencyData, Floats]:
+    """A record of no more frequencies than a race needs, spread evenly over its own, with their weights."""
+    if record.frequency.size <= RACING:
+        return record, weight
+    order = np.argsort(record.frequency, kind="stable")
+    kept = order[np.linspace(0, order.size - 1, RACING).astype(int)]
+    return replace(record, frequency=record.frequency[kept], response=record.response[kept], deviation=None), weight[
+        kept
+    ]
+
+
+def _begun(problem: ResponseProblem, start: Mapping[str, float] | None, rows: Floats, limits: Floats) -> list[Floats]:
+    """The start that a person gives."""
+    if start is None:
+        return []
+    if not isinstance(start, Mapping):
+        raise ModelError(f"start is {type(start).__name__}; give values by name, such as {{'alpha': 0.8}}")
+    check_known("start", start, problem.names)
+    free = len(problem.orders) + len(problem.coefficients)
+    values = np.array([float(start.get(n, 1.0 if k < free else 0.0)) for k, n in enumerate(problem.names)])
+    begun = problem.scaled(values)
+    if not (np.all(np.isfinite(values)) and np.all(rows @ begun <= limits + 1e-9)):
+        raise ModelError("start= is out of the bounds of orders or delays, or not finite; choose values within them")
+    return [begun]
+
+
+def _fit(problem: ResponseProblem, values: Floats, rows: Floats, limits: Floats, floor: float) -> Fitted:
+    def cost(numbers: Floats) -> float:
+        left, _ = problem.residuals(numbers, slopes=False)
+        return float(left @ left)
+
+    if not math.isfinite(cost(values)):
+        return Fitted(values, math.inf, False, 1, ())
+    return damped(problem.residuals, cost, values, rows, limits, floor=floor)
+
+
+def _result(
+    problem: ResponseProblem,
+    records: list[FrequencyData],
+    best: Fitted,
+    kind: str,
+    reached: tuple[int, int],
+    held: list[str],
+    *,
+    exact: bool,
+) -> FrequencyIdentification:
+    left, slopes = problem.residuals(best.values)
+    steep = problem.slopes_in_seconds(best.values, slopes)
+    values = problem.in_seconds(best.values)
+    rising = _rising(records)
+    left, steep = left[rising], steep[rising]
+    series = _series(records, left)
+    free = left.size - values.size
+    chi = best.cost / free
+    too_large = kind == "deviation" and best.cost > chi_squared_99(free)
+    warnings: list[str] = []
+    if kind == "deviation" and not too_large:
+        covariance = covariance_of(steep.T, [np.zeros(e.size) for e in series], float(free))
+    else:
+        covariance = covariance_of(steep.T, series, best.cost)
+    errors = np.sqrt(np.maximum(np.diag(covariance), 0.0))
+    white = exact or all(is_white(e, min(LAGS, max(e.size // 4, 1))) for e in series)
+    factor = float(_student(free)) if kind != "deviation" or too_large else NormalDist().inv_cdf(0.975)
+    names = problem.names
+    standard = dict(zip(names, errors.tolist(), strict=True))
+    if too_large:
+        warnings.append(
+            f"residuals are {math.sqrt(chi):.3g} times the standard deviations that the data state (99 %): the model "
+            "leaves something out, or they are too small; intervals are widened to what is left over"
+        )
+    if not white:
+        warnings.append(
+            "residuals are not white: from one frequency to the next they follow each other, so the model leaves "
+            "something out"
+        )
+    if not best.converged:
+        warnings.append("the fit ended before it stood still")
+    warnings += [f"an order or a delay is on its bound: {w}" for w in held]
+    warnings += _untold(problem, values, standard)
+    named = dict(zip(names, values.tolist(), strict=True))
+    model = _model(problem, records, named, values, covariance, standard, warnings)
+    intervals = {n: (named[n] - factor * e, named[n] + factor * e) for n, e in standard.items()}
+    return FrequencyIdentification(
+        model,
+        tuple(records),
+        kind,
+        named,
+        standard,
+        intervals,
+        names,
+        covariance,
+        chi if kind == "deviation" else None,
+        best.converged,
+        reached,
+        white,
+        tuple(warnings),
+    )
+
+
+def _rising(records: Sequence[FrequencyData]) -> NDArray[np.intp]:
+    """Places of residuals with the frequencies of each record in their order."""
+    places, at = [], 0
+    for record in records:
+        places.append(at + np.argsort(record.frequency, kind="stable"))
+        at += record.frequency.size
+    every = np.concatenate(places)
+    return np.concatenate([every, at + every])
+
+
+def _series(records: Sequence[FrequencyData], left: Floats) -> list[Floats]:
+    """Real and imaginary parts of every record's residuals, one after the other as they stand in `left`."""
+    ends = np.cumsum([r.frequency.size for r in records])
+    half = left.size // 2
+    return [*np.split(left[:half], ends[:-1]), *np.split(left[half:], ends[:-1])]
+
+
+def _untold(problem: ResponseProblem, values: Floats, standard: Mapping[str, float]) -> list[str]:
+    """Numbers that the data do not tell, or hardly."""
+    unseen = [n for n, e in standard.items() if not math.isfinite(e)]
+    out = []
+    if unseen:
+        out.append(f"moved together they change nothing: {', '.join(unseen)}; leave a term out, or fix one of them")
+    for name, value in zip(problem.names, values.tolist(), strict=True):
+        error = standard[name]
+        vague = error > 0.25 if name in problem.orders else error > 0.5 * abs(value)
+        if math.isfinite(error) and vague:
+            out.append(f"{name} = {value:.4g} ± {error:.2g} cannot be told from other values; fix it, or leave it out")
+    return out
+
+
+def _model(
+    problem: ResponseProblem,
+    records: Sequence[FrequencyData],
+    named: Mapping[str, float],
+    values: Floats,
+    covariance: Floats,
+    standard: Mapping[str, float],
+    warnings: Sequence[str],
+) -> Model:
+    """The model with what its file keeps of the identification."""
+    orders = {n: round(named[n], 9) for n in problem.orders}
+    late = {free.signal: named[free.name] for free in problem.structure.free_inputs}
+    found = problem.structure.with_delays(late).with_orders(orders)
+    found = found.with_coefficients({n: named[n] for n in problem.coefficients})
+    spread = None
+    if np.all(np.isfinite(covariance)):
+        rows = []
+        for item in problem.structure.equations:
+            for order, term in [(item.order, None), *((t.order, t) for t in item.terms)]:
+                row = np.zeros(values.size)
+                for n, w in order.weights:
+                    row[problem.names.index(n)] = w
+                rows.append(row)
+                if term is not None:
+                    row = np.zeros(values.size)
+                    if isinstance(term.coefficient, str):
+                        row[problem.names.index(term.coefficient)] = term.factor
+                    rows.append(row)
+        table = np.array(rows)
+        spread = tuple(tuple(row) for row in (table @ covariance @ table.T).tolist())
+    units: dict[str, str] = {}
+    if all(r.unit == "Ω" for r in records):
+        units = {r.output: "V" for r in records} | {r.input: "A" for r in records}
+    estimate = Estimate(
+        method="frequency-response",
+        runs=tuple(dict.fromkeys(r.name for r in records)),
+        values=dict(named),
+        standard_errors={n: e if math.isfinite(e) else None for n, e in standard.items()},
+        covariance=spread,
+        warnings=tuple(warnings),
+    )
+    return Model(found, orders, units, None, {"identified from": "frequency response"}, estimate)
+
+
+def _student(degrees: int) -> float:
+    """97.5 % quantile of Student's distribution, by its series about the normal one; good to 1 % from 4 degrees."""
+    z, n = NormalDist().inv_cdf(0.975), float(degrees)
+    terms = [(z**3 + z) / 4, (5 * z**5 + 16 * z**3 + 3 * z) / 96, (3 * z**7 + 19 * z**5 + 17 * z**3 - 15 * z) / 384]
+    return z + sum(t / n ** (k + 1) for k, t in enumerate(terms))

@@ -1,0 +1,496 @@
+"""Measured and modelled frequency responses as charts: gain and phase, the locus in the plane, what is left over."""
+
+from __future__ import annotations
+
+import contextlib
+import math
+import os
+from collections.abc import Mapping, Sequence
+from dataclasses import dataclass, field, replace
+from pathlib import Path
+from typing import TYPE_CHECKING, Any
+
+import numpy as np
+from markupsafe import Markup
+
+from ftlm.analysis.frequency_response import frequency_response, response_deviation, response_inputs
+from ftlm.data.frequency_data import FrequencyData, as_frequency_data
+from ftlm.errors import DataError, FtlmError
+from ftlm.estimation.verdict import TRUST, Verdict, verdict_html
+from ftlm.model.model import Model
+from ftlm.svg.complex_plane import locus_chart
+from ftlm.svg.figure import SMALL, Figure
+from ftlm.svg.html_page import Section, Table, write_page
+from ftlm.svg.line_chart import line_chart
+from ftlm.utils.formatting import Cell, number, symbol, unbounded, wrapped
+from ftlm.utils.statistics import NORMAL_95
+from ftlm.utils.validation import Complex, Floats
+from ftlm.validation.findings import BAD, CARE, concerns
+
+if TYPE_CHECKING:
+    pass
+
+DECIBEL = 20.0 / np.log(10.0)
+#: Points of a smooth curve between the ends of what was measured.
+CURVE = 160
+
+
+def grid_of(record: FrequencyData) -> tuple[Floats, Floats]:
+    """Frequencies of a smooth curve with those of a record among them, and where the record's are (else NaN).
+
+    Between two that were measured lies one that was not, so that each measured point stands alone, as a dot.
+    """
+    measured = np.unique(record.frequency)
+    between = np.sqrt(measured[1:] * measured[:-1])
+    smooth = np.geomspace(measured[0], measured[-1], CURVE) if measured.size > 1 else measured
+    return np.unique(np.concatenate([measured, between, smooth])), measured
+
+
+def curve_of(model: Model, record: FrequencyData, omega: Floats) -> tuple[Complex, Floats | None, Floats | None]:
+    """Response of the model, and half-widths of the 95 % bands of its gain [dB] and phase [degrees]."""
+    at = model.outputs.index(record.output), response_inputs(model, coupled=True).index(record.input)
+    response = frequency_response(model, omega)[at]
+    if model.estimate is None or model.estimate.covariance is None:
+        return response, None, None
+    gain, phase = (part[at] for part in response_deviation(model, omega))
+    return response, DECIBEL * NORMAL_95 * gain, np.degrees(NORMAL_95 * phase)
+
+
+def bode_of(model: Model, record: FrequencyData) -> list[Figure]:
+    """Gain and phase of a record with the model's and its 95 % band."""
+    omega, _ = grid_of(record)
+    response, wide, turned = curve_of(model, record, omega)
+    phase = np.degrees(np.unwrap(np.angle(response)))
+    order = np.argsort(record.frequency, kind="stable")
+    place = np.searchsorted(omega, record.frequency[order])
+    title = f"{symbol(record.output)} from {symbol(record.input)}, {record.name}"
+    shade = "" if wide is None else "Shade: 95 % band, from the covariance of the fit."
+    angles = record.phase[order]
+    # Whole turns are no difference.
+    angles = angles - 360.0 * np.round(np.median(angles - phase[place]) / 360.0)
+    size = f"gain [dB of {record.unit}]" if record.unit else "gain [dB]"
+    figures = []
+    for kind, label, ours, theirs, half in (
+        ("gain", size, DECIBEL * np.log(np.abs(response)), record.gain[order], wide),
+        ("phase", "phase [degrees]", phase, angles, turned),
+    ):
+        dots = np.full(omega.size, np.nan)
+        dots[place] = theirs
+        bands = [] if half is None else [(ours - half, ours + half)]
+        figures.append(
+            line_chart(
+                omega,
+                [("model", ours), ("measured", dots)],
+                log_x=True,
+                bands=bands,
+                title=f"{title}: {kind}",
+                dots=("measured",),
+                width=SMALL,
+                height=220,
+                x_label="frequency [rad/s]",
+                y_label=label,
+                caption=shade,
+            )
+        )
+    return figures
+
+
+def locus_of(model: Model, record: FrequencyData) -> Figure:
+    """The response in the complex plane; of impedances with -Im upwards, as chemists draw it."""
+    omega, _ = grid_of(record)
+    response, _, _ = curve_of(model, record, omega)
+    impedance = record.unit.endswith("Ω")
+    unit = f" [{record.unit}]" if record.unit else ""
+    upward = -1.0 if impedance else 1.0
+    title = f"{symbol(record.output)} from {symbol(record.input)}, {record.name}: Nyquist"
+    words = ("Re Z", "−Im Z") if impedance else ("real part", "imaginary part")
+    return locus_chart(
+        response.real + 1j * upward * response.imag,
+        record.response.real + 1j * upward * record.response.imag,
+        title=title,
+        x_label=words[0] + unit,
+        y_label=words[1] + unit,
+    )
+
+
+def misses_of(model: Model, record: FrequencyData) -> Figure:
+    """What is left over at each frequency, over the size of the measured response."""
+    order = np.argsort(record.frequency, kind="stable")
+    omega = record.frequency[order]
+    response, _, _ = curve_of(model, record, omega)
+    size = np.abs(record.response[order])
+    missed = 100.0 * (response - record.response[order]) / np.where(size > 0, size, np.max(size) or 1.0)
+    return line_chart(
+        omega,
+        [("real part", missed.real), ("imaginary part", missed.imag)],
+        log_x=True,
+        width=SMALL,
+        height=220,
+        title=f"{symbol(record.output)} from {symbol(record.input)}, {record.name}: residuals",
+        x_label="frequency [rad/s]",
+        y_label="model − measured [% of size]",
+    )
+
+
+#: A model that misses more than this share of a response describes little of it.
+USELESS = 0.5
+#: A validation misses far more than the data of the fit did where it is this many times as much, and above this share.
+MORE, LITTLE = 3.0, 0.02
+NOT_TRIED = "no response that it was not fitted to has been tried"
+
+
+@dataclass(frozen=True)
+class ResponseError:
+    """How far a model is from one measured response.
+
+    Parameters
+    ----------
+    name
+        Of the record.
+    output, input
+        What the response is of and from.
+    rms, largest
+        Of the complex error over the size of the measured response, [%].
+    at
+        Where it is largest [rad/s].
+    """
+
+    name: str
+    output: str
+    input: str
+    rms: float
+    largest: float
+    at: float
+
+
+@dataclass(frozen=True)
+class FrequencyValidation:
+    """A model on responses that it was not fitted to.
+
+    Parameters
+    ----------
+    data
+        The responses.
+    errors
+        How far the model is from each.
+    verdict
+        Whether to trust it after this.
+    """
+
+    data: tuple[FrequencyData, ...]
+    errors: tuple[ResponseError, ...]
+    verdict: Verdict
+
+    def to_dict(self) -> dict[str, Any]:
+        """For JSON."""
+        return {"errors": [vars(e) for e in self.errors], "verdict": self.verdict.to_dict()}
+
+    def __str__(self) -> str:
+        return "\n".join([*wrapped(str(self.verdict)), *_errors_in_words(self.errors)])
+
+
+@dataclass(frozen=True, eq=False)
+class FrequencyIdentification:
+    """What :func:`ftlm.identify_frequency` found.
+
+    Parameters
+    ----------
+    model
+        The model: it simulates over time, draws and saves as any other.
+    data
+        The records that it was fitted to.
+    weights
+        ``"deviation"``, ``"relative"`` or ``"uniform"``.
+    values, standard_errors, intervals
+        Orders, coefficients and delays by name, their standard errors, their 95 % intervals; infinite where the data do
+        not tell them.
+    names, covariance
+        What the rows of the covariance are of.
+    chi_squared
+        Mean square of the residuals in stated standard deviations, 1 where the model is right; None without any.
+    converged
+        Whether the fit stood still.
+    reached
+        How many starts ended at this optimum, and how many there were.
+    white
+        Whether residuals are noise from one frequency to the next (99 %).
+    warnings
+        What makes the model doubtful, in words.
+    """
+
+    model: Model
+    data: tuple[FrequencyData, ...]
+    weights: str
+    values: Mapping[str, float]
+    standard_errors: Mapping[str, float]
+    intervals: Mapping[str, tuple[float, float]]
+    names: tuple[str, ...]
+    covariance: Floats
+    chi_squared: float | None
+    converged: bool
+    reached: tuple[int, int]
+    white: bool
+    warnings: tuple[str, ...] = field(default=())
+
+    @property
+    def orders(self) -> dict[str, float]:
+        """Free orders as they were found."""
+        return {n: v for n, v in self.values.items() if n in self.model.orders}
+
+    @property
+    def coefficients(self) -> dict[str, float]:
+        """Free coefficients as they were found."""
+        return {n: v for n, v in self.values.items() if n in self.model.coefficients}
+
+    @property
+    def errors(self) -> tuple[ResponseError, ...]:
+        """How far the model is from each record."""
+        return tuple(error_of(self.model, record) for record in self.data)
+
+    def validate(self, data: FrequencyData | Sequence[FrequencyData]) -> FrequencyValidation:
+        """Compare the model with responses that it was not fitted to.
+
+        Parameters
+        ----------
+        data
+            Records of the model's outputs and inputs.
+
+        Raises
+        ------
+        DataError
+            Records of other signals.
+        """
+        others = tuple(placed(self.model, record) for record in as_frequency_data(data))
+        errors = tuple(error_of(self.model, record) for record in others)
+        return FrequencyValidation(others, errors, self._judged(errors, others))
+
+    def verdict(self, validation: FrequencyValidation | None = None) -> Verdict:
+        """Whether to trust the model.
+
+        "do not use": numbers that the data do not tell, a model that misses half of a response or more, or one that
+        grows without bound. "with care": residuals that follow the frequency or exceed stated deviations, numbers that
+        are hardly told, a fit that did not stand still or ended on a bound, a validation that misses three times as
+        much as its own data (and over 2 %), or no validation.
+        """
+        return self._judged(None) if validation is None else validation.verdict
+
+    def _judged(self, others: tuple[ResponseError, ...] | None, data: Sequence[FrequencyData] = ()) -> Verdict:
+        found: list[tuple[str, str, str]] = []
+        own = self.errors
+        for error in (*own, *(others or ())):
+            if not error.rms <= 100 * USELESS:
+                what = f"it misses {error.rms:.3g} % of {error.output} from {error.input} ({error.name})"
+                found.append((BAD, what, "add a term, a delay or a free order"))
+        grows = self._grows()
+        if grows:
+            found.append((BAD, grows, "measure a wider band, bound the coefficient that pushes, or take fewer terms"))
+        for concern in concerns(self.warnings):
+            if concern.kind.level in (BAD, CARE):
+                found.append((concern.kind.level, concern.warnings[0].partition(";")[0], concern.kind.remedy))
+        if others is not None:
+            most = max(e.rms for e in own)
+            lost = [e for e in others if e.rms > MORE * most and e.rms > 100 * LITTLE]
+            if lost:
+                words = f"it misses {most:.3g} % of its own data and {lost[0].rms:.3g} % of {lost[0].name}"
+                found.append((CARE, words, "fewer free numbers, or both records in one fit"))
+        same = any(np.array_equal(a.response, b.response) for a in data for b in self.data)
+        if others is None or same:
+            found.append((CARE, NOT_TRIED, "validate(load_frequency(file)), or --validation FILE"))
+        found.sort(key=lambda item: item[0] != BAD)
+        if found:
+            level, reason, remedy = found[0]
+            return Verdict(level, reason, remedy, tuple(dict.fromkeys(r for _, r, _ in found)))
+        shown = ", ".join(f"{e.name} {e.rms:.2g} %" for e in others or ())
+        return Verdict(TRUST, f"it predicts what it was not fitted to (error {shown}), residuals are noise")
+
+    def _grows(self) -> str:
+        """Words for poles with a positive real part; none where there are none."""
+        with contextlib.suppress(FtlmError):
+            stable = self.model.stability(coupling="simulated")
+            if math.isnan(stable.unstable_poles):
+                return ""
+            if stable.unstable_poles > 0:
+                count = int(stable.unstable_poles)
+                return f"its free run grows without bound ({count} pole{'s' * (count > 1)} with a positive real part)"
+        return ""
+
+    def summary(self, validation: FrequencyValidation | None = None) -> str:
+        """The first screen: verdict, equations, numbers, what the model does, how well it fits, warnings."""
+        from ftlm.report.text_summary import behaviour_in_words, concerns_in_words, equations_in_words
+
+        lines = [*wrapped(str(self.verdict(validation))), "", *equations_in_words(self.model), ""]
+        lines += self._numbers()
+        lines += [*behaviour_in_words(self.model), ""]
+        lines += _errors_in_words(self.errors)
+        if validation is not None:
+            lines += ["validation", *_errors_in_words(validation.errors)[1:]]
+        if self.chi_squared is not None:
+            lines.append(f"residuals over stated deviations: {math.sqrt(self.chi_squared):.3g} (1 of a right model)")
+        same, tried = self.reached
+        lines.append(
+            f"residuals white: {'yes' if self.white else 'no'}; weights: {self.weights}; {same} of {tried} "
+            "starts ended here"
+        )
+        return "\n".join(
+            [
+                *lines,
+                *(f"note: {w}" for r in self.data for w in r.warnings),
+                *concerns_in_words(self.warnings, "result.warnings"),
+            ]
+        )
+
+    def _numbers(self) -> list[str]:
+        from ftlm.report.typesetting import units_of
+
+        units = units_of(self.model)
+        rows = []
+        for name, value in self.values.items():
+            low, high = self.intervals[name]
+            ends = f"[{unbounded(low, '.5g')}, {unbounded(high, '.5g')}]"
+            rows.append((name, f"{value:.6g}", f"± {unbounded(self.standard_errors[name])}", ends, units.get(name, "")))
+        widths = [max(len(row[k]) for row in rows) for k in range(4)]
+        lines = [
+            f"  {a:<{widths[0]}}  {b:>{widths[1]}} {c:<{widths[2]}}  {d:<{widths[3]}}  {e}".rstrip()
+            for a, b, c, d, e in rows
+        ]
+        return [*lines, "  (± is one standard error, in brackets the 95 % interval)"]
+
+    def figures(self) -> list[Figure]:
+        """Bode and Nyquist charts with the measured points, and what is left over."""
+        model = self.model
+        return [f for r in self.data for f in (*bode_of(model, r), locus_of(model, r), misses_of(model, r))]
+
+    def report(
+        self, path: str | os.PathLike[str], *, validation: FrequencyValidation | None = None, force: bool = False
+    ) -> Path:
+        """Write a page that opens offline: verdict, equations, numbers, Bode and Nyquist with the measured points.
+
+        Parameters
+        ----------
+        path
+            File to write.
+        validation
+            What :meth:`validate` returned.
+        force
+            Overwrite an existing file.
+
+        Raises
+        ------
+        DataError
+            The file exists and ``force`` is not set, or cannot be written.
+        """
+        from ftlm.report.html_report import behaviour_figures, behaviour_tables, first_warnings, title_of, verdict_box
+        from ftlm.report.typesetting import equation_html, parameter_table
+
+        shown, more = first_warnings(self.warnings)
+        equations = [equation_html(e, self.model.structure.delay) for e in self.model.equations]
+        first = Section(
+            "Model",
+            [Markup("<p>{}</p>").format(e) for e in equations],
+            warnings=shown,
+            more=more,
+            tables=[parameter_table(self.model), *behaviour_tables(self.model)],
+            figures=behaviour_figures(self.model),
+            small=True,
+        )
+        rows: list[list[Cell]] = [_error_row("estimation", e) for e in self.errors]
+        rows += [] if validation is None else [_error_row("validation", e) for e in validation.errors]
+        heads = ("data", "record", "response", "error, % rms", "largest, %", "at [rad/s]")
+        notes = [w for r in self.data for w in r.warnings]
+        figures = self.figures()
+        for record in () if validation is None else validation.data:
+            figures += [*bode_of(self.model, record), locus_of(self.model, record)]
+        response = Section(
+            "Measured and modelled response",
+            [f"Weights: {self.weights}. Residuals white: {'yes' if self.white else 'no'} (99 %).", *notes],
+            tables=[Table("Error over the size of the measured response", heads, rows)],
+            figures=figures,
+            small=True,
+        )
+        return write_page(
+            path,
+            title=title_of(self.model),
+            sections=[first, response],
+            force=force,
+            verdict=verdict_box(self.verdict(validation)),
+        )
+
+    def to_dict(self) -> dict[str, Any]:
+        """For JSON."""
+
+        def ends(pair: tuple[float, float]) -> list[float | None]:
+            return [v if math.isfinite(v) else None for v in pair]
+
+        return {
+            "equations": [str(e) for e in self.model.equations],
+            "weights": self.weights,
+            "values": dict(self.values),
+            "standard_errors": {n: e if math.isfinite(e) else None for n, e in self.standard_errors.items()},
+            "intervals": {n: ends(pair) for n, pair in self.intervals.items()},
+            "chi_squared": self.chi_squared,
+            "errors": [vars(e) for e in self.errors],
+            "converged": self.converged,
+            "starts": list(self.reached),
+            "white": self.white,
+            "warnings": list(self.warnings),
+        }
+
+    def __str__(self) -> str:
+        return self.summary()
+
+    def _repr_html_(self) -> str:
+        from ftlm.report.typesetting import equation_html, parameter_table
+
+        equations = Markup("").join(
+            Markup("<p>{}</p>").format(equation_html(e, self.model.structure.delay)) for e in self.model.equations
+        )
+        drawn = Markup("").join(Markup(f._repr_html_()) for f in self.figures())
+        return str(verdict_html(self.verdict()) + equations + parameter_table(self.model).to_html() + drawn)
+
+
+def placed(model: Model, record: FrequencyData) -> FrequencyData:
+    """A record with the names of the response of a model that it is compared with."""
+    inputs = response_inputs(model, coupled=True)
+    out = {"output": record.output, "input": record.input}
+    for side, known in (("output", model.outputs), ("input", inputs)):
+        if not out[side] and len(known) == 1:
+            out[side] = known[0]
+        if out[side] not in known:
+            raise DataError(
+                f"{record.name} has the {side} {out[side]!r}, and the model {', '.join(known)}; say {side}= when "
+                "loading it"
+            )
+    return replace(record, output=out["output"], input=out["input"])
+
+
+def modelled(model: Model, record: FrequencyData, omega: Floats | None = None) -> Complex:
+    """Response of a model at the frequencies of a record, or at others."""
+    response = frequency_response(model, record.frequency if omega is None else omega)
+    inputs = response_inputs(model, coupled=True)
+    values: Complex = response[model.outputs.index(record.output), inputs.index(record.input)]
+    return values
+
+
+def error_of(model: Model, record: FrequencyData) -> ResponseError:
+    """How far a model is from one record."""
+    size = np.abs(record.response)
+    missed = np.abs(modelled(model, record) - record.response) / np.where(size > 0, size, np.max(size) or 1.0)
+    at = int(np.argmax(missed))
+    rms = 100 * float(np.sqrt(np.mean(missed**2)))
+    return ResponseError(
+        record.name, record.output, record.input, rms, 100 * float(missed[at]), float(record.frequency[at])
+    )
+
+
+def _errors_in_words(errors: Sequence[ResponseError]) -> list[str]:
+    lines = ["error over the size of the measured response"]
+    for e in errors:
+        lines.append(
+            f"  {e.output} from {e.input} ({e.name}): {e.rms:.3g} % rms, at most {e.largest:.3g} % at {e.at:.4g} rad/s"
+        )
+    return lines
+
+
+def _error_row(what: str, error: ResponseError) -> list[Cell]:
+    pair = f"{error.output} from {error.input}"
+    return [what, error.name, pair, number(error.rms, 3), number(error.largest, 3), number(error.at, 4)]

@@ -1,0 +1,433 @@
+"""A body that slides and rests by itself, by least squares: what drives, brakes and rubs it, each with its own sign."""
+
+from __future__ import annotations
+
+import itertools
+from collections.abc import Callable, Mapping, Sequence
+from dataclasses import replace
+
+import numpy as np
+from msgspec import UNSET, UnsetType
+
+from ftlm import _core
+from ftlm.data.run import Run
+from ftlm.data.sampling import read
+from ftlm.errors import DataError, FtlmError
+from ftlm.estimation.free_parameters import FreeProblem
+from ftlm.estimation.objective import Asked, Attempt, Grid
+from ftlm.simulation.discretization import COULOMB, record
+from ftlm.structure.equation import Equation, Friction, Term
+from ftlm.structure.order import Order
+from ftlm.structure.structure import Hints, Structure
+from ftlm.utils.linalg import solved
+from ftlm.utils.resources import memory_limit, stop
+from ftlm.utils.statistics import noise_of
+from ftlm.utils.validation import Floats
+
+#: Steps of a run over which its velocity is told, as a share of all, and the deviations of noise that it must exceed.
+PACE, SEEN = 0.01, 5.0
+#: Turns in which what friction holds at rest is taken from what drives.
+TURNS = 4
+
+
+def slid(runs: Sequence[Run], alone: Structure) -> dict[str, float]:
+    """Coefficients of one equation with friction, its orders numbers, that explain its integrals on all runs best.
+
+    Own terms pull back and friction brakes; what drives has any sign. The sign of the velocity is that of the measured
+    one where it stands out of its noise, elsewhere the body rests, and friction is what drives it. Each run has a
+    level, a velocity and a constant of its own.
+
+    Returns
+    -------
+    dict
+        By name; empty where no such numbers are finite.
+    """
+    item = alone.equations[0]
+    if item.friction is None or not isinstance(item.friction.coefficient, str):
+        return {}
+    parts = [_regressors(run, alone) for run in runs]
+    rest = [part[2] == 0.0 for part in parts]
+    signs = [part[2].copy() for part in parts]
+    strength, found = item.friction.coefficient, dict[str, float]()
+    for _ in range(TURNS):
+        found = _best(item, parts, signs)
+        if not found:
+            return {}
+        holds = -item.friction.factor * found[strength]
+        if holds <= 0.0:
+            break
+        for sign, still, part in zip(signs, rest, parts, strict=True):
+            push = sum((_value(item, k, found) * drive for k, drive in part[3].items()), start=np.zeros(sign.size))
+            sign[still] = np.clip(push[still] / holds, -1.0, 1.0)
+    return found
+
+
+_Part = tuple[list[Floats], Floats, Floats, dict[int, Floats], float]
+
+
+def _regressors(run: Run, alone: Structure) -> _Part:
+    """Integrals of every term, the output's means, the sign of its velocity, drives by term, and the step."""
+    item, m = alone.equations[0], run.length - 1
+    rec = record(run, alone, m, filtered=False)
+    alpha, means = item.order.constant, rec.of(item.output)
+    integrals = [_integral(rec.of(t.signal), rec.step, alpha - t.order.constant) for t in item.terms]
+    pace = max(1, round(PACE * m))
+    gone = means[pace:] - means[:-pace]
+    gone = np.concatenate([gone[:1].repeat(pace // 2), gone, gone[-1:].repeat(pace - pace // 2)])
+    sign = np.where(np.abs(gone) > SEEN * noise_of(read(run[item.output])), np.sign(gone), 0.0)
+    drives = {
+        k: rec.of(t.signal) for k, t in enumerate(item.terms) if t.signal != item.output and t.order.constant == 0.0
+    }
+    return integrals, means, sign, drives, rec.step
+
+
+def _integral(means: Floats, step: float, order: float) -> Floats:
+    """Pulse means of the integral of this order, above 0."""
+    signals = np.stack([np.zeros_like(means), means])
+    found: Floats = _core.respond((step, signals, None), [((0, order, [(1, 0.0)]), [1.0])], [False, True], [[]])[0]
+    return found
+
+
+def _value(item: Equation, k: int, found: Mapping[str, float]) -> float:
+    """A term's coefficient with its factor."""
+    term = item.terms[k]
+    return term.fixed if term.fixed is not None else term.factor * found[str(term.coefficient)]
+
+
+def _best(item: Equation, parts: Sequence[_Part], signs: Sequence[Floats]) -> dict[str, float]:
+    """The best numbers of which none has the wrong sign: least squares without each set of those that might have."""
+    alpha, rubs = item.order.constant, item.friction
+    assert rubs is not None
+    target, rows = [], []
+    for r, ((integrals, means, _, _, step), sign) in enumerate(zip(parts, signs, strict=True)):
+        times = (np.arange(means.size) + 0.5) * step
+        free = [c * t.factor for c, t in zip(integrals, item.terms, strict=True) if t.fixed is None]
+        known = [c * t.fixed for c, t in zip(integrals, item.terms, strict=True) if t.fixed is not None]
+        rub = rubs.factor * _integral(sign, step, alpha)
+        starts = [times * 0.0] * (3 * len(parts))
+        starts[3 * r : 3 * r + 3] = [np.ones_like(times), times, times**alpha]
+        rows.append(np.stack([*free, rub, *starts], axis=1))
+        target.append(means - sum(known, start=np.zeros_like(means)))
+    matrix, wanted = np.concatenate(rows), np.concatenate(target)
+    sizes = np.linalg.norm(matrix, axis=0)
+    terms = [t for t in item.terms if t.fixed is None]
+    names = [*(str(t.coefficient) for t in terms), str(rubs.coefficient)]
+    # A coefficient times its factor is negative of an own term, and of friction.
+    bound = {k: -np.sign(t.factor) for k, t in enumerate(terms) if t.signal == item.output} | {len(terms): 1.0}
+    best: tuple[float, dict[str, float]] = (np.inf, {})
+    for out in itertools.chain.from_iterable(itertools.combinations(bound, n) for n in range(len(bound) + 1)):
+        kept = [k for k in range(matrix.shape[1]) if k not in out and sizes[k] > 0]
+        if not np.all(np.isfinite(matrix[:, kept])):
+            return {}
+        x = np.zeros(matrix.shape[1])
+        x[kept] = solved(matrix[:, kept] / sizes[kept], wanted, None) / sizes[kept]
+        if any(x[k] * side < 0.0 for k, side in bound.items()):
+            continue
+        left = float(np.sum((wanted - matrix @ x) ** 2))
+        if left < best[0]:
+            best = (left, dict(zip(names, x[: len(names)].tolist(), strict=True)))
+    return best[1]
+
+
+#: Samples of the coarse fits that compare starts, evaluations of one, and fits that lead to others.
+COARSE_SAMPLES, FIRST_LAP, FINALISTS = 1200, 15, 3
+#: Highest order of a body with friction.
+HIGHEST = 2.0
+#: Friction at a start as shares of the force that drives the body, from next to none upwards.
+SHARES = (0.01, 0.05, 0.2, 0.5)
+#: The same as shares of what the measured sign of the velocity says.
+MULTIPLES = (1.0, 0.3)
+#: Stribeck friction at a start as shares of Coulomb's, and its speed as shares of that of the body.
+NEAR = (0.02, 0.2, 1.0)
+FALLS = (0.05, 0.2, 0.6)
+#: What hangs on a body at a start, as shares of the body's own inertia.
+CARRIED = (0.1, 0.3, 1.0, 3.0)
+#: Starts at most of several bodies each of which carries a share of its own.
+MOST_CARRIED = 64
+#: Orders of two terms of an equation and its counter-equation that lie nearer are action and reaction.
+ALIKE = 0.5
+#: A body that moves by less than this many deviations of its noise, peak to peak, has not moved.
+STILL = 10.0
+
+
+def race_with_friction(
+    alike: Grid, floor: float, threads: int, progress: Callable[[int, int], None] | None
+) -> _core.JointRace:
+    """Coarse fits of bodies with friction, best first, every output weighing alike.
+
+    The sign of the measured velocity makes the equation linear; where the body rests it is noise, and so are its
+    numbers, but they are near enough. Beside them stand those without friction, with some of it put in. Friction that
+    falls with speed starts where friction that does not ends, with some more of it near rest.
+    """
+    problem, runs = alike.problem, alike.runs
+    structure = problem.structure
+    check_moves(runs, structure)
+    if not structure.has_friction:
+        return raced(alike, floor, threads, progress)
+    coarse = replace(alike, decimation=max(1, min(run.length - 1 for run in runs) // COARSE_SAMPLES))
+    starts: list[Attempt] = []
+    if any(rubs.stribeck is not None for _, rubs in rubbing(structure)):
+        less = FreeProblem.of(with_friction(structure, lambda rubs: replace(rubs, more=UNSET)))
+        reached = race_with_friction(replace(alike, problem=less), floor, threads, progress)
+        for values, origin in list(zip(reached.values, reached.origins, strict=True))[:FINALISTS]:
+            starts += falling(coarse, dict(zip(less.names, values, strict=True)), origin)
+        return on_coarse_grids(coarse, starts, threads)
+    if 1 < len(rubbing(structure)) < len(structure.equations):
+        # What hangs on them is told from its own equation; that of a body, driven by all that hangs on it, may be
+        # explained by what they tell of its motion.
+        for orders in skeletons(problem):
+            starts += carrying(problem, runs, hanging(alike, orders, floor, threads), together=False)
+        return on_coarse_grids(coarse, starts, threads)
+    # Driven by measured signals, each of several bodies is told from its own equation, whatever the others do.
+    signed = FreeProblem.of(replace(with_measured_sign(structure), coupling="measured"))
+    reached = raced(replace(alike, problem=signed), floor, threads, progress)
+    for values, origin in list(zip(reached.values, reached.origins, strict=True))[:FINALISTS]:
+        starts += started(coarse, dict(zip(signed.names, values, strict=True)), origin)
+    if len(structure.equations) > 1 and len(reached):
+        best = reached.values[0]
+        named = signed.named(signed.split(best)[1])
+        starts += carrying(problem, runs, {**dict(zip(signed.names, best, strict=True)), **named})
+    return on_coarse_grids(coarse, starts, threads)
+
+
+def rubbing(structure: Structure) -> list[tuple[Equation, Friction]]:
+    """Equations with friction, and theirs."""
+    return [(e, e.friction) for e in structure.equations if e.friction is not None]
+
+
+def skeletons(problem: FreeProblem) -> list[dict[str, float]]:
+    """Orders at which a machine is put together: whole ones, and those beside them that are natural for it.
+
+    Orders that equations share tell too little of each by itself, and an overdamped body, whose drive and brake nearly
+    cancel, is another one at every order.
+    """
+    ends = dict(zip(problem.orders, problem.bounds, strict=True))
+    natural = (problem.structure.hints or Hints()).natural
+    known = {n: natural[n] for n in problem.orders if natural.get(n)}
+    whole = dict(zip(problem.orders, problem.core.whole_orders, strict=True))
+    whole |= {n: v for n, values in known.items() for v in values if v == round(v)}
+    other = {n: v for n, values in known.items() for v in values if v != whole[n]}
+    sets = [whole, whole | other] if other else [whole]
+    return [{n: min(max(v, ends[n][0]), ends[n][1]) for n, v in orders.items()} for orders in sets]
+
+
+def hanging(alike: Grid, orders: dict[str, float], floor: float, threads: int) -> dict[str, float]:
+    """The orders, and coefficients of equations without friction, each driven by what was measured; others are 0."""
+    structure = alike.problem.structure
+    values = orders | dict.fromkeys(structure.coefficient_names, 0.0)
+    for item, weight in zip(structure.equations, alike.weights, strict=True):
+        if item.friction is None:
+            named = {n: orders[n] for n in item.order_names}
+            alone = FreeProblem.of(structure.driven(item.output).with_orders(named))
+            reached = raced(replace(alike, problem=alone, weights=[weight]), floor, threads, None)
+            values |= alone.named(alone.split(reached.values[0])[1]) if len(reached) else {}
+    return values
+
+
+def carrying(
+    problem: FreeProblem, runs: Sequence[Run], values: dict[str, float], *, together: bool = True
+) -> list[Attempt]:
+    """Starts of bodies by themselves, with what hangs on them put back as action and reaction ask for.
+
+    The others are as they are when measured bodies drive them; a body itself, driven by measured others, may be
+    explained by what they tell of its motion, without what drives it and without friction. Several bodies carry
+    the same share of their inertia, or each its own.
+    """
+    structure = problem.structure
+    bounds = dict(zip(problem.orders, problem.bounds, strict=True))
+    alone = [(item, *by_itself(runs, structure, item, values, bounds)) for item, _ in rubbing(structure)]
+    told = [(item, orders, numbers) for item, orders, numbers in alone if numbers]
+    out = []
+    together = together or len(CARRIED) ** len(told) > MOST_CARRIED
+    for shares in [[s] * len(told) for s in CARRIED] if together else itertools.product(CARRIED, repeat=len(told)):
+        # What drives a body and brakes it moves the others, too.
+        found, rest = dict(values), dict(values)
+        for (item, orders, numbers), share in zip(told, shares, strict=True):
+            found |= reacting(structure, item, values, share)
+            found |= {n: (1.0 + share) * v for n, v in numbers.items()}
+            rest |= orders
+        free = dict(zip(problem.coefficients, problem.free_from(found), strict=True))
+        rest = {n: v for n, v in rest.items() if n in problem.names}
+        words = " and ".join(item.output for item, _, _ in told) + (", each" if len(told) > 1 else "")
+        carried = " and ".join(f"{share:g}" for share in (shares[:1] if together else shares))
+        out.append(at(problem, {**rest, **free}, f"{words} by itself, carrying {carried} of its inertia"))
+    return out if told else []
+
+
+def by_itself(
+    runs: Sequence[Run],
+    structure: Structure,
+    item: Equation,
+    values: dict[str, float],
+    bounds: dict[str, tuple[float, float]],
+) -> tuple[dict[str, float], dict[str, float]]:
+    """Orders of a body with friction that nothing hangs on, and coefficients by which it follows what drives it."""
+    # A filter's lag is no part of a start.
+    alone = replace(structure, sensor_filter=None).equation(item.output)
+    kept = tuple(t for t in alone.equations[0].terms if t.signal not in structure.outputs or t.signal == item.output)
+    if not kept:
+        return {}, {}
+    alone = replace(alone, equations=(replace(alone.equations[0], terms=kept),))
+    usual = (
+        {n: 0.0 for n in alone.order_names}
+        | {n: 1.0 for t in kept if t.signal == item.output for n in t.order.names}
+        | {n: HIGHEST for n in item.order.names}
+    )
+    shared = {n for e in structure.equations if e is not item for n in e.order_names}
+    orders = {n: values[n] if n in shared and n not in item.order.names else v for n, v in usual.items()}
+    orders = {n: min(max(v, bounds[n][0]), bounds[n][1]) if n in bounds else v for n, v in orders.items()}
+    return orders, slid(runs, alone.with_orders(orders))
+
+
+def reacting(structure: Structure, item: Equation, values: dict[str, float], share: float) -> dict[str, float]:
+    """Coefficients by which others act on a body: against what moves them, by their inertia over its own."""
+    out: dict[str, float] = {}
+    for other in structure.equations:
+        if other is item:
+            continue
+        named = {**values, **{n: 0.0 for n in other.order_names if n not in values}}
+
+        def highest(term: Term, named: dict[str, float] = named) -> float:
+            return term.order.constant + sum(w * named[n] for n, w in term.order.weights)
+
+        own = sorted((t for t in other.terms if t.signal == other.output), key=highest)
+        back = sorted((t for t in item.terms if t.signal == other.output), key=highest)
+        for there, here in zip(own, back, strict=False):
+            if not isinstance(here.coefficient, str) or abs(highest(there) - highest(here)) > ALIKE:
+                continue
+            value = there.fixed if there.fixed is not None else there.factor * values[str(there.coefficient)]
+            out[here.coefficient] = -share * value / here.factor
+    return out
+
+
+def raced(alike: Grid, floor: float, threads: int, progress: Callable[[int, int], None] | None) -> _core.JointRace:
+    """Where the starts of a problem without friction get, every output weighing alike."""
+    runs = Asked(alike.problem, alike.runs).core(progress)
+    return _core.joint_race(alike.problem.core, runs, alike.weights, floor, (threads, memory_limit()), stop())
+
+
+def on_coarse_grids(coarse: Grid, starts: Sequence[Attempt], threads: int) -> _core.JointRace:
+    """Where starts get on coarse grids, best first."""
+    runs = Asked(coarse.problem, coarse.runs).core()
+    return _core.joint_grids(
+        coarse.problem.core,
+        runs,
+        coarse.weights,
+        coarse.decimation,
+        [(a.values.tolist(), a.origin) for a in starts],
+        threads,
+        stop(),
+    )
+
+
+def check_moves(runs: Sequence[Run], structure: Structure) -> None:
+    """Refuse runs in none of which a body moves."""
+    for item, _ in rubbing(structure):
+        output = item.output
+        if all(float(np.ptp(read(run[output]))) <= STILL * noise_of(run[output]) for run in runs):
+            raise DataError(
+                f"{output} never moves beyond its noise in {', '.join(r.name for r in runs)}, and a body that only "
+                "rests tells nothing but that its friction is not exceeded; add a run in which it slides"
+            )
+
+
+def with_friction(structure: Structure, other: Callable[[Friction], Friction | UnsetType]) -> Structure:
+    """The structure with other friction of each body that has some, or none."""
+    equations = [e if e.friction is None else replace(e, coulomb=other(e.friction)) for e in structure.equations]
+    return replace(structure, equations=tuple(equations))
+
+
+def without_friction(structure: Structure) -> Structure:
+    """The structure of bodies that slide freely."""
+    return with_friction(structure, lambda _: UNSET)
+
+
+def with_measured_sign(structure: Structure) -> Structure:
+    """The structure with the signs of measured velocities as signals in the place of friction."""
+
+    def signed(item: Equation) -> Equation:
+        if item.friction is None:
+            return item
+        term = Term(f"{COULOMB}{item.output}", Order(), item.friction.coefficient, item.friction.factor)
+        return replace(item, terms=(*item.terms, term), coulomb=UNSET)
+
+    return replace(structure, equations=tuple(map(signed, structure.equations)))
+
+
+def started(coarse: Grid, values: dict[str, float], origin: str) -> list[Attempt]:
+    """Starts at numbers of a linear fit, with friction as it says, and as shares of the force that drives each body."""
+    problem = coarse.problem
+    free = [(e.output, rubs, rubs.coefficient) for e, rubs in rubbing(problem.structure)]
+    named = [(output, rubs, name) for output, rubs, name in free if isinstance(name, str)]
+    if not named:
+        return [at(problem, values, origin)]
+    said = {name: max(values[name], 0.0) for _, _, name in named}
+    strengths = [({n: m * v for n, v in said.items()}, f"{m:g} of the measured sign") for m in MULTIPLES]
+    out = [at(problem, values | v, f"{origin}, friction {words}") for v, words in strengths if any(said.values())]
+    linear = FreeProblem.of(without_friction(problem.structure))
+    try:
+        without = replace(coarse, problem=linear).descend(at(linear, values, origin), FIRST_LAP)
+    except FtlmError:
+        # Without any friction it runs away.
+        return out
+    values = {**values, **dict(zip(linear.names, without.values.tolist(), strict=True))}
+    forces = {name: driving(coarse.runs, identified_body(linear, output, values)) for output, _, name in named}
+    for share in SHARES if any(force > 0 for force in forces.values()) else ():
+        strength = {name: share * forces[name] / -rubs.factor for _, rubs, name in named}
+        out.append(at(problem, values | strength, f"{origin}, friction {share:g} of what drives"))
+    return out
+
+
+def falling(coarse: Grid, values: dict[str, float], origin: str) -> list[Attempt]:
+    """Starts at numbers of a fit with Coulomb friction alone, with some more of it at low speeds of each body."""
+    problem = coarse.problem
+    plain = FreeProblem.of(without_friction(problem.structure))
+    sizes: dict[str, float] = {}
+    paces: dict[str, float] = {}
+    for item, rubs in rubbing(problem.structure):
+        more = rubs.stribeck
+        if more is None:
+            continue
+        fc = abs(rubs.factor) * values.get(str(rubs.coefficient), 0.0) if rubs.strength is None else rubs.strength
+        if isinstance(more.coefficient, str):
+            size = fc or driving(coarse.runs, identified_body(plain, item.output, values))
+            sizes[more.coefficient] = size / -more.factor
+        if isinstance(more.speed, str):
+            paces[more.speed] = speed_of(coarse, item.output)
+    out = []
+    for near in NEAR if sizes else NEAR[:1]:
+        for fall in FALLS if paces else FALLS[:1]:
+            known = {n: near * v for n, v in sizes.items()} | {n: fall * v for n, v in paces.items()}
+            origin_here = f"{origin}, Stribeck {near:g} of Coulomb below {fall:g} of the speed"
+            out.append(at(problem, values | known, origin_here))
+    return out
+
+
+def speed_of(coarse: Grid, output: str) -> float:
+    """Root mean square of a body's measured speed, over intervals that noise does not fill."""
+    parts = [np.diff(read(run[output])[:: coarse.decimation]) / (run.step * coarse.decimation) for run in coarse.runs]
+    return float(np.sqrt(np.mean(np.concatenate(parts) ** 2)))
+
+
+def at(problem: FreeProblem, values: dict[str, float], origin: str) -> Attempt:
+    """A start at named values."""
+    orders, coefficients, inputs = problem.split([values[n] for n in problem.names])
+    return Attempt(orders, coefficients, origin, {}, inputs)
+
+
+def identified_body(problem: FreeProblem, output: str, values: dict[str, float]) -> Equation:
+    """The equation of a body that may stick, without its friction, at named values."""
+    coefficients = problem.named([values[n] for n in problem.coefficients])
+    item = next(e for e in problem.structure.equations if e.output == output)
+    return item.with_coefficients({n: coefficients[n] for n in item.coefficient_names})
+
+
+def driving(runs: Sequence[Run], item: Equation) -> float:
+    """Root mean square of the largest force that another signal exerts by itself [unit of D^alpha y]."""
+    sizes = [0.0]
+    for term in item.terms:
+        if term.signal == item.output or term.order.names or term.order.constant != 0:
+            continue
+        signal = np.concatenate([read(run[term.signal]) for run in runs])
+        sizes.append(abs(term.fixed or 0.0) * float(np.sqrt(np.mean(signal**2))))
+    return max(sizes)

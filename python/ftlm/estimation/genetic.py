@@ -1,0 +1,479 @@
+"""The genetic baseline of the paper's Tables 6 and 7: orders and coefficients together, by PyGAD, on criterion (45)."""
+
+from __future__ import annotations
+
+import math
+import time
+from collections.abc import Callable, Mapping, Sequence
+from dataclasses import dataclass, field
+from typing import Any
+
+import numpy as np
+from numpy.typing import NDArray
+
+from ftlm import _core
+from ftlm.errors import ModelError
+from ftlm.progress import Progress
+from ftlm.simulation.discretization import Record, lattice_tuple
+from ftlm.structure.equation import Equation
+from ftlm.structure.order import Order
+from ftlm.structure.order_grid import Lattice
+from ftlm.structure.structure import Structure
+from ftlm.utils.validation import Floats, check_threads, whole_number
+
+#: Orders are coded in steps of this, the digits that the paper prints and fewer; regressors are then shared.
+RESOLUTION = 0.001
+#: Bounds of a coefficient whose value the maker states: plus and minus this many times it.
+STATED_RANGE = 2.0
+#: Bounds of any other: this many times what would make its term alone, at the middle orders, as large as the output.
+SCALE_RANGE = 4.0
+#: A population keeps this share of itself, which are also the parents.
+PARENTS = 0.25
+#: Spread of simulated binary crossover and of polynomial mutation, and the share of children that are crossed: the
+#: values that Deb and Agrawal (Complex Systems 1995) and the libraries that follow them use.
+CROSSOVER_SPREAD, MUTATION_SPREAD, CROSSED = 15.0, 20.0, 0.9
+#: Copies of parents are not evaluated again, so it takes more generations to spend all evaluations: at most this
+#: many times as many.
+MOST_COPIES = 4
+#: Evaluations took between these multiples of what those of the first generation take: most are left sooner.
+FOLLOWED = (0.1, 1.5)
+#: Fitness of what diverges or has no chance of being a parent: PyGAD takes finite numbers only.
+HOPELESS = -1e300
+#: Most evaluations that are not asked for by number: the lattice of a stage under its law has millions.
+MOST_EVALUATIONS = 1_000_000
+
+
+@dataclass(frozen=True)
+class Genetic:
+    """Settings of the genetic algorithm.
+
+    Parameters
+    ----------
+    seeds
+        One run of the algorithm a seed; the best of all is the result, and the errors of all are kept.
+    evaluations
+        Evaluations a seed, rounded up to a whole generation; by default as many as the lattice has candidates.
+    population
+        Candidates of one generation, at least 8.
+    bounds
+        (low, high) of coefficients by name. By default ±2 times the value that the maker states, or else ±4 times the
+        coefficient with which its term alone would be as large as the output, at the middle of the orders' intervals.
+
+    Raises
+    ------
+    ModelError
+        Seeds that are none, a population outside [8, 100000], evaluations of less than two generations, bounds that are
+        no interval.
+    """
+
+    seeds: Sequence[int] = (0, 1, 2)
+    evaluations: int | None = None
+    population: int = 200
+    bounds: Mapping[str, tuple[float, float]] = field(default_factory=dict)
+
+    def __post_init__(self) -> None:
+        population = whole_number(self.population)
+        if population is None or not 8 <= population <= 100_000:
+            raise ModelError(f"population = {self.population!r} is outside [8, 100000]")
+        if self.evaluations is not None and (whole_number(self.evaluations) or 0) < 2 * self.population:
+            raise ModelError(
+                f"evaluations = {self.evaluations!r} is less than two generations of {self.population}; give more"
+            )
+        seeds = [whole_number(s) for s in self.seeds] if not isinstance(self.seeds, str) else [None]
+        if not seeds or any(s is None or not 0 <= s < 1 << 32 for s in seeds):
+            raise ModelError(f"seeds = {self.seeds!r}: give one or more whole numbers from 0 to 4294967295")
+        for name, pair in self.bounds.items():
+            if not (isinstance(pair, (tuple, list)) and len(pair) == 2 and -math.inf < pair[0] < pair[1] < math.inf):
+                raise ModelError(f"bounds of {name} = {pair!r} are no interval; write (low, high)")
+
+
+@dataclass(frozen=True)
+class GeneticRun:
+    """What the algorithm came to: the best candidate of all seeds, and what each seed came to, within which bounds.
+
+    Errors are (45), or RMSE (46) for the norm ``"l2"``; under an order law the sum of each output's divided by its
+    spread.
+    """
+
+    orders: dict[str, float]
+    coefficients: dict[str, float]
+    errors: dict[int, float]
+    evaluations: dict[int, int]
+    bounds: dict[str, tuple[float, float]]
+
+
+@dataclass(frozen=True)
+class _Rows:
+    """One equation's candidates from genes: alpha, orders, coefficients = genes @ weights + constants."""
+
+    points: _core.Points
+    weights: Floats
+    constants: Floats
+    own: NDArray[np.bool_]
+    scale: float
+
+    def candidates(self, genes: Floats, *, repaired: bool) -> Floats:
+        """Rows for the core; repaired ones have no order above what alpha allows."""
+        rows = genes @ self.weights + self.constants
+        if repaired:
+            highest = rows[:, :1] - np.where(self.own, RESOLUTION, 0.0)
+            n = self.own.size
+            rows[:, 1 : 1 + n] = np.minimum(rows[:, 1 : 1 + n], highest)
+        return rows
+
+
+class Problem:
+    """Genes and what they are worth.
+
+    Parameters
+    ----------
+    records, structure, lattice, settings
+        As :func:`genetic_search` has them.
+    norm
+        ``"l1"`` or ``"l2"``.
+    threads
+        Of the free runs.
+    """
+
+    def __init__(
+        self, records: list[Record], structure: Structure, lattice: Lattice, settings: Genetic, norm: str, threads: int
+    ) -> None:
+        values = lattice.values(structure)
+        self.order_names, self.coefficient_names = structure.order_names, structure.coefficient_names
+        self.names = (*self.order_names, *self.coefficient_names)
+        self.law = structure.has_order_law
+        self.bounds: dict[str, tuple[float, float]] = {n: (v[0], v[-1]) for n, v in values.items()}
+        self.bounds |= {n: default_bounds(n, records, structure, values) for n in self.coefficient_names}
+        for name, pair in settings.bounds.items():
+            if name not in self.names:
+                raise ModelError(f"bounds of {name!r}: there is no such number; free are {', '.join(self.names)}")
+            self.bounds[name] = (float(pair[0]), float(pair[1]))
+        self.rows = [self._rows(e, records, norm) for e in structure.equations]
+        self.threads = threads
+        self.size = self._candidates(structure, records, values)
+
+    def _rows(self, item: Equation, records: list[Record], norm: str) -> _Rows:
+        signals, inputs = records[0].signals, list(records[0].inputs)
+        n = len(item.terms)
+        weights, constants = np.zeros((len(self.names), 1 + 2 * n)), np.zeros(1 + 2 * n)
+
+        def place(column: int, order: Order) -> None:
+            constants[column] = order.constant
+            for name, weight in order.weights:
+                weights[self.names.index(name), column] = weight
+
+        place(0, item.order)
+        for k, term in enumerate(item.terms):
+            place(1 + k, term.order)
+            if isinstance(term.coefficient, str):
+                weights[self.names.index(term.coefficient), 1 + n + k] = term.factor
+            else:
+                constants[1 + n + k] = term.factor * term.coefficient
+        points = _core.Points(
+            [r.core() for r in records],
+            signals.index(item.output),
+            [signals.index(t.signal) for t in item.terms],
+            inputs,
+            norm == "l2",
+        )
+        own = np.array([t.signal == item.output for t in item.terms])
+        count = sum(r.m for r in records)
+        spread = math.sqrt(sum(float(np.var(r.of(item.output)) * r.m) for r in records) / count)
+        scale = 1.0 if not self.law else spread * count if norm == "l1" else spread
+        return _Rows(points, weights, constants, own, scale)
+
+    def _candidates(self, structure: Structure, records: list[Record], values: Mapping[str, tuple[float, ...]]) -> int:
+        """Size of the lattice; under a law an upper bound of it."""
+        if self.law:
+            return math.prod(len(v) for v in values.values())
+        orders = lattice_tuple(structure.equations[0], records[0].signals, values)
+        return _core.lattice_size(orders, list(records[0].inputs))
+
+    def tidy(self, genes: Floats) -> Floats:
+        """Orders in whole steps."""
+        tidied = np.array(genes, dtype=np.float64)
+        n = len(self.order_names)
+        tidied[:, :n] = np.round(tidied[:, :n] / RESOLUTION) * RESOLUTION
+        return tidied
+
+    def errors(self, genes: Floats, limit: float) -> Floats:
+        """What each row of genes is worth; infinite above the limit."""
+        tidied, total = self.tidy(genes), np.zeros(genes.shape[0])
+        for part in self.rows:
+            rows = np.ascontiguousarray(part.candidates(tidied, repaired=not self.law))
+            total += part.points.scores(rows, limit * part.scale, self.threads) / part.scale
+        return np.where(total <= limit, total, np.inf)
+
+    def named(self, genes: Floats) -> tuple[dict[str, float], dict[str, float]]:
+        """Orders and coefficients by name."""
+        tidied = self.tidy(genes[None, :])
+        n = len(self.order_names)
+        values = dict(zip(self.names, tidied[0].tolist(), strict=True))
+        if not self.law:
+            part = self.rows[0]
+            row = part.candidates(tidied, repaired=True)[0]
+            for column, value in enumerate(row[: 1 + part.own.size].tolist()):
+                gene = np.flatnonzero(part.weights[:n, column])
+                if gene.size:
+                    values[self.names[int(gene[0])]] = value
+        orders = {name: round(values[name], 9) for name in self.order_names}
+        return orders, {name: values[name] for name in self.coefficient_names}
+
+
+def default_bounds(
+    name: str, records: Sequence[Record], structure: Structure, values: Mapping[str, tuple[float, ...]]
+) -> tuple[float, float]:
+    """Bounds of a coefficient, see :class:`Genetic`."""
+    stated = structure.reference.get(name, 0.0)
+    if stated:
+        return -STATED_RANGE * abs(stated), STATED_RANGE * abs(stated)
+    middle = {n: 0.5 * (v[0] + v[-1]) for n, v in values.items()}
+    item, term = next((e, t) for e in structure.equations for t in e.terms if t.coefficient == name)
+    eta = max(item.order.at(middle) - term.order.at(middle), 0.0)
+    largest = 0.0
+    for record in records:
+        kernel = _core.block_pulse_kernel(eta, record.m, record.step)
+        integral = _core.series_multiply(kernel, record.of(term.signal), record.m)
+        size = float(np.linalg.norm(integral))
+        largest = max(largest, float(np.linalg.norm(record.of(item.output))) / size if size else 0.0)
+    limit = SCALE_RANGE * (largest or 1.0) / abs(term.factor)
+    return -limit, limit
+
+
+def genetic_search(
+    records: list[Record],
+    structure: Structure,
+    lattice: Lattice,
+    settings: Genetic,
+    *,
+    norm: str = "l1",
+    threads: int | None = None,
+    progress: Callable[[int, int], None] | None = None,
+) -> GeneticRun:
+    """Minimise the error of the free run over orders and coefficients of one equation, or several under an order law.
+
+    The ends of the lattice bound the orders, its size is the default number of evaluations; progress counts these over
+    all seeds. The result is the same for any number of threads.
+
+    Raises
+    ------
+    ModelError
+        PyGAD is not installed, a record that does not start at rest, bounds of a number that is not free, a lattice
+        so large that the number of evaluations must be given.
+    """
+    try:
+        import pygad  # type: ignore[import-untyped]  # noqa: PLC0415 — an extra; only this baseline needs it
+    except ImportError:
+        raise ModelError("the genetic baseline needs PyGAD; pip install 'ftlm[genetic]'") from None
+    if records[0].offset != "none":
+        raise ModelError(
+            f"the genetic baseline knows no offset, and offset = {records[0].offset!r}; "
+            "use method='output-error', or offset='none'"
+        )
+    if records[0].start != (False, []):
+        raise ModelError(
+            "the genetic baseline knows no initial terms and needs runs that start at rest; "
+            "slice the runs, or give the structure initial='rest'"
+        )
+    problem = Problem(records, structure, lattice, settings, norm, check_threads(threads))
+    wanted = settings.evaluations or problem.size
+    if settings.evaluations is None and wanted > MOST_EVALUATIONS:
+        raise ModelError(
+            f"the lattice has {wanted} candidates, too many to evaluate one by one; give Genetic(evaluations=…)"
+        )
+    wanted = max(wanted, 2 * settings.population)
+    total = wanted * len(settings.seeds)
+    if isinstance(progress, Progress):
+        name = "the stage" if structure.has_order_law else structure.outputs[0]
+        progress.expect(f"the genetic algorithm on {name}", *_seconds(problem, settings.population, total))
+    ends: dict[int, _Kept] = {}
+    for number, seed in enumerate(settings.seeds):
+
+        def told(count: int, before: int = number * wanted) -> None:
+            if progress is not None:
+                progress(min(before + count, total), total)
+
+        ends[int(seed)] = _evolved(pygad.GA, problem, settings.population, int(seed), wanted, told)
+    best = min(ends.values(), key=lambda kept: kept.best)
+    if not math.isfinite(best.best):
+        raise ModelError("no candidate of the genetic algorithm had a finite error; narrow its bounds")
+    orders, coefficients = problem.named(best.genes)
+    errors = {seed: kept.best for seed, kept in ends.items()}
+    return GeneticRun(orders, coefficients, errors, {s: kept.count for s, kept in ends.items()}, problem.bounds)
+
+
+def _seconds(problem: Problem, population: int, evaluations: int) -> tuple[float, float]:
+    """Least and most time of so many evaluations [s], as the first generation tells: later ones are left sooner."""
+    low, high = np.array([problem.bounds[n] for n in problem.names]).T
+    genes = low + np.random.default_rng(0).random((population, low.size)) * (high - low)
+    begun = time.perf_counter()
+    problem.errors(genes, math.inf)
+    each = (time.perf_counter() - begun) / population
+    return FOLLOWED[0] * each * evaluations, FOLLOWED[1] * each * evaluations
+
+
+def _evolved(
+    algorithm: Any, problem: Problem, population: int, seed: int, wanted: int, told: Callable[[int], None]
+) -> _Kept:
+    """Run the algorithm from one seed until it has spent its evaluations.
+
+    Real-coded: simulated binary crossover, polynomial mutation, truncation selection whose survivors are the next
+    generation's parents. A candidate that cannot be among those is left as soon as its partial error says so, which
+    changes no generation.
+    """
+    parents = max(2, round(PARENTS * population))
+    kept = _Kept(parents)
+    bounds = [problem.bounds[n] for n in problem.names]
+    low, high = np.array(bounds).T
+
+    def enough(_: Any) -> str | None:
+        return "stop" if kept.count >= wanted else None
+
+    def crossover(chosen: Any, size: tuple[int, int], running: Any) -> Floats:
+        return simulated_binary(np.asarray(chosen, dtype=np.float64), size, running.numpy_random_generator)
+
+    def mutation(children: Any, running: Any) -> Floats:
+        return polynomial(np.asarray(children, dtype=np.float64), low, high, running.numpy_random_generator)
+
+    def fitness(_: Any, genes: Any, __: Any) -> list[float]:
+        candidates = np.asarray(genes, dtype=np.float64)
+        errors = problem.errors(candidates, kept.limit)
+        kept.take(errors, candidates)
+        told(kept.count)
+        return np.where(np.isfinite(errors), -errors, HOPELESS).tolist()  # type: ignore[no-any-return]
+
+    algorithm(
+        num_generations=MOST_COPIES * math.ceil(wanted / (population - parents)),
+        on_generation=enough,
+        num_parents_mating=parents,
+        keep_elitism=parents,
+        sol_per_pop=population,
+        num_genes=len(bounds),
+        fitness_func=fitness,
+        fitness_batch_size=population,
+        gene_space=[{"low": start, "high": end} for start, end in bounds],
+        parent_selection_type="sss",
+        crossover_type=crossover,
+        mutation_type=mutation,
+        random_seed=seed,
+        suppress_warnings=True,
+        save_best_solutions=False,
+    ).run()
+    return kept
+
+
+def simulated_binary(parents: Floats, size: tuple[int, int], random: Any) -> Floats:
+    """Children between and around pairs of parents, gene by gene (Deb and Agrawal, Complex Systems 9, 1995)."""
+    pairs = (size[0] + 1) // 2
+    first, second = (parents[random.randint(0, parents.shape[0], pairs)] for _ in range(2))
+    u = random.random_sample(first.shape)
+    with np.errstate(divide="ignore"):
+        spread = np.where(u <= 0.5, 2.0 * u, 0.5 / (1.0 - u)) ** (1.0 / (CROSSOVER_SPREAD + 1.0))
+    crossed = (random.random_sample(first.shape) < 0.5) & (random.random_sample((pairs, 1)) < CROSSED)
+    spread = np.where(crossed, spread, 1.0)
+    middle, half = 0.5 * (first + second), 0.5 * (first - second)
+    return np.concatenate([middle + spread * half, middle - spread * half])[: size[0]]
+
+
+def polynomial(children: Floats, low: Floats, high: Floats, random: Any) -> Floats:
+    """Children with one gene in their number moved, on average, and all within bounds (Deb and Goyal 1996)."""
+    u = random.random_sample(children.shape)
+    power = 1.0 / (MUTATION_SPREAD + 1.0)
+    move = np.where(u < 0.5, (2.0 * u) ** power - 1.0, 1.0 - (2.0 * (1.0 - u)) ** power)
+    moved = random.random_sample(children.shape) < 1.0 / children.shape[1]
+    return np.clip(children + np.where(moved, move * (high - low), 0.0), low, high)
+
+
+class _Kept:
+    """The smallest errors met so far, as many as there are parents: who exceeds the largest is no parent."""
+
+    def __init__(self, parents: int) -> None:
+        self._errors = np.full(parents, np.inf)
+        self.genes = np.zeros(0)
+        self.best = math.inf
+        self.count = 0
+
+    @property
+    def limit(self) -> float:
+        """The largest of them."""
+        return float(self._errors[-1])
+
+    def take(self, errors: Floats, genes: Floats) -> None:
+        """Learn of a generation."""
+        self.count += errors.size
+        first = int(np.argmin(errors))
+        if errors[first] < self.best:
+            self.best, self.genes = float(errors[first]), genes[first].copy()
+        self._errors = np.sort(np.concatenate([self._errors, errors]))[: self._errors.size]
+
+
+#: Candidates a generation for each gene: SciPy's own.
+EACH = 15
+#: Logarithm of an error that is not finite: above those of all that are.
+DIVERGED = 1e3
+
+
+def differential_evolution_search(
+    records: list[Record],
+    structure: Structure,
+    lattice: Lattice,
+    settings: Genetic,
+    *,
+    norm: str = "l1",
+    threads: int | None = None,
+    progress: Callable[[int, int], None] | None = None,
+) -> GeneticRun:
+    """Minimise the error of the free run by differential evolution, within what the genetic baseline is given.
+
+    Seeds, evaluations and bounds are those of `settings`; everything else is as SciPy has it (best1bin, 15 candidates a
+    gene), with as many whole generations as the evaluations are enough for, and no local search at the end.
+
+    Raises
+    ------
+    ModelError
+        SciPy is not installed, a record that does not start at rest, no candidate with a finite error.
+    """
+    try:
+        from scipy.optimize import differential_evolution  # type: ignore[import-untyped]  # noqa: PLC0415 — an extra; only this rival needs it
+    except ImportError:
+        raise ModelError("differential evolution needs SciPy; pip install 'ftlm[genetic]'") from None
+    if records[0].start != (False, []) or records[0].offset != "none":
+        raise ModelError("differential evolution knows no initial terms and no offset; slice the runs to start at rest")
+    problem = Problem(records, structure, lattice, settings, norm, check_threads(threads))
+    wanted = settings.evaluations or problem.size
+    bounds = [problem.bounds[n] for n in problem.names]
+    generation = EACH * sum(low < high for low, high in bounds)
+    generations = max(0, math.ceil(wanted / generation) - 1)
+    total, done = (generations + 1) * generation * len(settings.seeds), 0
+
+    def errors(columns: Floats) -> Floats:
+        nonlocal done
+        rows = np.ascontiguousarray(columns.T if columns.ndim == 2 else columns[None, :])
+        done += rows.shape[0]
+        if progress is not None:
+            progress(min(done, total), total)
+        # Only comparisons count, and the spread of errors over hundreds of decades is no number.
+        with np.errstate(divide="ignore"):
+            return np.clip(np.log(problem.errors(rows, math.inf)), -DIVERGED, DIVERGED)
+
+    ends: dict[int, Any] = {}
+    for seed in settings.seeds:
+        ends[int(seed)] = differential_evolution(
+            errors,
+            bounds,
+            maxiter=generations,
+            popsize=EACH,
+            tol=0.0,
+            polish=False,
+            updating="deferred",
+            vectorized=True,
+            rng=np.random.default_rng(int(seed)),
+        )
+    best = min(ends.values(), key=lambda end: float(end.fun))
+    if best.fun >= DIVERGED:
+        raise ModelError("no candidate of differential evolution had a finite error; narrow its bounds")
+    orders, coefficients = problem.named(np.asarray(best.x, dtype=np.float64))
+    each = {seed: math.exp(end.fun) if end.fun < DIVERGED else math.inf for seed, end in ends.items()}
+    # SciPy counts calls, of a generation each.
+    evaluations = {seed: int(end.nfev) * generation for seed, end in ends.items()}
+    return GeneticRun(orders, coefficients, each, evaluations, problem.bounds)

@@ -1,0 +1,370 @@
+"""Coefficients at given orders: least squares, multi-innovation, instrumental variables."""
+
+from __future__ import annotations
+
+from collections.abc import Sequence
+from dataclasses import dataclass, field, replace
+from typing import Any, Literal
+
+import numpy as np
+from numpy.typing import NDArray
+
+from ftlm import _core
+from ftlm.data.run import Run
+from ftlm.errors import DataError, FtlmError, InternalError, ModelError
+from ftlm.order_search.options import Settings
+from ftlm.simulation.discretization import InitialTuple, Record, named_coefficients, prepare, structure_tuple
+from ftlm.structure.equation import Equation
+from ftlm.structure.structure import Initial, Structure
+from ftlm.svg.figure import Figure
+from ftlm.svg.line_chart import line_chart
+from ftlm.utils.validation import Floats, whole_number
+
+#: Most steps of refined instrumental variables, and the relative change of a coefficient that ends them.
+REFINEMENTS = 40
+STILL = 1e-8
+#: A coefficient that the prior moves by more than this share is not the data's alone.
+PULLED = 0.05
+#: Fewest pulses on which the effect of the step is looked at.
+LEAST_PULSES = 32
+#: Standard errors that the step may move a coefficient by before it is said.
+STEP_BIAS = 0.5
+
+
+@dataclass(frozen=True)
+class CoefficientFit:
+    """Coefficients at given orders by name, their standard errors where known, on what, and what to beware of."""
+
+    m: int
+    initial: Initial
+    values: dict[str, float] = field(default_factory=dict)
+    errors: dict[str, float] = field(default_factory=dict)
+    warnings: list[str] = field(default_factory=list)
+
+
+def estimate_coefficients(
+    runs: Sequence[Run], structure: Structure, settings: Settings, m: int | None
+) -> CoefficientFit:
+    """Coefficients at given orders by the estimator that the settings name."""
+    records = prepare(runs, structure, m, power_of_two=settings.needs_haar)
+    fit = CoefficientFit(records[0].m, records[0].initial)
+    if settings.coefficients == "instrumental-variables":
+        _instrumental(fit, structure, records)
+        return fit
+    for item in structure.equations:
+        if settings.coefficients == "least-squares":
+            raw = _core.least_squares(*_linear(item, records))[0]
+        else:
+            raw = _multi_innovation(item, records, settings, settings.prior_covariance)
+            # A prior so weak that the data alone decide.
+            weak = _multi_innovation(item, records, settings, min(settings.prior_covariance * 1e12, 1e300))
+            fit.warnings.extend(_pulled(item.output, raw, weak, settings))
+        fit.values.update(named_coefficients(item, raw))
+    return fit
+
+
+def _linear(
+    item: Equation, records: list[Record]
+) -> tuple[list[Any], Any, list[bool], list[float | None], InitialTuple]:
+    """One equation and its records as the estimators that are linear in the coefficients take them."""
+    first = records[0]
+    fixed, structure = [t.fixed for t in item.terms], structure_tuple(item, first.signals)
+    return [r.core() for r in records], structure, list(first.inputs), fixed, first.start
+
+
+def _multi_innovation(item: Equation, records: list[Record], settings: Settings, prior: float) -> list[float]:
+    """Coefficients by (44) in closed form."""
+    haar = settings.rows == "haar"
+    (raw, *_), _ = _core.multi_innovation(*_linear(item, records), settings.innovation_length, prior, haar, False)
+    return raw
+
+
+def _instrumental(fit: CoefficientFit, structure: Structure, records: list[Record]) -> None:
+    """Fill in coefficients by refined instrumental variables, their standard errors at these orders, and warnings.
+
+    Equations that drive each other are simulated together, so that every instrument follows from the inputs alone.
+    """
+    initial, inputs = records[0].start, list(records[0].inputs)
+    groups = [structure.equations] if structure.coupling == "simulated" else [(e,) for e in structure.equations]
+    for group in groups:
+        outputs = ", ".join(e.output for e in group)
+        estimates, covariances, iterations, converged, damped = _core.instrumental_variables(
+            [r.core() for r in records],
+            [structure_tuple(e, records[0].signals) for e in group],
+            inputs,
+            [[t.fixed for t in e.terms] for e in group],
+            initial,
+            REFINEMENTS,
+            STILL,
+        )
+        if not converged:
+            fit.warnings.append(
+                f"{outputs}: instrumental variables did not stand still in {iterations} steps; the coefficients are "
+                "those of the least output error met. Too much noise for these terms: use method='output-error'"
+            )
+        if damped:
+            fit.warnings.append(f"{outputs}: the free run of these coefficients is unstable; do not trust them")
+        for item, (raw, _, _, _), covariance in zip(group, estimates, covariances, strict=True):
+            fit.values.update(named_coefficients(item, raw))
+            free = [t for t in item.terms if t.fixed is None]
+            spread = np.sqrt(np.diag(np.reshape(covariance, (len(free), len(free)))))
+            pairs = zip(free, spread.tolist(), strict=True)
+            fit.errors.update({str(t.coefficient): s / abs(t.factor) for t, s in pairs})
+
+
+def step_bias(runs: Sequence[Run], structure: Structure, settings: Settings, fit: CoefficientFit) -> list[str]:
+    """Say so where the step of the pulses moves coefficients by more than noise does.
+
+    The scheme is of second order, so of the move from twice the step a third is left (Richardson).
+    """
+    if not fit.errors or fit.m < 2 * LEAST_PULSES:
+        return []
+    try:
+        coarser = estimate_coefficients(runs, structure, settings, fit.m // 2).values
+    except FtlmError:
+        # A step that leaves no estimate tells nothing about half of it.
+        return []
+    moved = {n: abs(coarser[n] - fit.values[n]) / 3 / e for n, e in fit.errors.items() if e > 0}
+    worst = max(moved, key=lambda n: moved[n], default="")
+    if not worst or moved[worst] <= STEP_BIAS:
+        return []
+    carried = min(run.length - 1 for run in runs)
+    finer = f"raise m, up to {carried}, or " if fit.m < carried else ""
+    # Far from the limit a third of the move says no more than that it is large.
+    amount = f"about {moved[worst]:.2g}" if moved[worst] <= 10 else "more than 10"
+    return [
+        f"at {fit.m} pulses the step alone moves coefficient {worst} by {amount} standard errors, which do "
+        f"not count it; {finer}use method='output-error', which refines the step"
+    ]
+
+
+def _pulled(output: str, raw: list[float], weak: list[float], settings: Settings) -> list[str]:
+    """Say so where the prior, not the data, decides the size of a coefficient."""
+    shares = [abs(a - b) / abs(b) for a, b in zip(raw, weak, strict=True) if b]
+    worst = max(shares, default=0.0)
+    if worst <= PULLED:
+        return []
+    return [
+        f"{output}: the prior (K0 = {settings.prior_covariance:g}, coefficients near 0) moves a coefficient by "
+        f"{100 * min(worst, 9.99):.0f} % from what the data alone say; p = {settings.innovation_length} only weighs "
+        "the data against it. Raise prior_covariance or use method='least-squares'"
+    ]
+
+
+@dataclass(frozen=True)
+class Trace:
+    """How the recursion (44) converged on one equation.
+
+    Parameters
+    ----------
+    step
+        Steps at which the rest is given, from 1.
+    coefficients
+        By name, after each of these steps.
+    error
+        Error (45) of the free run of the model after each of these steps, at rest; infinite where it diverged.
+    innovation_length
+        p.
+    """
+
+    step: NDArray[np.int64]
+    coefficients: dict[str, NDArray[np.float64]]
+    error: NDArray[np.float64]
+    innovation_length: int
+
+
+def multi_innovation_trace(
+    run: Run,
+    equation: Structure,
+    *,
+    innovation_length: int = 7,
+    prior_covariance: float = 1.0,
+    rows: Literal["haar", "time"] = "haar",
+    m: int | None = None,
+    every: int = 1,
+) -> Trace:
+    """Run the recursion (44) step by step: coefficients, and error (45) of the model they make, after every step.
+
+    Parameters
+    ----------
+    run
+        One run that starts at rest.
+    equation
+        One equation whose orders are numbers.
+    innovation_length, prior_covariance, rows, m
+        See :func:`identify`.
+    every
+        Give every n-th step (and the last).
+
+    Returns
+    -------
+    Trace
+        The last row equals the closed form to rounding.
+
+    Raises
+    ------
+    ModelError
+        More than one equation, free orders, settings out of range.
+
+    Notes
+    -----
+    O(m k^3) for the recursion and one division of series for each step given.
+    """
+    settings = Settings.check(innovation_length=innovation_length, prior_covariance=prior_covariance, rows=rows)
+    if len(equation.equations) != 1 or equation.order_names:
+        raise ModelError("a trace needs one equation whose orders are numbers; use .equation(…).with_orders(…)")
+    if equation.offset != "none":
+        raise ModelError(f"a trace follows no offset, and offset = {equation.offset!r}; use offset='none'")
+    stride = whole_number(every)
+    if stride is None or stride < 1:
+        raise ModelError(f"every = {every!r} is no whole number from 1; 1 gives every step")
+    rest = replace(equation, initial="rest")
+    rec = prepare([run], rest, m, power_of_two=settings.needs_haar)[0]
+    item = equation.equations[0]
+    core_structure = structure_tuple(item, rec.signals)
+    inputs = list(rec.inputs)
+    _, trace = _core.multi_innovation(
+        [rec.core()],
+        core_structure,
+        inputs,
+        [t.fixed for t in item.terms],
+        (False, []),
+        settings.innovation_length,
+        settings.prior_covariance,
+        settings.rows == "haar",
+        True,
+    )
+    if trace is None:
+        raise InternalError("the recursion gave no trace; please report it")
+    step = np.unique(np.append(np.arange(stride, trace.shape[0] + 1, stride), trace.shape[0]))
+    kept = np.ascontiguousarray(trace[step - 1])
+    error = _core.trace_errors(rec.core(), core_structure, inputs, kept)
+    names = {t.coefficient: kept[:, k] / t.factor for k, t in enumerate(item.terms) if isinstance(t.coefficient, str)}
+    return Trace(step, names, error, settings.innovation_length)
+
+
+def trace_chart(traces: Sequence[tuple[str, Trace]], *, title: str, log_x: bool = False) -> Figure:
+    """Error (45) of the free run after every step of the recursion (44), as in the paper's Figure 4(b).
+
+    Parameters
+    ----------
+    traces
+        (name, trace), such as ("p = 7", …), of one equation and with the same steps.
+    title
+        What is shown.
+    log_x
+        Whether the axis of steps is logarithmic, which widens the first ones.
+
+    Raises
+    ------
+    DataError
+        No trace, or traces whose steps differ.
+    """
+    if not traces:
+        raise DataError("a convergence chart needs at least one trace; give (name, trace) pairs")
+    steps = traces[0][1].step
+    for name, trace in traces:
+        if not np.array_equal(trace.step, steps):
+            raise DataError(f"trace {name!r} is given at other steps than {traces[0][0]!r}; use the same every=")
+    return line_chart(
+        steps,
+        [(name, trace.error) for name, trace in traces],
+        title=title,
+        x_label="step of the recursion",
+        y_label="error (45) of the free run",
+        log_x=log_x,
+        log_y=True,
+    )
+
+
+class Streaming:
+    """Coefficients of a structure after every sample of a run that starts at rest.
+
+    Each sample costs the same, whatever the length of the run: the past is held by about a hundred numbers a signal.
+    After the last sample the coefficients are those of ``identify(method="multi-innovation", rows="time")`` at the
+    same orders on the run's own grid, to rounding.
+
+    Parameters
+    ----------
+    structure
+        One or several equations whose orders are numbers, without delays, initial terms or sensor filter; alpha - nu
+        of every term in [0, 2].
+    step
+        Time between samples [s].
+    longest
+        Longest run [s].
+    inputs
+        Which of the structure's signals are inputs, held between samples.
+    innovation_length, prior_covariance
+        p and K0 of (44).
+
+    Raises
+    ------
+    ModelError
+        A structure that a stream cannot do, settings out of range.
+    """
+
+    def __init__(
+        self,
+        structure: Structure,
+        *,
+        step: float,
+        longest: float,
+        inputs: Sequence[str] = ("I1", "I2"),
+        innovation_length: int = 7,
+        prior_covariance: float = 1.0,
+    ) -> None:
+        if structure.order_names:
+            raise ModelError(
+                f"the orders {', '.join(structure.order_names)} are free; a stream needs numbers: give them with "
+                "with_orders(…)"
+            )
+        if structure.offset != "none":
+            raise ModelError(
+                f"offset = {structure.offset!r} cannot be followed in a stream; identify the recorded run, or use "
+                "offset='none'"
+            )
+        if (
+            structure.delay
+            or structure.limits
+            or structure.sensor_filter is not None
+            or structure.initial not in ("auto", "rest")
+        ):
+            raise ModelError(
+                "delays, limits, initial terms and sensor filters cannot be followed in a stream; identify the "
+                "recorded run"
+            )
+        self.signals = tuple(structure.signals)
+        self.structure = structure
+        known = [name in inputs for name in self.signals]
+        equations = [(structure_tuple(e, self.signals), [t.fixed for t in e.terms]) for e in structure.equations]
+        rows = max(2, round(longest / step) + 1)
+        self._core = _core.Streaming(step, rows, known, equations, innovation_length, prior_covariance)
+
+    def push(self, samples: Floats) -> None:
+        """Takes samples, shape (n, len(signals)), in SI units and in the order of `signals`.
+
+        Raises
+        ------
+        DataError
+            A sample that is not finite.
+        ModelError
+            More samples than `longest` holds.
+        ConvergenceError
+            The covariance lost its sign to rounding.
+        """
+        self._core.push(np.ascontiguousarray(samples, dtype=np.float64))
+
+    @property
+    def coefficients(self) -> dict[str, float]:
+        """By name, after the newest sample."""
+        values = zip(self.structure.equations, self._core.coefficients, strict=True)
+        return {name: c for item, raw in values for name, c in named_coefficients(item, raw).items()}
+
+    @property
+    def pulses(self) -> int:
+        """Rows of (44) so far: samples less one."""
+        return self._core.pulses
+
+    def __str__(self) -> str:
+        return ", ".join(f"{name} = {value:.6g}" for name, value in self.coefficients.items())

@@ -1,0 +1,369 @@
+"""What makes an identified model doubtful, in words."""
+
+from __future__ import annotations
+
+import math
+from collections.abc import Sequence
+from dataclasses import replace
+
+import numpy as np
+
+from ftlm import _core
+from ftlm.data.run import Run
+from ftlm.data.sampling import read
+from ftlm.estimation.free_parameters import FreeProblem
+from ftlm.estimation.output_error import FAR, JointFit
+from ftlm.estimation.result import Judged
+from ftlm.model.model import Model
+from ftlm.simulation.discretization import compared_values, has_own_times
+from ftlm.simulation.output_samples import Sampled
+from ftlm.structure.structure import Structure
+from ftlm.utils.linalg import dot
+from ftlm.utils.statistics import ROUNDING, is_white, robust_deviation
+from ftlm.utils.validation import Floats
+from ftlm.validation.comparison import Comparison, compare, validation_warnings
+from ftlm.validation.data_advice import dead, excitation_for
+
+#: Two parameters more correlated than this cannot be told apart where neither is known by itself.
+INSEPARABLE = 0.995
+#: A coefficient or delay is not known by itself where its standard error exceeds this share of its value, an order
+#: where it exceeds this much. However correlated two numbers are, both are usable if each is within a tenth: then its
+#: 95 % interval spans less than half its value, and an order's less than the steps of 0.5 in which mechanisms differ.
+VAGUE = 0.1
+#: Outliers are worth a word from so many on, and from this share of all residuals on; fewer, where they hold this share
+#: of the squares: they double the variance of every number then.
+FEWEST_OUTLIERS = 3
+OUTLIERS = 2e-3
+DECISIVE = 0.5
+#: Noise of this share of a step shakes an output over its steps; with less, residuals are the rounding itself.
+COARSE = 2.0
+#: Share of a step by which multiples of it may be off.
+ROUNDED = 0.01
+#: Share of its range by which an output must move within a sample to count as moving.
+TURNED = 1e-6
+#: Fewer intervals than this in which a body moves at less than so many times vs tell nothing of how friction falls.
+FEWEST_SLOW, SLOW = 5, 2.0
+#: Two coefficients further apart than this share do not obey the coefficient law.
+LAW_BROKEN = 0.05
+
+
+def uncertain(joint: JointFit, problem: FreeProblem) -> list[str]:
+    """Say what the runs cannot tell."""
+    warnings = []
+    if not joint.converged:
+        warnings.append("the fit ended before it stood still; its figures are provisional")
+    if not joint.settled:
+        warnings.append(
+            f"at {joint.refinement} pulses a sample the step still moves estimates by over a tenth of their standard "
+            "errors: the model is stiffer than the sampling; sample faster or trust its fast poles less"
+        )
+    warnings += _growth(joint)
+    errors = joint.standard_errors
+    unseen = [n for n in joint.names if math.isinf(errors[n])]
+    if unseen:
+        warnings.append(
+            f"these runs do not tell {', '.join(unseen)} apart: moved together they change nothing that was measured, "
+            "so their intervals are infinite; leave a term out, fix one of them, or record a richer input"
+        )
+    for (name, value), (low, high) in zip(joint.orders.items(), problem.bounds, strict=True):
+        # Negated so that a standard error that is not a number counts as too large.
+        if name in unseen:
+            continue
+        if not errors[name] <= high - low and not _bounded(joint, name):
+            warnings.append(f"order {name} cannot be told from these runs: its standard error exceeds its bounds")
+        elif min(value - low, high - value) < 1e-6 and high > low and value != 0:
+            warnings.append(f"order {name} = {value:g} is on its bound; widen it")
+    for item in problem.inputs:
+        value, (low, high) = joint.inputs[item.name], item.bounds
+        if item.name in unseen:
+            continue
+        if not errors[item.name] <= high - low and not _bounded(joint, item.name):
+            warnings.append(f"the {item.words} cannot be told from these runs: its standard error exceeds its bounds")
+        elif high - value < 1e-6 * (high - low) or (low > 0 and value - low < 1e-6 * (high - low)):
+            unit = " s" if item.law == "delay" else ""
+            warnings.append(f"the {item.words} = {value:g}{unit} is on its bound; widen it")
+    for name, value in joint.coefficients.items():
+        # Where the cost is no parabola, its profile knows better.
+        told = name in joint.profiles and 0.0 not in joint.profiles[name]
+        if name not in unseen and not errors[name] <= abs(value) and not told:
+            warnings.append(
+                f"coefficient {name} = {value:.4g} is not different from 0 in these runs "
+                f"(standard error {errors[name]:.3g})"
+            )
+    warnings += inseparable(joint) + unbounded_ends(joint, unseen)
+    coloured = sorted({o for run in joint.residuals for o, series in run.items() if not is_white(series)})
+    if coloured:
+        warnings.append(
+            f"residuals of {', '.join(coloured)} are not white: the model leaves something out; "
+            "standard errors allow for the colour, not for the bias of what is left out"
+        )
+    return warnings
+
+
+def _growth(joint: JointFit) -> list[str]:
+    """Say what was made of an optimum whose free run grows."""
+    if joint.growth is None or joint.growth.excess <= 0.0:
+        # One that costs more than the stable one was none.
+        return []
+    excess = 100.0 * joint.growth.excess
+    if not joint.growth.kept:
+        limit = joint.growth.at_limit
+        smaller = 100.0 * (1.0 - 1.0 / (1.0 + joint.growth.excess))
+        return [
+            f"an optimum that is not stable has residuals {smaller:.2g} % smaller, by no more than chance: what the "
+            "run did before its start takes a growing mode away until its end; the stable one was kept"
+            + (", which stands where free runs begin to grow: the runs do not tell its damping" if limit else "")
+        ]
+    if not math.isfinite(excess):
+        return ["no stable optimum was found beside this one, whose free run grows"]
+    return [
+        f"the free run of this optimum grows; the best stable one found has residuals {excess:.2g} % larger, which the "
+        "runs refuse at 99 %: an unstable machine in a closed loop, or a term that is missing"
+    ]
+
+
+def _bounded(joint: JointFit, name: str) -> bool:
+    """Whether the profile of the likelihood has both ends of a number's interval."""
+    return name in joint.profiles and not joint.profiles[name].is_open
+
+
+def unbounded_ends(joint: JointFit, unseen: Sequence[str]) -> list[str]:
+    """Say which numbers have an interval without an end."""
+    sides = {
+        n: [s for s, end in (("below", p.low), ("above", p.high)) if math.isinf(end)]
+        for n, p in joint.profiles.items()
+        if n not in unseen
+    }
+    # An order that ends at 0 has nothing below it.
+    words = [f"{n} {' or '.join(s)}" for n, s in sides.items() if s and (s != ["below"] or joint.orders.get(n) != 0.0)]
+    if not words:
+        return []
+    return [
+        f"these runs do not bound {', '.join(words)}: with all other numbers fitted anew the cost never rises by what "
+        "noise explains; fix a number, leave a term out, or record a richer input"
+    ]
+
+
+def irregular(runs: Sequence[Run], joint: JointFit, problem: FreeProblem) -> list[str]:
+    """Say what in the samples harms the figures: outliers, quantisation, times that could not be honoured."""
+    warnings = []
+    for output in problem.structure.outputs:
+        size = math.sqrt(float(np.mean([np.nanvar(run[output]) for run in runs])))
+        noise = joint.noise[output]
+        if noise <= ROUNDING * size:
+            continue
+        warnings += [
+            w for w in (_outliers(runs, joint, output), _quantised(runs, problem.structure, output, noise)) if w
+        ]
+    kept = [run.name for run in runs if run.readings is not None and not has_own_times(run, problem.structure)]
+    if kept:
+        warnings.append(
+            f"{', '.join(kept)}: outputs were read at times of their own, but a free delay, or signals taken "
+            "behind a sensor filter, need them on a grid: straight lines were drawn between them, and the intervals do "
+            "not know what that costs"
+        )
+    return warnings
+
+
+def _outliers(runs: Sequence[Run], joint: JointFit, output: str) -> str | None:
+    """Residuals far beyond the usual ones, where nothing was done about them."""
+    if joint.robust is not None:
+        return None
+    every = read(np.concatenate([part[output] for part in joint.residuals]))
+    usual = robust_deviation(every)
+    far, first = 0, ""
+    for run, part in zip(runs, joint.residuals, strict=True):
+        rows = np.flatnonzero(np.abs(part[output]) > FAR * usual)
+        if rows.size and not far:
+            # Compared rows begin behind the first one.
+            first = f"first at row {int(rows[0]) + 1} of {run.name}"
+        far += rows.size
+    count = every.size
+    share = float(np.sum(every[np.abs(every) > FAR * usual] ** 2) / max(dot(every, every), 1e-300))
+    if usual == 0.0 or (share < DECISIVE and far < max(FEWEST_OUTLIERS, OUTLIERS * count)):
+        return None
+    verb, held = ("lies", "holds") if far == 1 else ("lie", "hold")
+    power = f" and {held} {100 * share:.0f} % of their squares" if share >= DECISIVE else ""
+    return (
+        f"{far} of {count} residuals of {output} {verb} beyond {FAR:g} times the usual one{power}, {first}: "
+        f"{'an outlier' if far == 1 else 'outliers'}, or moments "
+        "that the model does not explain; squares let them cost precision: loss='huber' weighs them down"
+    )
+
+
+def _quantised(runs: Sequence[Run], structure: Structure, output: str, noise: float) -> str | None:
+    """An output whose steps are coarser than anything that would shake it over them."""
+    steps = [quantum(read(compared_values(run, structure, output))) for run in runs]
+    coarse = [(step, run) for step, run in zip(steps, runs, strict=True) if step > COARSE * noise]
+    if not coarse:
+        return None
+    step, run = max(coarse, key=lambda pair: pair[0])
+    return (
+        f"{output} is quantised in steps of {step:.3g} in {run.name}, and its residuals are {noise:.3g}: rounding, "
+        "which repeats where the signal does and is no noise; intervals do not allow for it; use a finer converter or "
+        "scale"
+    )
+
+
+def quantum(values: Floats) -> float:
+    """Step of which all values are whole multiples; 0 where there is none."""
+    levels = np.unique(values)
+    gaps = np.diff(levels)
+    gaps = gaps[gaps > 1e-9 * max(float(np.abs(levels).max()), float(np.ptp(levels)))] if gaps.size else gaps
+    if gaps.size == 0:
+        return 0.0
+    # Rounding apart, the least gap is the step; the mean of those close to it tells it better.
+    step = float(np.mean(gaps[gaps < 1.5 * gaps.min()]))
+    multiples = gaps / step
+    return step if float(np.abs(multiples - np.rint(multiples)).max()) < ROUNDED else 0.0
+
+
+def inseparable(joint: JointFit) -> list[str]:
+    """Say which numbers trade for each other, a line a group: correlated, and none of them known by itself."""
+    errors, correlation = joint.standard_errors, np.abs(joint.correlation)
+    sizes = {n: abs(v) for n, v in zip(joint.names, joint.values.tolist(), strict=True)}
+    # Negated so that a standard error that is not a number counts as too large.
+    vague = [i for i, n in enumerate(joint.names) if not errors[n] <= VAGUE * (1.0 if n in joint.orders else sizes[n])]
+    groups: list[list[int]] = []
+    for i in vague:
+        tied = [g for g in groups if any(_trade(joint, correlation, i, j) for j in g)]
+        groups = [g for g in groups if g not in tied] + [sorted([*(j for g in tied for j in g), i])]
+    said = []
+    for group in (g for g in groups if len(g) > 1):
+        *most, last = (joint.names[i] for i in group)
+        known = [c for i in group for j in group if i < j and math.isfinite(c := float(correlation[i, j]))]
+        of = "correlation" if len(group) == 2 else "correlations up to"
+        why = f"{of} {max(known):.4f}" if known else "their standard errors are not finite"
+        said.append(f"{', '.join(most)} and {last} cannot be told apart in these runs ({why})")
+    return said
+
+
+def _trade(joint: JointFit, correlation: Floats, i: int, j: int) -> bool:
+    """Whether two vague numbers move together; those without a finite error do, whatever their correlation."""
+    errors = joint.standard_errors
+    if not any(math.isfinite(errors[joint.names[k]]) for k in (i, j)):
+        return True
+    return bool(correlation[i, j] > INSEPARABLE)
+
+
+def unexcited(runs: Sequence[Run], structure: Structure) -> list[str]:
+    """Say so where no run alone has inputs rich enough for the free numbers of an equation."""
+    lacking = [{f.signal: f.sentence for f in excitation_for(run, structure)} for run in runs]
+    return [sentence for output, sentence in lacking[0].items() if all(output in other for other in lacking)]
+
+
+def silent(runs: Sequence[Run], structure: Structure) -> list[str]:
+    """Say where a measured channel was off: a fit takes what it shows then for motion."""
+    channels = [(r.bridged(), n) for r in runs for n in r.outputs if n in structure.signals]
+    return [f"run {run.name}: {found.sentence}" for run, name in channels for found in dead(run, name)]
+
+
+def broken_law(model: Model) -> list[str]:
+    """Distance of freely estimated coefficients from the coefficient law, in words."""
+    law, values = model.structure.coefficient_law, model.coefficients
+    warnings = []
+    for name, sign, factors in law:
+        known = [values[f] for f in factors if f in values]
+        if name not in values or len(known) != len(factors):
+            continue
+        wanted = sign * math.prod(known)
+        if abs(values[name] - wanted) > LAW_BROKEN * max(abs(wanted), abs(values[name])):
+            warnings.append(
+                f"coefficient law: {name} = {values[name]:.4g}, but the other equation gives {wanted:.4g}; "
+                "the equation-error estimators do not impose the law"
+            )
+    ratios: dict[str, list[tuple[str, float]]] = {}
+    for name, sign, factors in law:
+        free = [f for f in factors if f not in values]
+        known = [values[f] for f in factors if f in values]
+        rest = math.prod(known)
+        if name in values and len(free) == 1 and known and rest:
+            ratios.setdefault(free[0], []).append((name, sign * values[name] / rest))
+    for ratio, said in ratios.items():
+        wrong = [(n, v) for n, v in said if not v > 1]
+        if wrong:
+            listed = ", ".join(f"{v:.4g} by {n}" for n, v in wrong)
+            warnings.append(f"coefficient law: the inertia ratio {ratio} must exceed 1, but is {listed}")
+    return warnings
+
+
+def discretisation(model: Model, comparison: Comparison) -> list[str]:
+    """Warn where the block-pulse scheme itself is unstable at this number of pulses.
+
+    An own-output order alpha - nu > 1 of a stiff equation gives the scheme a mode at its Nyquist frequency that the
+    model does not have.
+    """
+    warnings = []
+    for item in model.equations:
+        own = [
+            (float(t.fixed or 0.0), item.order.constant - t.order.constant)
+            for t in item.terms
+            if t.signal == item.output
+        ]
+        margin = min(_core.nyquist_margin(own, step) for step in comparison.step)
+        if margin <= 0:
+            warnings.append(
+                f"{item.output}: at {comparison.m} pulses the discretisation itself is unstable (margin {margin:.2g}), "
+                "whether or not the model is; raise m"
+            )
+    return warnings
+
+
+def one_sided(model: Model, free: Sequence[Sampled]) -> list[str]:
+    """Warn where friction and an offset do the same: the body slides in one direction only."""
+    if not model.structure.has_friction or model.structure.offset == "none":
+        return []
+
+    def turns(samples: Floats) -> bool:
+        moved, least = np.diff(samples), TURNED * float(np.ptp(samples))
+        return bool(np.any(moved > least) and np.any(moved < -least))
+
+    return [
+        f"the velocity of {model.outputs[i]} never changes its sign in a run: while it slides, friction is a constant "
+        "like the offset, and only the rests tell them apart; add a run that moves both ways, or use offset='none'"
+        for i in model.structure.sticks
+        if not any(turns(run.outputs[i]) for run in free)
+    ]
+
+
+def unslowed(model: Model, runs: Sequence[Run], free: Sequence[Sampled]) -> list[str]:
+    """Warn where no run tells what friction has near rest from what it has at speed."""
+    said = []
+    for item in model.equations:
+        near = None if item.friction is None else item.friction.stribeck
+        if near is None or (near.name is None and near.speed_name is None):
+            continue
+        vs, column = float(near.speed), model.outputs.index(item.output)
+        paces = [np.abs(np.diff(there.outputs[column])) / run.step for run, there in zip(runs, free, strict=True)]
+        pace = np.concatenate([p[p > TURNED * p.max(initial=0.0)] for p in paces])
+        slow = int(np.sum(pace < SLOW * vs))
+        if slow < FEWEST_SLOW:
+            said.append(
+                f"{item.output} moves at less than {SLOW:g} vs = {SLOW * vs:.3g} per s in {slow} of {pace.size} "
+                "intervals: nothing tells fs and vs, what is seen of friction is fc alone; add a run that creeps, or "
+                "leave the Stribeck term out"
+            )
+        elif pace.max(initial=0.0) < vs:
+            said.append(
+                f"{item.output} never moves faster than vs = {vs:.3g} per s: what is seen of friction is fc and fs "
+                "together; add a run that slides faster, or leave the Stribeck term out"
+            )
+    return said
+
+
+def growing(model: Model) -> list[str]:
+    """Warn of poles with a positive real part: within one run the input may hide what they do, later nothing does."""
+    if model.structure.has_friction:
+        # Friction holds what would grow slowly; no poles say so.
+        return []
+    verdict = model.stability(coupling=model.structure.coupling)
+    if not verdict.unstable_poles > 0:
+        return []
+    return [f"the model is {verdict}: its free run grows without bound, however well it fits a run of this length"]
+
+
+def validate(result: Judged, runs: Run | Sequence[Run]) -> Comparison:
+    """Both errors on other runs, with what they say against the model; see :meth:`ftlm.Identification.validate`."""
+    there = compare(result.model, runs)
+    words = [*there.warnings, *validation_warnings(result.comparison, there), *discretisation(result.model, there)]
+    return replace(there, warnings=tuple(dict.fromkeys(words)))

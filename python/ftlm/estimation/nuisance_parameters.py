@@ -1,0 +1,329 @@
+"""The output error around a point: what an offset would explain there, and what free orders add to intervals."""
+
+from __future__ import annotations
+
+import math
+from collections.abc import Callable, Mapping, Sequence
+from dataclasses import dataclass, replace
+from functools import partial
+
+import numpy as np
+
+from ftlm import _core
+from ftlm.data.run import Run
+from ftlm.errors import FtlmError
+from ftlm.estimation.free_parameters import FreeProblem
+from ftlm.estimation.objective import Attempt, Grid, covariance
+from ftlm.estimation.output_error import RACED, SWEEP, JointFit, Outset, fit_output_error
+from ftlm.order_search.options import Loss
+from ftlm.progress import Course
+from ftlm.simulation.initial_conditions import decided_together, has_memory, history, misfit_of_fits, needed, together
+from ftlm.simulation.output_samples import in_motion, initial_exponents
+from ftlm.structure.equation import Term
+from ftlm.structure.order import Order
+from ftlm.structure.structure import History, Initial, Structure, offset_exponents
+from ftlm.utils.linalg import dot, orthonormal, projections, singular
+from ftlm.utils.statistics import LEVEL, ROUNDING, autoregression, chi_squared
+from ftlm.utils.validation import Floats
+from ftlm.validation.residual_tests import LAGS
+
+#: Pulses a sample interval where the fit does not say how many it needed.
+EVERY = 2
+#: Share of what an offset does that other unknowns must leave for it to be told from them.
+TOLD_APART = 1e-6
+#: What explains less of an output than this share of its deviation nobody would miss.
+VISIBLE = 1e-3
+#: Share of records without an offset in which one is spoken of that nobody asked for.
+UNASKED = 1e-4
+#: Evaluations from the lattice's point to the optimum between its points.
+EVALUATIONS = 40
+
+
+@dataclass(frozen=True)
+class OffsetTest:
+    """Whether unknown constants in the equations explain more than noise does.
+
+    Parameters
+    ----------
+    statistic
+        Squared sizes of the constants in units of their variances under the colour of the residuals; chi-squared where
+        there is no offset.
+    degrees
+        How many constants the runs tell, over all equations and runs; 0 where they tell none from the other unknowns.
+    share
+        Share of the residuals' sum of squares that the constants explain.
+    size
+        What they explain as a share of the outputs' deviations, root mean square: far below 1, it is rounding.
+    """
+
+    statistic: float
+    degrees: int
+    share: float
+    size: float
+
+    def exceeds(self, level: float = LEVEL, *, size: float = ROUNDING) -> bool:
+        """Whether a record without an offset comes to this with a probability below ``level``, rounding set aside."""
+        return self.degrees > 0 and self.size > size and self.statistic > chi_squared(self.degrees, level)
+
+    @property
+    def figures(self) -> str:
+        """The statistic and its 99 % limit in words."""
+        return f"chi-squared {self.statistic:.4g} of {self.degrees}, 99 % limit {chi_squared(self.degrees, LEVEL):.4g}"
+
+    @property
+    def decision(self) -> str:
+        """What ``offset="auto"`` makes of it, in words."""
+        if not self.degrees:
+            return "none: these runs do not tell one from the other unknowns"
+        if self.exceeds():
+            return f"constant, since the runs ask for one ({self.figures})"
+        return f"none, since the runs ask for none ({self.figures})"
+
+
+def at_point(
+    runs: Sequence[Run], structure: Structure, values: Mapping[str, float], every: int
+) -> tuple[Grid, Attempt]:
+    """The output error at given numbers, each output weighing as its residuals ask for."""
+    problem = FreeProblem.of(replace(structure, initial=decided_together(runs, structure)))
+    orders, coefficients, inputs = problem.split([values[n] for n in problem.names])
+    start = Attempt(orders, coefficients, "given", {}, inputs)
+    grid = Grid(problem, runs, [1.0] * len(structure.outputs), every=every)
+    here = grid.descend(start, 1, plain=True)
+    weights = [1.0 / max(level, 1e-300) for level in grid.levels(here).values()]
+    grid = replace(grid, weights=weights)
+    if len(weights) > 1:
+        # Initial terms bring all outputs closest together, so that they follow the weights.
+        return grid, grid.descend(here, 1, plain=True)
+    scaled = {n: weights[0] * np.asarray(here.outcome[n]) for n in ("residuals", "jacobian")}
+    cost = weights[0] ** 2 * float(here.outcome["cost"])
+    return grid, replace(here, outcome={**here.outcome, **scaled, "cost": cost})
+
+
+def offset_test(
+    runs: Sequence[Run], structure: Structure, values: Mapping[str, float], *, every: int = EVERY
+) -> OffsetTest | None:
+    """Test for an unknown constant in each equation on each run, at given numbers; None where it cannot be computed.
+
+    What an input of ones would do joins the sensitivities of everything that is free, initial terms projected out, with
+    a coefficient of 0. It is a score test made insensitive to errors of the other numbers (Neyman's C(alpha)), so that
+    any consistent estimate will do. Its variance is that of residuals of their own colour, an autoregression.
+    """
+    taken = {*structure.signals, *structure.coefficient_names, *structure.order_names, *runs[0].signals}
+    one = next(n for n in ("one", *(f"one{k}" for k in range(len(taken) + 1))) if n not in taken)
+    names = [f"{one}_{k}" for k in range(len(structure.equations))]
+    equations = tuple(
+        replace(e, terms=(*e.terms, Term(one, Order(), n))) for e, n in zip(structure.equations, names, strict=True)
+    )
+    initial = without_stand_ins(decided_together(runs, structure), structure, values)
+    extended = replace(structure, equations=equations, offset="none", initial=initial)
+    try:
+        whole = [run.with_outputs({one: np.ones(run.length)}) for run in runs]
+        grid, here = at_point(whole, extended, {**values, **dict.fromkeys(names, 0.0)}, every)
+    except FtlmError:
+        # No finite free run on this grid: the result says so elsewhere.
+        return None
+    first = len(grid.problem.orders) + grid.problem.coefficients.index(names[0])
+    rows = np.asarray(here.outcome["jacobian"])
+    others = np.delete(rows, range(first, first + len(names)), axis=0)
+    residuals = np.asarray(here.outcome["residuals"])
+    blocks = _blocks(grid)
+    columns = []
+    for row in rows[first : first + len(names)]:
+        for start, stop in ((own[0][0], own[-1][1]) for own in blocks):
+            column = np.zeros(residuals.size)
+            column[start:stop] = row[start:stop]
+            columns.append(column)
+    before = np.stack(columns, axis=1)
+    sizes = np.linalg.norm(before, axis=0)
+    left = before / np.where(sizes > 0, sizes, 1.0)
+    basis = orthonormal(others.T, 1e-12) if others.size else np.zeros((residuals.size, 0))
+    for _ in range(2):
+        left = left - basis @ (basis.T @ left)
+    directions, spread, _ = singular(left)
+    told = directions[:, spread > TOLD_APART]
+    count = told.shape[1]
+    total = dot(residuals, residuals)
+    if count == 0 or not total > 0:
+        return OffsetTest(0.0, 0, 0.0, 0.0)
+    along = projections(told, residuals)
+    # Where the numbers come from a fit with an offset, part of what it does lies along their sensitivities.
+    noise = residuals - told @ along - basis @ projections(basis, residuals)
+    spread = _coloured(told, noise, blocks, residuals.size - basis.shape[1] - count)
+    statistic = float(along @ np.linalg.pinv(spread) @ along)
+    explained = told @ along
+    sizes = [float(np.nanstd(run[o])) for run in runs for o in structure.outputs]
+    weights = [w for _ in runs for w in grid.weights]
+    places = [place for own in blocks for place in own]
+    size = max(
+        math.sqrt(float(np.mean(explained[a:b] ** 2))) / (w * s) if w * s > 0 else 0.0
+        for (a, b), w, s in zip(places, weights, sizes, strict=True)
+    )
+    return OffsetTest(statistic, count, float(along @ along) / total, size)
+
+
+def without_stand_ins(initial: Initial, structure: Structure, values: Mapping[str, float]) -> Initial:
+    """Caputo's terms at given numbers without powers of t that do what an offset does; others as they are."""
+    if initial != "caputo":
+        return initial
+    kept: set[float] = set()
+    for item in (e.with_orders({n: values[n] for n in e.order_names}) for e in structure.equations):
+        own = offset_exponents(item.order.constant, "constant").values()
+        kept |= set(initial_exponents(item, "caputo", "constant")) - {round(e, 9) for e in own}
+    return History(sorted(kept))
+
+
+def _blocks(grid: Grid) -> list[list[tuple[int, int]]]:
+    """First and last place of the residuals of every output, by run."""
+    blocks, at = [], 0
+    for _, count in grid.counts:
+        own = []
+        for _ in grid.problem.structure.outputs:
+            own.append((at, at + count))
+            at += count
+        blocks.append(own)
+    return blocks
+
+
+def _coloured(directions: Floats, noise: Floats, blocks: list[list[tuple[int, int]]], degrees: int) -> Floats:
+    """Covariance of what directions see of noise, each output's an autoregression over all runs."""
+    total: Floats = np.zeros((directions.shape[1], directions.shape[1]))
+    scale = noise.size / max(degrees, 1)
+    for output in range(len(blocks[0])):
+        places = [slice(*own[output]) for own in blocks]
+        series = [noise[p] for p in places]
+        filtered = autoregression(series, LAGS)
+        errors = np.concatenate([np.convolve(e, filtered, "valid") for e in series])
+        power = float(np.mean(errors**2)) * scale
+        for place in places:
+            size = place.stop - place.start
+            divisor = np.zeros(size)
+            divisor[: min(filtered.size, size)] = filtered[:size]
+            # Noise is what 1/A makes of white noise; its transpose runs through the directions backwards.
+            turned = [_core.series_divide(np.ascontiguousarray(d[place][::-1]), divisor) for d in directions.T]
+            stacked = np.stack(turned)
+            total += power * np.einsum("ik,jk->ij", stacked, stacked)
+    return total
+
+
+def unasked_offset(test: OffsetTest | None, outputs: Sequence[str]) -> list[str]:
+    """Say so where an offset that nobody asked for explains what a model misses."""
+    if test is None or not test.exceeds(UNASKED, size=VISIBLE):
+        return []
+    return [
+        f"an unknown constant in the equation of {', '.join(outputs)} explains {100 * min(test.share, 1):.2g} % of "
+        f"what the model misses ({test.figures}): a sensor's zero, a load, a voltage at rest; use offset='constant' "
+        "or offset='auto'"
+    ]
+
+
+def errors_with_orders(
+    runs: Sequence[Run], structure: Structure, values: Mapping[str, float], *, every: int = EVERY
+) -> dict[str, float] | None:
+    """Standard errors of orders and coefficients found on a lattice; None where they cannot be computed.
+
+    Instruments refined at the optimum make instrumental variables as precise as the output error, so the errors are
+    those of the output error with all orders free, robust to colour, at the optimum between the lattice's points; the
+    way there is what the lattice is off, and counts as an error as well.
+    """
+    try:
+        grid, here = at_point(runs, replace(structure, coefficient_law=()), values, every)
+        there = grid.descend(here, EVALUATIONS, plain=True)
+        spread = np.diag(covariance(there, grid))
+    except FtlmError:
+        return None
+    given = np.array([values[n] for n in grid.problem.names])
+    with np.errstate(invalid="ignore"):
+        errors = np.sqrt(spread + (there.values - given) ** 2)
+    return {n: e if math.isfinite(e) else math.inf for n, e in zip(grid.problem.names, errors.tolist(), strict=True)}
+
+
+def fit_any_start(
+    runs: Sequence[Run],
+    structure: Structure,
+    start: Initial,
+    *,
+    threads: int = 1,
+    progress: Callable[[int, int], None] | None = None,
+    loss: Loss = "squares",
+    known: Sequence[Mapping[str, float]] = (),
+    alone: bool = False,
+) -> JointFit:
+    """Fit a structure on runs whose initial terms look like `start`, and decide by the fit where it leaves them open.
+
+    Alone, the first of what is known is the only start.
+
+    A fit with a history is kept unless Caputo's terms leave residuals that are as good; a fit from rest unless a
+    history makes them much better. Which terms were fitted is in the result.
+    """
+
+    def fitted(initial: Initial, *, refine: bool = True, raced: _core.JointRace | None = None) -> JointFit:
+        asked = replace(structure, initial=initial)
+        begun = partial(fit_output_error, start=known[0]) if alone else partial(fit_output_error, known=known)
+        return begun(runs, asked, threads=threads, refine=refine, progress=progress, loss=loss, raced=raced)
+
+    decided = structure.initial != "auto" or not has_memory(structure) or structure.has_friction
+    if not decided and isinstance(start, History):
+        # Where few terms are enough on the first grid, finer ones are for them alone: what a coarse grid leaves asks
+        # for more terms, not for fewer.
+        outset = Outset.of(runs, replace(structure, initial=start))
+        raced = None if alone else outset.race(threads, Course(progress).until(RACED, SWEEP))
+        many = fitted(start, refine=False, raced=raced)
+        kept = _shorter(many, runs, structure, loss, refine=False)
+        if kept.growth is None and many.growth is None:
+            asked = replace(structure, initial=kept.initial)
+            fine = fit_output_error(runs, asked, near=kept, loss=loss, raced=raced)
+            fine = replace(fine, starts=many.starts, origin=many.origin)
+            return fine if kept is not many else _shorter(fine, runs, structure, loss, refine=True)
+        # Where a free run may grow, the starts of the race are asked on every grid.
+        return _shorter(fitted(start, raced=raced), runs, structure, loss, refine=True)
+    joint = fitted(start)
+    if decided or start != "rest" or not _moved(joint, runs, structure):
+        return joint
+    return fitted(together([history(run, structure) for run in runs]) or history(runs[0], structure))
+
+
+def _shorter(joint: JointFit, runs: Sequence[Run], structure: Structure, loss: Loss, *, refine: bool) -> JointFit:
+    """The fit with Caputo's terms where they are enough, else the one with a history."""
+    try:
+        few = _from(joint, runs, replace(structure, initial="caputo"), loss, refine=refine)
+    except FtlmError:
+        # From here it has no finite free run, so it is not enough.
+        return joint
+    return joint if asks_for_history(few, joint, runs, structure) else few
+
+
+def _from(joint: JointFit, runs: Sequence[Run], structure: Structure, loss: Loss, *, refine: bool = False) -> JointFit:
+    """A fit of another structure from where one ended; where it is not refined, on a grid as coarse as it allows."""
+    values = dict(zip(joint.names, joint.values.tolist(), strict=True))
+    return fit_output_error(runs, structure, start=values, loss=loss, refine=refine)
+
+
+def instead_of_history(joint: JointFit, runs: Sequence[Run], structure: Structure) -> JointFit | None:
+    """A fit with Caputo's terms and a constant in each equation that leaves no more than one with a history, if any."""
+    asked = replace(structure, offset="constant")
+    loss: Loss = "squares" if joint.robust is None else "huber"
+    try:
+        few = _from(joint, runs, replace(asked, initial="caputo"), loss)
+        # On the same kind of grid: what a coarse one leaves is no history.
+        many = _from(joint, runs, replace(structure, initial=joint.initial), loss)
+    except FtlmError:
+        return None
+    fewer = few.initial_terms < many.initial_terms
+    return few if fewer and not asks_for_history(few, many, runs, asked) else None
+
+
+def asks_for_history(few: JointFit, many: JointFit, runs: Sequence[Run], structure: Structure) -> bool:
+    """Whether a fit with few initial terms leaves more than one with a history."""
+    outputs = structure.outputs
+    ours, theirs = (
+        [fit.noise[o] * np.concatenate([part[o] for part in fit.residuals]) for o in outputs] for fit in (few, many)
+    )
+    sizes = [float(np.nanstd(np.concatenate([run[o] for run in runs]))) for o in outputs]
+    return needed(structure, misfit_of_fits(ours, theirs, sizes), many.initial_terms - few.initial_terms)
+
+
+def _moved(joint: JointFit, runs: Sequence[Run], structure: Structure) -> bool:
+    """Whether what a fit from rest leaves over asks for a history."""
+    problem = FreeProblem.of(structure)
+    numbers = problem.named(list(joint.coefficients.values()))
+    return in_motion(structure.with_orders(joint.orders).with_coefficients(numbers).with_inputs(joint.inputs), runs)

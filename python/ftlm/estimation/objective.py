@@ -1,0 +1,347 @@
+"""Runs sampled for a joint fit, points in the space of its parameters, and the descents between them."""
+
+from __future__ import annotations
+
+from collections.abc import Callable, Sequence
+from dataclasses import dataclass, field, replace
+from functools import cached_property
+from typing import Any
+
+import numpy as np
+
+from ftlm import _core
+from ftlm.data.run import Run
+from ftlm.data.sampling import read
+from ftlm.estimation.free_parameters import FreeProblem, spans
+from ftlm.simulation.discretization import (
+    Instants,
+    Record,
+    compared_times,
+    compared_values,
+    driving,
+    has_own_times,
+    record,
+    sensor_series,
+)
+from ftlm.structure.structure import Structure
+from ftlm.utils.resources import stop
+from ftlm.utils.validation import Floats
+
+#: A descent ends where a whole step would lower the cost by a smaller share than this.
+TOLERANCE = 1e-9
+
+
+def experiment(
+    run: Run,
+    problem: FreeProblem,
+    weights: Sequence[float],
+    *,
+    every: int = 1,
+    decimation: int = 1,
+    shares: Floats | None = None,
+) -> tuple[Any, ...]:
+    """A run as the core compares with it: ``every`` pulses a sample interval, each ``decimation``-th sample.
+
+    ``shares`` are those of the weights with which the compared samples of each output count; what was not read counts
+    for nothing anyway.
+    """
+    # What is free of inputs is the core's to apply, to inputs as they were given.
+    structure = problem.structure.as_given()
+    rows = (run.length - 1) // decimation * decimation + 1
+    if rows != run.length:
+        run = run.slice(None, rows * run.step - run.step / 2)
+    intervals = (rows - 1) // decimation
+    rec = record(run, structure, intervals * every, filtered=structure.behind_filter)
+    if has_own_times(run, problem.structure):
+        return _at_own_times(run, structure, rec, weights, decimation, shares)
+    samples = []
+    for output in structure.outputs:
+        if rec.sensor is None or structure.measured_through(output):
+            samples.append(run[output][::decimation])
+        else:
+            # The equation is compared in filtered signals, so this output passes the filter too.
+            samples.append(_core.point_samples(rec.of(output))[::every])
+    filtered = _output_filter(structure, rec)
+    instants = [_instant(run, structure, rec, name, every, decimation) for name in structure.signals]
+    measured, counted = _counted(np.stack(samples), slice(1, -1), shares)
+    return rec.begun(), every, measured, filtered, list(weights), instants, counted, None
+
+
+def _at_own_times(
+    run: Run, structure: Structure, rec: Record, weights: Sequence[float], decimation: int, shares: Floats | None
+) -> tuple[Any, ...]:
+    """The same of a run whose rows have times of their own; the very first sample shows only where it starts."""
+    times = compared_times(run, structure)
+    kept = np.flatnonzero(times > 0.0)[::decimation]
+    at = Instants.of(run, rec, structure, times[kept])
+    measured, counted = _counted(
+        np.stack([compared_values(run, structure, o)[kept] for o in structure.outputs]), slice(None), shares
+    )
+    filtered = _output_filter(structure, rec)
+    signals = [at.values(name) for name in structure.signals]
+    # What was not read everywhere drives nothing.
+    instants = [(None if v is None or np.isnan(v).any() else v, False) for v in signals]
+    own = (at.places, [at.jumps(name) for name in structure.signals])
+    return rec.begun(), 1, measured, filtered, list(weights), instants, counted, own
+
+
+def _output_filter(structure: Structure, rec: Record) -> tuple[Floats | None, list[bool]] | None:
+    """The filter that simulated outputs pass before they are compared; None where all signals are behind it already."""
+    if structure.sensor_filter is None or rec.sensor is not None:
+        return None
+    return sensor_series(structure, rec.m, rec.step), [structure.measured_through(o) for o in structure.outputs]
+
+
+def _counted(samples: Floats, compared: slice, shares: Floats | None) -> tuple[Floats, Floats | None]:
+    """Samples without gaps, and the shares with which the compared ones count; None where all count alike."""
+    unread = np.isnan(samples)
+    counted = shares
+    if unread.any():
+        known = np.where(unread[:, compared], 0.0, 1.0)
+        counted = np.ascontiguousarray(known if shares is None else known * shares)
+    return np.ascontiguousarray(np.where(unread, 0.0, samples)), counted
+
+
+def _instant(
+    run: Run, structure: Structure, rec: Record, name: str, every: int, decimation: int
+) -> tuple[Floats | None, bool]:
+    """What a signal is at the samples, after it changed there, and whether it holds in between.
+
+    None where it has no jump or corner of its own at the samples: behind a sensor filter, or made of other signals; nor
+    where it was not read throughout, for then it drives nothing.
+    """
+    if name not in run or name in run.missing or (rec.sensor is not None and not structure.measured_through(name)):
+        return None, False
+    held = name in run.inputs and run.intersample[name] == "zoh"
+    values, delay = driving(run, structure, name)[name], structure.delay.get(name, 0.0)
+    if delay and held:
+        # A command switches between samples after a delay: what it is then is the pulse that follows.
+        means = rec.of(name)[::every]
+        return np.append(means, means[-1]), held
+    if delay:
+        values = _core.delayed(values, delay / run.step, 0.0 if rec.initial == "rest" else float(values[0]))
+    return np.ascontiguousarray(values[::decimation]), held
+
+
+@dataclass
+class Attempt:
+    """A point in the space of parameters, where it comes from, and what the core said about it."""
+
+    orders: list[float]
+    coefficients: list[float]
+    origin: str
+    outcome: Any
+    inputs: list[float] = field(default_factory=list)
+
+    @property
+    def values(self) -> Floats:
+        """Orders, coefficients, numbers of inputs."""
+        return np.array(self.orders + self.coefficients + self.inputs)
+
+    @property
+    def level(self) -> float:
+        """Cost per residual: 1 at the noise floor if the weights are right."""
+        return 2.0 * float(self.outcome["cost"]) / len(self.outcome["residuals"])
+
+    @property
+    def converged(self) -> bool:
+        """Whether the gradient vanished, but for what pushes out of a bound; a fit stopped at a wall has not."""
+        return bool(self.outcome["status"] == "converged")
+
+
+def descend(
+    problem: FreeProblem,
+    experiments: list[Any],
+    attempt: Attempt,
+    *,
+    evaluations: int,
+    plain: bool = False,
+    held: int | Sequence[int] = (),
+    tolerance: float = TOLERANCE,
+    steady: bool = False,
+) -> Attempt:
+    """Levenberg-Marquardt from an attempt; numbers, by their places, may be held where they are.
+
+    A steady one goes from a free run that dies away to none that grows. What runs of bodies that may stick start with
+    is no projection, and goes on from where it was.
+    """
+    states = attempt.outcome.get("states", []) if isinstance(attempt.outcome, dict) else []
+    outcome = problem.core.descend(
+        experiments,
+        (attempt.values.tolist(), states),
+        plain,
+        (held,) if isinstance(held, int) else held,
+        evaluations,
+        tolerance,
+        steady,
+        stop(),
+    )
+    orders, coefficients, inputs = problem.split(outcome["values"])
+    return replace(attempt, orders=orders, coefficients=coefficients, inputs=inputs, outcome=outcome)
+
+
+@dataclass(frozen=True)
+class Grid:
+    """A problem on its runs, what each output weighs, pulses a sample interval, and of how many samples one counts.
+
+    Shares of these weights by run, a row an output, are those of a robust loss. On a steady one no descent goes from a
+    free run that dies away to one that grows.
+    """
+
+    problem: FreeProblem
+    runs: Sequence[Run]
+    weights: Sequence[float]
+    every: int = 1
+    decimation: int = 1
+    shares: Sequence[Floats] | None = None
+    steady: bool = False
+
+    @cached_property
+    def experiments(self) -> list[Any]:
+        """The runs as the core compares with them."""
+        return [
+            experiment(
+                run,
+                self.problem,
+                self.weights,
+                every=self.every,
+                decimation=self.decimation,
+                shares=None if self.shares is None else self.shares[k],
+            )
+            for k, run in enumerate(self.runs)
+        ]
+
+    @cached_property
+    def finer(self) -> Grid:
+        """The same on half the step."""
+        return replace(self, every=2 * self.every)
+
+    def descend(
+        self,
+        attempt: Attempt,
+        evaluations: int,
+        *,
+        plain: bool = False,
+        held: int | Sequence[int] = (),
+        tolerance: float = TOLERANCE,
+    ) -> Attempt:
+        """Levenberg-Marquardt from an attempt; see :func:`descend`."""
+        return descend(
+            self.problem,
+            self.experiments,
+            attempt,
+            evaluations=evaluations,
+            plain=plain,
+            held=held,
+            tolerance=tolerance,
+            steady=self.steady,
+        )
+
+    def evaluated(self, attempt: Attempt) -> Attempt:
+        """An attempt with its residuals and its cost on this grid, without derivatives."""
+        return self.descend(attempt, 0)
+
+    def residuals(self, attempt: Attempt) -> list[dict[str, Floats]]:
+        """Residuals of an attempt over the noise by run and output, whatever their shares; NaN where none was read."""
+        residuals = np.asarray(attempt.outcome["residuals"])
+        parts, at = [], 0
+        for shares, count in self.counts:
+            part = {}
+            for i, output in enumerate(self.problem.structure.outputs):
+                part[output] = residuals[at : at + count]
+                at += count
+                if shares is not None:
+                    part[output] = part[output] / np.where(shares[i] > 0, shares[i], np.nan)
+            parts.append(part)
+        return parts
+
+    @property
+    def counts(self) -> list[tuple[Floats | None, int]]:
+        """Shares and number of the compared samples of each run."""
+        return [(e[6], e[2].shape[1] - (2 if e[7] is None else 0)) for e in self.experiments]
+
+    @property
+    def every_share(self) -> Floats:
+        """Share of every residual, as the core strings them together."""
+        outputs = len(self.problem.structure.outputs)
+        return np.concatenate(
+            [np.ones(outputs * count) if shares is None else shares.ravel() for shares, count in self.counts]
+        )
+
+    def levels(self, attempt: Attempt) -> dict[str, float]:
+        """Root mean square of the weighted residuals by output, over all runs; infinite beyond the numbers."""
+        with np.errstate(over="ignore"):
+            return {o: float(np.sqrt(np.mean(e**2))) for o, e in self.pooled(attempt).items()}
+
+    def pooled(self, attempt: Attempt) -> dict[str, Floats]:
+        """Weighted residuals that are there by output, all runs one after another."""
+        parts = self.residuals(attempt)
+        return {o: read(np.concatenate([p[o] for p in parts])) for o in self.problem.structure.outputs}
+
+
+@dataclass(frozen=True)
+class Asked:
+    """A problem's runs; questions come on the thread that called the core."""
+
+    problem: FreeProblem
+    runs: Sequence[Run]
+
+    def sampled(self, every: int, decimation: int, first: int | None) -> list[Any]:
+        """The runs with so many pulses a sample interval, of every so many samples one, or their first intervals."""
+        weights = [1.0] * len(self.problem.structure.outputs)
+        runs = self.runs if first is None else [run.slice(None, (first + 0.5) * run.step) for run in self.runs]
+        return [experiment(run, self.problem, weights, every=every, decimation=decimation) for run in runs]
+
+    def records(self, m: int, inputs: Sequence[float]) -> list[Any]:
+        """Records of so many pulses, driven by what was measured, inputs acting with these numbers."""
+        names = (item.name for item in self.problem.inputs)
+        structure = self.problem.structure.with_inputs(dict(zip(names, inputs, strict=True)))
+        structure = replace(structure, coupling="measured")
+        return [record(run, structure, m).core() for run in self.runs]
+
+    def read(self, signal: int) -> list[Floats]:
+        """A signal of each run at regular times; NaN where it was not read."""
+        name = self.problem.structure.signals[signal]
+        return [np.ascontiguousarray(run[name]) for run in self.runs]
+
+    def core(self, told: Callable[[int, int], None] | None = None) -> tuple[Any, ...]:
+        """The runs as the core takes them, and who is told how far it is."""
+
+        def between(name: str) -> str | None:
+            if name not in self.runs[0].inputs:
+                return None
+            return "zoh" if any(run.intersample.get(name) == "zoh" for run in self.runs) else "foh"
+
+        return self, spans(self.runs), [between(name) for name in self.problem.structure.signals], told
+
+
+def covariance(attempt: Attempt, grid: Grid) -> Floats:
+    """Covariance of the parameters: classical where residuals are white, robust to their colour where not.
+
+    Nothing is truncated: a parameter that takes part in a direction which the runs do not see has an infinite variance.
+    Under a robust loss it is that of an M-estimator.
+    """
+    series = [residuals for part in grid.residuals(attempt) for residuals in part.values()]
+    shares = None if grid.shares is None else grid.every_share
+    return _core.fit_covariance(np.asarray(attempt.outcome["jacobian"]), series, shares)
+
+
+def covariance_of(jacobian: Floats, series: Sequence[Floats], squares: float) -> Floats:
+    """Covariance from a Jacobian (a row a parameter), residuals by run and output, and the sum of their squares.
+
+    Residuals are NaN where nothing was read. Covariances with a parameter of infinite variance are not numbers.
+    """
+    return _core.covariance_of(jacobian, series, squares)
+
+
+def long_run(jacobian: Floats, series: Sequence[Floats]) -> Floats:
+    """Covariance of sums of scores with Bartlett weights: the middle of the sandwich (doi:10.2307/1913610)."""
+    return _core.long_run(jacobian, series)
+
+
+def deviation(slopes: Floats, spread: Floats) -> Floats:
+    """Standard errors, to first order, of numbers whose slopes are the rows, infinite where a parameter's is."""
+    unseen = np.isinf(np.diag(spread))
+    known = slopes[:, ~unseen]
+    variance = np.einsum("ij,jk,ik->i", known, spread[np.ix_(~unseen, ~unseen)], known)
+    return np.where((slopes[:, unseen] != 0).any(axis=1), np.inf, np.sqrt(np.maximum(variance, 0.0)))

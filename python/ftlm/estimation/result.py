@@ -1,0 +1,450 @@
+"""The record of an identification: a model, what it was asked from, and everything that is known about it."""
+
+from __future__ import annotations
+
+import math
+import os
+from collections.abc import Callable, Mapping, Sequence
+from dataclasses import dataclass, field, replace
+from pathlib import Path
+from typing import TYPE_CHECKING, Any
+
+from ftlm.data.run import Run
+from ftlm.errors import ModelError
+from ftlm.estimation.output_error import JointFit, ProfileInterval
+from ftlm.estimation.physical_parameters import PhysicalParameter, physical_parameters
+from ftlm.model.model import Model
+from ftlm.order_search.result import SearchResult
+from ftlm.structure.order_grid import Lattice, lattice_of
+from ftlm.structure.structure import Structure
+from ftlm.utils.files import to_frame
+from ftlm.utils.formatting import unbounded
+from ftlm.utils.statistics import NORMAL_95
+from ftlm.utils.validation import check_threads
+from ftlm.validation.comparison import Comparison, Metrics, filter_state, finite
+from ftlm.validation.information_criteria import InformationCriteria
+from ftlm.validation.residual_tests import Residuals, resid
+
+if TYPE_CHECKING:
+    from ftlm.estimation.verdict import Validation, Verdict
+
+
+@dataclass(frozen=True)
+class Task:
+    """What was asked for: from it, reports draw what the result alone does not hold.
+
+    Parameters
+    ----------
+    runs
+        The runs.
+    structure
+        What was identified, its free orders and coefficients still free.
+    lattice
+        Of the order search; None for the default.
+    """
+
+    runs: tuple[Run, ...]
+    structure: Structure
+    lattice: Lattice | None = None
+
+    def lattice_of(self, part: Structure) -> Lattice:
+        """The lattice of one searched part of the structure."""
+        return lattice_of(self.lattice, part) or Lattice()
+
+
+@dataclass(frozen=True)
+class Judged:
+    """An identified model and all figures; its fields are those of :class:`ftlm.Identification`."""
+
+    model: Model
+    method: str
+    comparison: Comparison
+    searches: dict[str, SearchResult]
+    settings: dict[str, Any]
+    warnings: tuple[str, ...] = field(default=())
+    joint: JointFit | None = None
+    residuals: Residuals | None = None
+    information: InformationCriteria | None = None
+    task: Task | None = field(default=None, repr=False)
+    coefficient_errors: Mapping[str, float] = field(default_factory=dict)
+
+    @property
+    def orders(self) -> dict[str, float]:
+        """Free orders by name."""
+        return dict(self.model.orders)
+
+    @property
+    def standard_errors(self) -> dict[str, float]:
+        """Standard errors by name.
+
+        Of orders and coefficients by output error and by instrumental variables, robust to coloured residuals; where
+        all orders were given, of the coefficients. Empty for the equation-error methods.
+        """
+        if self.joint is None:
+            return dict(self.coefficient_errors)
+        return {**self.joint.standard_errors, **self.joint.derived_errors}
+
+    @property
+    def intervals(self) -> dict[str, tuple[float, float]]:
+        """95 % intervals by name, of what has standard errors.
+
+        Value ± 1.96 standard errors, or, where the quadratic picture fails for a number of a joint fit, those of the
+        profile likelihood: neither symmetric nor always finite.
+        """
+        values = {**self.orders, **self.coefficients, **({} if self.joint is None else self.joint_values)}
+        errors = self.standard_errors
+        quadratic = {n: (values[n] - NORMAL_95 * e, values[n] + NORMAL_95 * e) for n, e in errors.items()}
+        return {**quadratic, **{n: (p.low, p.high) for n, p in self.profiles.items()}}
+
+    @property
+    def profiles(self) -> dict[str, ProfileInterval]:
+        """95 % intervals by profile likelihood, where they are used; see :meth:`ftlm.Identification.profile`."""
+        return {} if self.joint is None else dict(self.joint.profiles)
+
+    @property
+    def delays(self) -> dict[str, float]:
+        """Delays of inputs [s] by input, estimated or known."""
+        return dict(self.model.structure.delay)
+
+    @property
+    def limits(self) -> dict[str, float]:
+        """Saturations (``sat_u``) and dead zones (``dead_u``) of inputs in their units, estimated or known."""
+        known = [(limit.name, limit.value) for limit in self.model.structure.limits]
+        return {n: float(v) for n, v in known if not isinstance(v, tuple)}
+
+    @property
+    def joint_values(self) -> dict[str, float]:
+        """Orders, coefficients and numbers of inputs of the joint fit by name; empty without one."""
+        return {} if self.joint is None else dict(zip(self.joint.names, self.joint.values.tolist(), strict=True))
+
+    @property
+    def coefficients(self) -> dict[str, float]:
+        """Coefficients by name."""
+        return self.model.coefficients
+
+    @property
+    def equation_error(self) -> dict[str, Metrics]:
+        """Figures of the equation error by output."""
+        return self.comparison.equation_error
+
+    @property
+    def output_error(self) -> dict[str, Metrics]:
+        """Figures of the free run by output."""
+        return self.comparison.output_error
+
+    @property
+    def fit_percent(self) -> dict[str, float]:
+        """Fit of the free run in percent, by output."""
+        return self.comparison.fit_percent
+
+
+class Identification(Judged):
+    """An identified model with everything that is known about it.
+
+    Parameters
+    ----------
+    model
+        The model.
+    method
+        Estimator of the coefficients.
+    comparison
+        Both errors on the runs it was identified from.
+    searches
+        The order searches that gave its orders: by output, or under ``"stage"`` for a search under the order law;
+        empty where all orders were given.
+    settings
+        Of the estimator.
+    warnings
+        What makes the model doubtful, in words.
+    joint
+        The optimum of the joint output error with its covariance; None for the equation-error methods.
+    residuals
+        Residual tests on the runs it was identified from; None where these are too short.
+    information
+        Information criteria, orders counted as parameters; None where there are no residuals.
+    task
+        The runs and the structure as they were given.
+    coefficient_errors
+        Standard errors of coefficients, and of orders that were found, where the method gives no joint covariance.
+    """
+
+    def physical(self, **known: float) -> dict[str, PhysicalParameter]:
+        """Physical parameters of a flexible link once one of them is known; see :func:`ftlm.physical_parameters`.
+
+        Parameters
+        ----------
+        **known
+            One parameter a stage by name, such as ``J_12=0.1704``.
+
+        Returns
+        -------
+        dict
+            Every parameter of the stage by name, with standard error, interval and unit.
+
+        Raises
+        ------
+        ModelError
+            A model without coefficient law or intervals, or a name that is no parameter of it.
+        """
+        if self.joint is None:
+            raise ModelError(f"method {self.method!r} gives no joint covariance; identify by method='output-error'")
+        return physical_parameters(self.joint, known)
+
+    def profile(
+        self,
+        *names: str,
+        level: float = 0.95,
+        threads: int | None = None,
+        progress: Callable[[int, int], None] | None = None,
+    ) -> dict[str, ProfileInterval]:
+        """Intervals by profile likelihood: what a number may be if all others are fitted anew for each of its values.
+
+        Where the cost is a parabola they are estimate ± standard errors; where it is a bent valley they are neither
+        symmetric nor always finite, and standard errors mean little. The cost may rise by the square of the normal
+        quantile times the noise's variance, widened for coloured residuals as the standard errors are; with a robust
+        loss, at the shares of the fit. Each end is followed from the optimum without a gap, so another optimum beyond a
+        ridge is not seen.
+
+        It takes two to four refits an end where the picture is nearly quadratic, up to forty in a valley without end:
+        some ten to two hundred free runs a number, each as long as one evaluation on the fit's finest grid. Ends are
+        found by several threads, with the same figures for any number of them; Ctrl-C ends it within a refit.
+
+        Parameters
+        ----------
+        *names
+            Free orders, free coefficients, delays (``"delay_u"``); all of them where none is named. Not those that
+            follow from a coefficient law.
+        level
+            Probability, between 0 and 1.
+        threads
+            By default all cores.
+        progress
+            Called with (ends found, ends in all).
+
+        Returns
+        -------
+        dict of ProfileInterval
+            By name.
+
+        Raises
+        ------
+        ModelError
+            A method without a likelihood, a fit with a reference, a name that is no free number, a level that is no
+            probability.
+        ConvergenceError
+            The profile leads to an optimum below the fit's.
+        """
+        from ftlm.estimation.confidence_intervals import profile
+
+        return profile(self, names, level, check_threads(threads), progress)
+
+    def resid(self, runs: Run | Sequence[Run], *, lags: int = 25) -> Residuals:
+        """Residual tests on other runs; see :func:`ftlm.resid`."""
+        return resid(self.model, runs, lags=lags)
+
+    def validate(self, runs: Run | Sequence[Run]) -> Validation:
+        """Both errors on runs that the model was not identified from, with what they say against the model.
+
+        Parameters
+        ----------
+        runs
+            One run or several with the same names and units.
+
+        Returns
+        -------
+        Validation
+            A :class:`ftlm.Comparison` whose ``.verdict`` says whether to trust the model. Its warnings name a fit that
+            is lost, and runs that the model was identified from.
+
+        Raises
+        ------
+        DataError
+            Runs that do not fit the model.
+        """
+        from ftlm.estimation.model_checks import validate
+        from ftlm.estimation.verdict import validated
+
+        return validated(self, validate(self, runs))
+
+    def report(
+        self, path: str | os.PathLike[str], *, validation: Run | Sequence[Run] | None = None, force: bool = False
+    ) -> Path:
+        """Write everything about this result as one HTML file that opens offline.
+
+        Parameters
+        ----------
+        path
+            File to write.
+        validation
+            Runs that the model was not identified from; without any, the page says that it was not validated.
+        force
+            Overwrite an existing file.
+
+        Returns
+        -------
+        pathlib.Path
+            The file.
+
+        Raises
+        ------
+        DataError
+            A validation run that does not fit the model; the file exists and ``force`` is not set, or cannot be
+            written.
+        """
+        from ftlm.report.html_report import identification_page
+
+        return identification_page(self, path, validation=validation, force=force)
+
+    def to_frame(self) -> Any:
+        """Orders and coefficients as a pandas frame: value, standard error, 95 % interval, stated value by name."""
+        values = {**self.orders, **self.joint_values, **self.coefficients}
+        errors, intervals = self.standard_errors, self.intervals
+        none = (math.nan, math.nan)
+        rows = [
+            {
+                "parameter": n,
+                "value": v,
+                "standard_error": errors.get(n, math.nan),
+                "low": intervals.get(n, none)[0],
+                "high": intervals.get(n, none)[1],
+                "stated": self.model.structure.reference.get(n, math.nan),
+            }
+            for n, v in values.items()
+        ]
+        return to_frame(rows, ["parameter"])
+
+    def to_dict(self) -> dict[str, Any]:
+        """For JSON."""
+        return {
+            "method": self.method,
+            "settings": self.settings,
+            "equations": {e.output: self.model.structure.written(e) for e in self.model.equations},
+            "orders": self.orders,
+            "coefficients": self.coefficients,
+            "delays": self.delays,
+            **({"limits": self.limits} if self.limits else {}),
+            "standard_errors": {n: finite(e) for n, e in self.standard_errors.items()},
+            "intervals": {n: [finite(low), finite(high)] for n, (low, high) in self.intervals.items()},
+            "profiled": list(self.profiles),
+            **self.comparison.to_dict(),
+            "residuals": None if self.residuals is None else self.residuals.to_dict(),
+            "information": None if self.information is None else self.information.to_dict(),
+            "searches": {name: s.to_dict() for name, s in self.searches.items()},
+            "choice": None if self.joint is None else self.joint.choice,
+            "warnings": list(self.warnings),
+        }
+
+    def verdict(self, validation: Comparison | None = None) -> Verdict:
+        """Whether to trust this model: ``"trust"``, ``"with care"`` or ``"do not use"``, with one reason.
+
+        Parameters
+        ----------
+        validation
+            What :meth:`validate` said of runs that the model was not identified from. Without any, no model is
+            trusted: how well it predicts other data is not known.
+
+        Returns
+        -------
+        Verdict
+            Prints as one sentence; ``.reasons`` has all that speaks against the model, most serious first.
+
+        Raises
+        ------
+        ModelError
+            What is no answer of :meth:`validate`.
+
+        Notes
+        -----
+        The first of these rules that applies gives the reason.
+
+        *Do not use*: the free run leaves the range of numbers, or grows (a pole with a positive real part); numbers
+        that the runs do not tell apart at all (infinite standard errors); an output that the free run explains by less
+        than half (NR above 0.5), on its own runs or on validation, over all runs or on one; own orders by which an
+        equation says that an output equals itself.
+
+        *With care*: a fit that falls by 20 points on validation, over all runs or on one, or leaves there more than a
+        tenth and three times as much as on its own runs, or more than a twentieth and five times as much; growth that
+        cannot be told, or a swing whose damping is not told apart from 0 (an integrator is no fault); residuals that
+        follow an input; a closed loop with coloured residuals; residuals that are not white (all three no smaller than
+        a thousandth of the output); a fit that did not stand still; a number that nothing tells, a coefficient known to
+        no more than half of itself, an order to no more than 0.25, a delay or a limit whose interval has no end; an
+        offset that is hidden by what a run did before its start; intervals that are rough and every other warning of
+        weight; no standard errors; no validation.
+
+        A saved model keeps what spoke against it, and is judged alike.
+        """
+        from ftlm.estimation.verdict import verdict
+
+        if not (validation is None or isinstance(validation, Comparison)):
+            raise ModelError(f"validation is {type(validation).__name__}; give what validate(run) returns")
+        return verdict(self, validation)
+
+    def summary(self, validation: Comparison | None = None) -> str:
+        """The first screen, as print shows it: verdict, equations, numbers, gain, modes, fit, three warnings.
+
+        Parameters
+        ----------
+        validation
+            What :meth:`validate` said of runs that the model was not identified from.
+        """
+        from ftlm.report.text_summary import summary
+
+        self.verdict(validation)
+        return summary(self, validation)
+
+    def details(self) -> str:
+        """All that is known as text: settings, both errors, criteria, searches, initial terms, every warning."""
+        from ftlm.report.text_summary import settings_in_words
+
+        lines = [f"{self.model.structure.name}: {self.method}, {settings_in_words(self.settings)}"]
+        lines += [f"  {self.model.structure.written(e)}" for e in self.model.equations]
+        reference = self.model.structure.reference
+        errors = self.standard_errors
+        for name, value in {**self.orders, **self.joint_values, **self.coefficients}.items():
+            spread = f" ± {unbounded(errors[name]):<10}" if name in errors else ""
+            if name in self.profiles:
+                spread += f"   {self.profiles[name]}"
+            stated = f"   (stated {reference[name]:.6g})" if name in reference else ""
+            lines.append(f"  {name:<12}{value:>14.6g}{spread}{stated}")
+        if self.joint is not None:
+            lines.append(f"  {self.joint.choice}")
+        if errors:
+            others = ", but those written out: by profile likelihood" if self.profiles else ""
+            lines.append(f"  (value ± standard error; 95 % intervals are ± 1.96 of these{others})")
+        lines.append(str(replace(self.comparison, warnings=())))
+        if self.residuals is not None:
+            white = ", ".join(f"{o} {'yes' if w else 'no'}" for o, w in self.residuals.white.items())
+            free = ", ".join(f"{o} {w}" for o, w in self.residuals.independence.items())
+            around = [f"{u} around {o}" for o, r in self.residuals.outputs.items() for u in r.feedback]
+            loop = f"; closed loop of {', '.join(around)}" if around else ""
+            lines.append(f"residuals white: {white}; independent of the inputs: {free}{loop} (99 %)")
+        if self.information is not None:
+            lines.append(str(self.information))
+        for name, search in self.searches.items():
+            lines.append(
+                f"order search ({name}): {search.candidates} candidates, {len(search.table)} kept{search.left_out}"
+            )
+        lines += _initial_in_words(self.comparison)
+        lines += [f"warning: {w}" for w in self.warnings]
+        return "\n".join(lines)
+
+    def __str__(self) -> str:
+        return self.summary()
+
+    def _repr_html_(self) -> str:
+        from ftlm.report.html_report import identification_html
+
+        return identification_html(self)
+
+
+def _initial_in_words(comparison: Comparison) -> list[str]:
+    """Initial terms of every run that has some, a line an output."""
+    lines = []
+    for (run, _, _), initial in zip(comparison.per_run, comparison.initial, strict=True):
+        for output, terms in initial.items():
+            if terms:
+                listed = ", ".join(
+                    f"{v:.4g} t^{e:g}" if e > -1 else f"{filter_state(e)} {v:.4g}" for e, v in terms.items()
+                )
+                lines.append(f"initial terms of {output} in {run} (of that run alone): {listed}")
+    return lines

@@ -1,0 +1,536 @@
+"""Inputs to begin with: squares, sweeps, random switching, sums of sines with the best spectrum and a low crest."""
+
+from __future__ import annotations
+
+import math
+from collections.abc import Callable, Iterable, Iterator, Mapping, Sequence
+from dataclasses import dataclass, replace
+
+import numpy as np
+
+from ftlm.analysis.frequency_response import check_unlimited
+from ftlm.analysis.poles import modes, stability
+from ftlm.data.run import Run
+from ftlm.errors import DataError, FtlmError, ModelError
+from ftlm.estimation.output_error import freedom_of
+from ftlm.estimation.result import Identification
+from ftlm.estimation.verdict import VAGUE_ORDER
+from ftlm.experiment_design.exchange import Design, exchanged, judged
+from ftlm.experiment_design.problem import Bounds, Criterion, Kind, by_name
+from ftlm.experiment_design.result import DesignedInput, Reached
+from ftlm.experiment_design.sensitivity import Laid, Sensitivities
+from ftlm.experiment_design.spectrum import Spectrum, best_spectrum, lines_of
+from ftlm.model.model import Solved, check_solved
+from ftlm.progress import Course, Progress
+from ftlm.simulation.discretization import check_linear
+from ftlm.utils.resources import between, expected, stop
+from ftlm.utils.statistics import NORMAL_95
+from ftlm.utils.validation import Floats, check_seed, nearest, real_number, shown
+
+#: Rounds in which the crest of a sum of sines is cut and its spectrum put back.
+CREST_ROUNDS = 200
+#: What is cut of a crest in each.
+CUT = 0.85
+#: Shares of the best spectrum's power below which its lowest and its highest frequency lie.
+LOW, MIDDLE, HIGH = 0.05, 0.5, 0.95
+
+
+def square(rows: int, period: int) -> Floats:
+    """A square of size 1 that begins high, period in samples."""
+    return np.where((np.arange(rows) % period) * 2 < period, 1.0, -1.0)
+
+
+def shapes(spectrum: Spectrum, inputs: int, rows: int, step: float, seed: int) -> Iterator[tuple[str, Floats]]:
+    """Name and commands, shape (inputs, rows), of size 1 at most; motors get different ones where chance decides."""
+    rng = np.random.default_rng(seed)
+    sines = multisine(spectrum, inputs, rows, step, rng)
+    yield "multisine", sines
+    yield "binary by multisine", np.where(sines >= 0, 1.0, -1.0)
+    low, middle, high = quantiles(spectrum, rows * step)
+    time = np.asarray(step * np.arange(rows), dtype=np.float64)
+    sweep = _chirp(time, low, max(high, 1.5 * low))
+    signs = np.where(np.arange(inputs) % 2 == 0, 1.0, -1.0)[:, None]
+    yield f"chirp {low:.3g} to {max(high, 1.5 * low):.3g} Hz", signs * sweep
+    yield "binary by chirp", signs * np.where(sweep >= 0, 1.0, -1.0)
+    for f in np.unique([low, math.sqrt(low * middle), middle, math.sqrt(middle * high), high]):
+        period = max(2, round(1.0 / f / step))
+        ratios = np.arange(inputs)
+        yield f"square, period {period * step:.3g} s", np.stack([square(rows, period << int(k)) for k in ratios])
+    for f in np.unique([math.sqrt(low * middle), middle, math.sqrt(middle * high)]):
+        clock = max(1, round(0.4 / f / step))
+        every = -(-rows // clock)
+        drawn = rng.choice([-1.0, 1.0], (inputs, every))
+        yield f"random binary, clock {clock * step:.3g} s", np.repeat(drawn, clock, axis=1)[:, :rows]
+
+
+def quantiles(spectrum: Spectrum, duration: float) -> tuple[float, float, float]:
+    """Where the power of a spectrum lies [Hz]: its low end, its middle and its high end."""
+    order = np.argsort(spectrum.lines.frequencies)
+    frequencies, power = spectrum.lines.frequencies[order], spectrum.power[order]
+    total = np.cumsum(power)
+    if not total[-1] > 0:
+        return 1 / duration, 3 / duration, 10 / duration
+    low, middle, high = (float(frequencies[np.searchsorted(total, q * total[-1])]) for q in (LOW, MIDDLE, HIGH))
+    return low, middle, high
+
+
+def multisine(spectrum: Spectrum, inputs: int, rows: int, step: float, rng: np.random.Generator) -> Floats:
+    """A sum of sines with the powers of a spectrum, of size 1, phases such that its crest is low.
+
+    Schroeder's phases (doi:10.1109/TIT.1970.1054411) for a start; then its peaks are cut and its spectrum is put back,
+    time and again (Van der Ouderaa, Schoukens & Renneboog, 1988).
+    """
+    points = len(spectrum.power)
+    of_input = np.argmax(spectrum.lines.costs[:inputs] > 0, axis=0) if points else np.zeros(0, int)
+    numbers = np.round(spectrum.lines.frequencies * rows * step).astype(np.int64)
+    out = np.zeros((inputs, rows))
+    for k in range(inputs):
+        own = (of_input == k) & (spectrum.power > 1e-6 * np.max(spectrum.power, initial=0.0))
+        if not own.any():
+            out[k] = rng.choice([-1.0, 1.0], rows)
+            continue
+        sizes = np.zeros(rows // 2 + 1)
+        sizes[numbers[own]] = np.sqrt(spectrum.power[own])
+        share = sizes**2 / np.sum(sizes**2)
+        phases = -2 * math.pi * np.cumsum(np.cumsum(share)) + rng.uniform(0, 2 * math.pi, sizes.size) * 1e-3
+        best, crest = np.zeros(rows), math.inf
+        for _ in range(CREST_ROUNDS):
+            wave = np.fft.irfft(sizes * np.exp(1j * phases), rows)
+            peak = float(np.max(np.abs(wave)))
+            if peak < crest:
+                best, crest = wave, peak
+            phases = np.angle(np.fft.rfft(np.clip(wave, -CUT * peak, CUT * peak)))
+        out[k] = best / crest
+    return out
+
+
+def _chirp(time: Floats, low: float, high: float) -> Floats:
+    growth, duration = math.log(high / low), float(time[-1])
+    return np.asarray(np.sin(2 * math.pi * low * duration / growth * np.expm1(growth * time / duration)))
+
+
+#: Fewest and most rows of a run that is designed.
+FEWEST, MOST = 32, 50_000
+#: Holds of a run in a first search, and how many times finer ones become.
+HOLDS, FINER = 125, (1, 2, 4)
+#: Designs took between these multiples of what their rows and numbers let expect: how many exchanges pay turns out.
+CAME_TO = (0.4, 4.0)
+#: Inputs from which holds are exchanged.
+BEGUN = 4
+#: Periods of the square that a design is set beside: the paper's ten seconds have five.
+PERIODS = 5
+#: A model whose own uncertainty moves its answer by more than this share of it is none to design on.
+VAGUE = 0.5
+
+
+@dataclass(frozen=True)
+class Wanted:
+    """What was asked for, checked."""
+
+    laid: Laid
+    step: float
+    rows: int
+    bounds: Bounds
+    criterion: Criterion
+    period: int
+    seed: int
+    warnings: tuple[str, ...]
+
+
+def design_input(
+    model: Identification | Solved,
+    *,
+    like: Run | None = None,
+    duration: float | None = None,
+    step: float | None = None,
+    peak: float | Mapping[str, float] | None = None,
+    slew: float | Mapping[str, float] | None = None,
+    limits: Mapping[str, float] | None = None,
+    names: Sequence[str] | None = None,
+    criterion: Kind = "D",
+    noise: Mapping[str, float] | None = None,
+    period: float | None = None,
+    seed: int = 0,
+    progress: Callable[[int, int], None] | None = None,
+) -> DesignedInput:
+    """Lay out the experiment that tells an identified model's numbers best within the limits of a machine.
+
+    What any input tells follows from the exact derivatives of the free run, those of the fit, over the noise that the
+    fit left. A convex problem gives the best periodic spectrum and proves it; from its sum of sines, sweeps, squares
+    and random switching, levels are then exchanged one after another until no exchange tells more. It takes seconds to
+    a minute, the longer the more rows and numbers.
+
+    Parameters
+    ----------
+    model : Identification or Model
+        Of method ``"output-error"``; a saved model will do.
+    like : Run, optional
+        A run that the machine is known to bear: what is not said is as in it, the largest output included. Default of
+        an identification its first run.
+    duration, step : float, optional
+        Of the run [s].
+    peak : float or mapping, optional
+        Largest size of each input.
+    slew : float or mapping, optional
+        Fastest change of each input, a second; default none.
+    limits : mapping, optional
+        Largest size of outputs by name, in the model's units; infinity for none.
+    names : sequence of str, optional
+        Numbers to be told; default all free orders, or all numbers where no order is free.
+    criterion : {"D", "E"}, default "D"
+        ``"D"``: the smallest ellipsoid of confidence of these numbers. ``"E"``: its widest axis as short as can be,
+        coefficients in units of their values.
+    noise : mapping, optional
+        Standard deviation of each output's noise; default what the fit left.
+    period : float, optional
+        Of the square that the design is set beside [s]; default a fifth of the duration, as in the paper.
+    seed : int
+        Of the random inputs among those to begin with.
+    progress : callable, optional
+        Called with parts done and parts in all.
+
+    Returns
+    -------
+    DesignedInput
+        Commands, predicted intervals beside those of the model and of the square, limits that bind; ``.save`` writes
+        what a rig is given.
+
+    Raises
+    ------
+    ModelError
+        A model that is not stable, or integrates without a limit of that output; one with friction, saturations or dead
+        zones; intervals too wide to design on; an argument that cannot be used, or a limit that cannot be kept.
+    """
+    if progress is not None and not callable(progress):
+        raise ModelError(f"progress is a {type(progress).__name__}; pass what is called with (done, all)")
+    wanted = _wanted(
+        model,
+        like,
+        duration,
+        step,
+        peak,
+        slew,
+        limits,
+        names,
+        criterion,
+        noise,
+        period,
+        seed,
+    )
+    laid, bounds, goal = wanted.laid, wanted.bounds, wanted.criterion
+    if isinstance(progress, Progress):
+        size = len(laid.names) * len(laid.outputs) * wanted.rows
+        progress.expect("the design", *between(expected(0.3 + 2e-5 * size, 1), CAME_TO))
+    course = Course(progress)
+    known = Sensitivities.of(laid, wanted.step, wanted.rows - 1, bounds.ramp(wanted.step))
+    course.at(0.05)
+    spectrum = best_spectrum(lines_of(laid, bounds, wanted.step, wanted.rows - 1), goal)
+    course.at(0.15)
+    tried = _tried(wanted, known, spectrum, course)
+    plain = np.stack([p * square(wanted.rows - 1, wanted.period) for p in bounds.peaks.values()])
+    reference = laid.run(known.written(plain), wanted.step, f"square of period {wanted.period * wanted.step:.4g} s")
+    base = float(goal.score(known.information(known.derivatives(plain))))
+    best = tried[0]
+    commands = best.commands * _within(wanted, known, best.commands)
+    run = laid.run(known.written(commands), wanted.step, "designed")
+    errors = _errors(laid, reference, run)
+    at = list(goal.chosen)
+    ratios = np.log(errors["square"][at]) - np.log(errors["designed"][at])
+    course.at(1.0)
+    return DesignedInput(
+        run=run,
+        reference=reference,
+        shape=_shape(best, run, wanted),
+        criterion=goal.kind,
+        chosen=tuple(laid.names[i] for i in at),
+        values=dict(zip(laid.names, laid.values, strict=True)),
+        errors={k: dict(zip(laid.names, v.tolist(), strict=True)) for k, v in errors.items()},
+        gain=float(np.exp(np.sum(ratios))),
+        gains=tuple((d.name, math.exp(min(goal.count * (d.score - base), 700.0))) for d in tried),
+        reached=_reached(run, bounds),
+        spectrum=spectrum,
+        efficiency=math.exp(best.score - spectrum.bound),
+        warnings=wanted.warnings,
+    )
+
+
+def _tried(wanted: Wanted, known: Sensitivities, spectrum: Spectrum, course: Course) -> list[Design]:
+    """Every input that was tried, best first: shapes as they are, and what exchanges made of the best of them."""
+    laid, bounds, goal, rows = wanted.laid, wanted.bounds, wanted.criterion, wanted.rows - 1
+    ended = stop()
+
+    def stopped() -> None:
+        if ended is not None and ended.is_set:
+            raise KeyboardInterrupt
+
+    peaks = np.array(list(bounds.peaks.values()))[:, None]
+    begun = [
+        judged(name, peaks * c, known, goal, bounds)
+        for name, c in shapes(spectrum, len(laid.inputs), rows, wanted.step, wanted.seed)
+    ]
+    found = [d for d in begun if d.score > -math.inf]
+    if not found:
+        raise ModelError(
+            f"no input tells {', '.join(laid.names[i] for i in goal.chosen)} from the other numbers: they move the "
+            "outputs in ways that no experiment of this length tells apart; name fewer numbers, or make the run longer"
+        )
+    # Of each kind the best one: what they lead to differs more than what they are.
+    kinds: dict[str, Design] = {}
+    for design in sorted(found, key=lambda d: -d.score):
+        kinds.setdefault(design.name.split(",")[0].split(" by")[0], design)
+    starts = sorted(kinds.values(), key=lambda d: -d.score)[:BEGUN]
+    coarse = max(known.ramp, 1, -(-rows // HOLDS))
+    ends = []
+    for place, design in enumerate(starts):
+        ends.append(exchanged(design, coarse, known, goal, bounds, stopped))
+        course.at(0.15 + 0.55 * (place + 1) / len(starts))
+    best = max(ends, key=lambda d: d.score)
+    for place, finer in enumerate(FINER[1:]):
+        hold = max(known.ramp, 1, coarse // finer)
+        if coarse % hold:
+            continue
+        further = exchanged(best, hold, known, goal, bounds, stopped)
+        best = further if further.score > best.score else best
+        course.at(0.7 + 0.25 * (place + 1) / len(FINER[1:]))
+    ends = [replace(d, name=f"{d.name}, exchanged") for d in (*(e for e in ends if e.name != best.name), best)]
+    return sorted([*found, *ends], key=lambda d: -d.score)
+
+
+def _wanted(
+    model: Identification | Solved,
+    like: Run | None,
+    duration: float | None,
+    step: float | None,
+    peak: float | Mapping[str, float] | None,
+    slew: float | Mapping[str, float] | None,
+    limits: Mapping[str, float] | None,
+    names: Sequence[str] | None,
+    criterion: str,
+    noise: Mapping[str, float] | None,
+    period: float | None,
+    seed: int,
+) -> Wanted:
+    """Check every argument and the model."""
+    solved = model.model if isinstance(model, Identification) else model
+    check_solved(solved)
+    check_linear(solved.equations, "a design of the next experiment")
+    check_unlimited(solved, "a design of the next experiment")
+    if like is None and isinstance(model, Identification) and model.task is not None:
+        like = model.task.runs[0]
+    if like is not None and not isinstance(like, Run):
+        raise ModelError(f"like is {type(like).__name__}, not a Run; give a run that the machine bore")
+    free = freedom_of(solved)
+    outputs = solved.outputs
+    laid = Laid.of(solved, by_name("noise", noise, outputs, free.noise))
+    _check_signals(laid, like)
+    if free.covariance is None:
+        _too_wide(laid, "some of its numbers have infinite intervals", None)
+    time = _positive("step", step if step is not None else None if like is None else like.step, "a step [s]")
+    length = _positive(
+        "duration", duration if duration is not None else None if like is None else like.duration, "a length [s]"
+    )
+    rows = round(min(length / time, 1e9)) + 1
+    if not FEWEST <= rows <= MOST:
+        raise ModelError(
+            f"duration = {length:g} s in steps of {time:g} s are {rows} rows; give a run of {FEWEST} to {MOST} rows"
+        )
+    swings = dict.fromkeys(outputs, math.inf) | ({} if like is None else _largest(like, outputs, moved=True))
+    bounds = Bounds(
+        by_name("peak", peak, laid.inputs, None if like is None else _largest(like, laid.inputs, moved=False)),
+        by_name("slew", slew, laid.inputs, dict.fromkeys(laid.inputs, math.inf)),
+        by_name("limits", limits, outputs, swings),
+    )
+    for name, value in bounds.peaks.items():
+        if math.isinf(value):
+            raise ModelError(f"peak of {name} is infinite: the louder the better; give what the machine bears")
+    ramp = bounds.ramp(time)
+    if ramp > rows // 4:
+        slow = min(bounds.slews, key=lambda n: bounds.slews[n] / bounds.peaks[n])
+        raise ModelError(
+            f"slew of {slow} = {bounds.slews[slow]:g} a second takes {ramp * time:.3g} s from one peak to the other, "
+            f"of {length:g} s in all: no input of that peak can be kept within it; lower peak=, or raise slew= or "
+            "duration="
+        )
+    _check_stable(laid, bounds)
+    _check_known_enough(laid, time, length)
+    at = _chosen(laid, names)
+    if not isinstance(criterion, str) or criterion not in ("D", "E"):
+        raise ModelError(f"criterion = {shown(criterion)} is not known; use 'D' (all intervals) or 'E' (the widest)")
+    # An order is of size 1 by itself; what else is known, is known as a share of itself.
+    units = [1.0 if laid.names[i] in laid.problem.orders else abs(laid.values[i]) or 1.0 for i in at]
+    begun = check_seed(seed)
+    every = round(_positive("period", length / PERIODS if period is None else period, "a time [s]") / time)
+    if not 2 <= every <= 2 * rows:
+        raise ModelError(f"period = {period:g} s is not between two steps and twice the run; give another one")
+    told = () if solved.estimate is None else solved.estimate.warnings
+    colour = next((w for w in told if "not white" in w), None)
+    words = (
+        ()
+        if colour is None or noise is not None
+        else ("predicted for white noise, and of the model it is said: " + colour,)
+    )
+    return Wanted(
+        laid, time, rows, bounds, Criterion("D" if criterion == "D" else "E", at, tuple(units)), every, begun, words
+    )
+
+
+def _check_signals(laid: Laid, like: Run | None) -> None:
+    """Refuse a model that nobody can drive, and a run without its inputs."""
+    if not laid.inputs:
+        raise ModelError("the model has no input, so there is nothing to design; give one with an input")
+    if laid.problem.structure.behind_filter:
+        raise ModelError(
+            "an input of the model passed its sensor filter, and what a rig is given did not; identify it with the "
+            "filter on outputs alone"
+        )
+    if like is None:
+        return
+    lacking = [n for n in laid.inputs if n not in like.inputs]
+    if lacking:
+        raise DataError(
+            f"run {like.name!r} has no input {lacking[0]!r}{nearest(lacking[0], like.inputs)}, which drives the model; "
+            "give the run of that machine, or leave like= out"
+        )
+
+
+def _positive(name: str, value: object, what: str) -> float:
+    if value is None:
+        raise ModelError(f"{name} is not given; give {name}= {what}, or like= a run")
+    number = real_number(name, value)
+    if not (number > 0 and math.isfinite(number)):
+        raise ModelError(f"{name} = {number:g} is not {what} above 0; give one")
+    return number
+
+
+def _largest(run: Run, names: Sequence[str], *, moved: bool) -> dict[str, float]:
+    """How far signals of a run go, outputs from where they begin; without those that it lacks or that stand still."""
+    out = {}
+    for name in names:
+        if name in run:
+            values = np.asarray(run[name])
+            values = values[np.isfinite(values)]
+            size = float(np.max(np.abs(values - (values[0] if moved else 0.0)), initial=0.0)) if values.size else 0.0
+            if size > 0:
+                out[name] = size
+    return out
+
+
+def _chosen(laid: Laid, names: Sequence[str] | None) -> tuple[int, ...]:
+    """Places of the numbers to be told."""
+    if isinstance(names, str):
+        names = [names]
+    if names is None:
+        names = laid.problem.orders or laid.names
+    if not isinstance(names, Iterable):
+        raise ModelError(f"names is a {type(names).__name__}; give a list of names of {', '.join(laid.names)}")
+    given = list(names)
+    for k, name in enumerate(given):
+        if not isinstance(name, str) or name not in laid.names:
+            near = nearest(name, laid.names) if isinstance(name, str) else ""
+            raise ModelError(
+                f"names[{k}] = {shown(name)} is no free number of the model{near}; it has {', '.join(laid.names)}"
+            )
+        if name in given[:k]:
+            raise ModelError(f"names has {name!r} twice; give each once")
+    if not given:
+        raise ModelError("names is empty; give the numbers to be told, or leave it out for all orders")
+    return tuple(laid.names.index(n) for n in given)
+
+
+def _check_stable(laid: Laid, bounds: Bounds) -> None:
+    """Refuse what runs away, and what drifts without a limit."""
+    found = stability(laid.model)
+    if found.unstable_poles != 0 or found.on_axis:
+        raise ModelError(
+            f"the model is {found}: whatever an experiment begins with grows, and none can be laid out on it; identify "
+            "the machine in a loop that holds it, or check the model"
+        )
+    drifting = [o for o, limit in bounds.swings.items() if math.isinf(limit)]
+    if found.origin_order > 0 and drifting:
+        raise ModelError(
+            f"the model integrates its input (order {found.origin_order:g}), so that {drifting[0]} may drift anywhere; "
+            "say how far it may go by limits= (--limit), or give like= a run"
+        )
+
+
+def _check_known_enough(laid: Laid, step: float, length: float) -> None:
+    """Refuse a model that is known so badly that what is best for it says nothing of the machine."""
+    spread = laid.covariance
+    errors = np.sqrt(np.diag(spread))
+    vague = [
+        f"{n} = {v:.3g} ± {e:.2g}"
+        for n, v, e in zip(laid.names, laid.values, errors, strict=True)
+        if n in laid.problem.orders and not e <= VAGUE_ORDER
+    ]
+    if vague:
+        _too_wide(laid, f"order {vague[0]}", (step, length))
+    rows = min(max(round(length / step), FEWEST), 2000)
+    coarse = length / rows
+    probe = np.stack(
+        [np.where(np.random.default_rng(k).random(rows) < 0.5, -1.0, 1.0) for k in range(len(laid.inputs))]
+    )
+    run = laid.run(np.cumsum(probe, axis=1) / math.sqrt(rows) + probe, coarse, "probe")
+    rows_of = laid.jacobian(run)
+    moved = np.einsum("pt,pq,qt->t", rows_of, spread, rows_of)
+    for output, part in zip(laid.outputs, np.split(moved, len(laid.outputs)), strict=True):
+        size = float(np.sqrt(np.mean((run[output] / laid.noise[output]) ** 2)))
+        share = float(np.sqrt(np.mean(np.maximum(part, 0.0)))) / max(size, 1e-300)
+        if not share <= VAGUE:
+            _too_wide(laid, f"its own uncertainty moves what {output} does by {100 * share:.0f} %", (step, length))
+
+
+def _too_wide(laid: Laid, why: str, times: tuple[float, float] | None) -> None:
+    """Refuse, with the experiment that comes first."""
+    low, high = (0.1, 10.0) if times is None else (1.0 / times[1], 0.1 / times[0])
+    try:
+        own = [abs(m.pole) / (2 * math.pi) for m in modes(laid.model)]
+        if own:
+            low, high = max(low, min(own) / 10), min(high, 10 * max(own))
+    except FtlmError:
+        # Where its modes cannot be told, the run's own band stands.
+        pass
+    band = f"{low:.2g}:{max(high, 2 * low):.2g}"
+    raise ModelError(
+        f"the intervals are too wide to design on ({why}): what is best for this model may be bad for the machine. "
+        f"First record a run that shakes all of its band, such as a multisine of {band} Hz (ftlm record --input "
+        f"multisine --band {band}), and identify again from both runs"
+    )
+
+
+def _within(wanted: Wanted, known: Sensitivities, commands: Floats) -> float:
+    """Factor that keeps outputs within their limits over the model's intervals, not only at its values."""
+    moved, slopes = known.moved(commands), known.derivatives(commands)
+    spread = np.einsum("pot,pq,qot->ot", slopes, wanted.laid.covariance, slopes)
+    noise = np.array([wanted.laid.noise[o] for o in wanted.laid.outputs])[:, None]
+    reach = np.abs(moved) + NORMAL_95 * noise * np.sqrt(np.maximum(spread, 0.0))
+    return wanted.bounds.scale(commands, reach)
+
+
+def _errors(laid: Laid, reference: Run, run: Run) -> dict[str, Floats]:
+    """Standard errors as the model has them, and as fits of runs are predicted to have them."""
+    now, new = laid.covariance, laid.predicted(run)
+    size = np.sqrt(np.diag(now))
+    told = np.linalg.inv(now / np.outer(size, size)) + np.linalg.inv(new / np.outer(size, size))
+    both = np.linalg.inv(told) * np.outer(size, size)
+    every = {"now": now, "square": laid.predicted(reference), "designed": new, "both": both}
+    return {k: np.sqrt(np.diag(v)) for k, v in every.items()}
+
+
+def _reached(run: Run, bounds: Bounds) -> tuple[Reached, ...]:
+    out = []
+    for name, limit in bounds.peaks.items():
+        out.append(Reached(name, float(np.max(np.abs(run[name]))), limit))
+        if math.isfinite(bounds.slews[name]):
+            fastest = float(np.max(np.abs(np.diff(run[name][:-1], prepend=0.0)))) / run.step
+            out.append(Reached(f"slew of {name}", fastest, bounds.slews[name]))
+    return (*out, *(Reached(o, float(np.max(np.abs(run[o]))), limit) for o, limit in bounds.swings.items()))
+
+
+def _shape(best: Design, run: Run, wanted: Wanted) -> str:
+    """The designed input in words."""
+    if not best.name.endswith("exchanged"):
+        return best.name
+    first = next(iter(wanted.laid.inputs))
+    switches = int(np.sum(np.diff(run[first][:-1]) != 0)) if wanted.bounds.ramp(wanted.step) == 1 else 0
+    begun = best.name.removesuffix(", exchanged")
+    return f"levels exchanged from {begun}" + (f", {switches} switches" if switches else "")

@@ -1,0 +1,234 @@
+"""The best switching of an input that holds each of its levels for some samples: one hold exchanged after another."""
+
+from __future__ import annotations
+
+import math
+from collections.abc import Callable, Iterator, Mapping
+from dataclasses import dataclass
+
+import numpy as np
+from numpy.typing import NDArray
+
+from ftlm.experiment_design.problem import Bounds, Criterion
+from ftlm.experiment_design.sensitivity import Sensitivities
+from ftlm.utils.validation import Complex, Floats
+
+#: Levels of a command, in units of its peak.
+LEVELS = (-1.0, 0.0, 1.0)
+#: Changes of a level, and how many holds later another one may change by as much in the other direction.
+STEPS, GAPS = (-2.0, -1.0, 1.0, 2.0), (1, 2, 4, 8)
+#: Exchanges that are looked at closely, those with the largest slope first.
+FOLLOWED = 200
+#: Most exchanges, and what one has to add.
+MOST, LEAST = 400, 1e-7
+
+
+@dataclass(frozen=True)
+class Design:
+    """Commands and what they say.
+
+    Parameters
+    ----------
+    name
+        How they came to be.
+    commands
+        Shape (inputs, rows), within all limits.
+    score
+        What they say.
+    exchanges
+        How many holds were exchanged.
+    """
+
+    name: str
+    commands: Floats
+    score: float
+    exchanges: int = 0
+
+
+def judged(name: str, commands: Floats, known: Sensitivities, criterion: Criterion, bounds: Bounds) -> Design:
+    """Commands made so small that all limits are kept, and what they say then."""
+    scale = bounds.scale(commands, known.moved(commands))
+    score = float(criterion.score(known.information(known.derivatives(commands)))) + math.log(scale)
+    return Design(name, scale * commands, score)
+
+
+def exchanged(
+    begin: Design,
+    hold: int,
+    known: Sensitivities,
+    criterion: Criterion,
+    bounds: Bounds,
+    stopped: Callable[[], None] = lambda: None,
+) -> Design:
+    """Fedorov's exchange (Theory of Optimal Experiments, 1972) of the holds of an input, one or two at a time.
+
+    The information is quadratic in the commands, so that what every exchange comes to follows from convolutions, and is
+    exact. The best one that the limits bear is made, until none adds anything: no change of one hold is better, nor one
+    that takes from a hold what it gives to another near it, though other switching may be.
+    """
+    inputs, rows = begin.commands.shape
+    starts = np.arange(0, rows, hold)
+    peaks = np.array(list(bounds.peaks.values()))[:, None]
+    limits = np.array(list(bounds.swings.values()))[:, None]
+    means = np.add.reduceat(begin.commands, starts, axis=1) / np.diff(np.append(starts, rows))
+    level = _nearest(means / np.maximum(np.max(np.abs(means), axis=1, keepdims=True), 1e-300))
+    holds = [Hold.of(known, k, hold, starts, float(peaks[k, 0])) for k in range(inputs)]
+
+    def commands() -> Floats:
+        return np.asarray(np.repeat(level, hold, axis=1)[:, :rows] * peaks)
+
+    derivatives, moved = known.derivatives(commands()), known.moved(commands())
+    information = known.information(derivatives)
+    score = float(criterion.score(information)) - _over(moved, limits)
+    made = 0
+    while made < MOST:
+        stopped()
+        slope = None if score == -math.inf else criterion.slope(information) / 2
+        moves: list[tuple[float, int, int, int, float, Floats]] = []
+        for k, one in enumerate(holds):
+            for gap, shared, own in one.mixed(known, derivatives):
+                for step in STEPS:
+                    there = _allowed(level[k], step, gap)
+                    gain = np.zeros(len(shared))
+                    if slope is not None:
+                        gain = np.einsum("spq,pq->s", step * shared + step**2 * own, slope)
+                    for at in np.argsort(np.where(there, -gain, np.inf))[: min(FOLLOWED, int(np.sum(there)))]:
+                        moves.append((float(gain[at]), k, int(at), gap, step, step * shared[at] + step**2 * own[at]))
+        moves = sorted(moves, key=lambda m: -m[0])[:FOLLOWED]
+        if not moves:
+            break
+        told = criterion.score(information + np.stack([m[5] for m in moves]))
+        best, then = score + LEAST, moved
+        chosen: tuple[int, int, int, float] | None = None
+        for place in np.argsort(-told):
+            if not told[place] > best:
+                break
+            _, k, at, gap, step, _ = moves[place]
+            after = holds[k].after(moved, at, gap, step, shown=True)
+            reached = float(told[place]) - _over(after, limits)
+            if reached > best:
+                best, then, chosen = reached, after, (k, at, gap, step)
+        if chosen is None:
+            break
+        k, at, gap, step = chosen
+        score, moved = best, then
+        level[k, at] += step
+        if gap:
+            level[k, at + gap] -= step
+        derivatives = holds[k].after(derivatives, at, gap, step, shown=False)
+        information = known.information(derivatives)
+        made += 1
+    ended = judged(begin.name, commands(), known, criterion, bounds)
+    return Design(begin.name, ended.commands, ended.score, made)
+
+
+def _over(moved: Floats, limits: Floats) -> float:
+    """Logarithm of how far outputs are over their limits; 0 within."""
+    return math.log(max(1.0, float(np.max(np.abs(moved) / limits))))
+
+
+def _allowed(level: Floats, step: float, gap: int) -> NDArray[np.bool_]:
+    """Where a hold may be changed by a step, and the one a gap later by as much in the other direction."""
+    there: NDArray[np.bool_] = np.abs(level + step) < LEVELS[-1] + 0.5
+    if gap:
+        there[:-gap] &= np.abs(level[gap:] - step) < LEVELS[-1] + 0.5
+        there[-gap:] = False
+    return there
+
+
+@dataclass(frozen=True)
+class Hold:
+    """What one held level of an input does, at its peak.
+
+    Parameters
+    ----------
+    starts
+        Samples at which holds begin.
+    block, shown
+        Derivatives, shape (numbers, outputs, rows), and outputs from a hold's start on.
+    spectrum
+        Transform of the derivatives.
+    offsets
+        What a hold shares with offsets of the run, by its start.
+    own
+        Information of one hold by its start, and of one less another that begins a gap later, by gap.
+    """
+
+    starts: NDArray[np.int64]
+    block: Floats
+    shown: Floats
+    spectrum: Complex
+    offsets: Floats
+    own: Mapping[int, Floats]
+
+    @classmethod
+    def of(cls, known: Sensitivities, place: int, hold: int, starts: NDArray[np.int64], peak: float) -> Hold:
+        """Of one input."""
+        block, shown = _held(known.kernels[place], hold) * peak, _held(known.answers[place], hold) * peak
+        spectrum = np.fft.rfft(block, known.length)
+        offsets = _at_starts(known, known.nuisance.reshape(-1, *block.shape[1:]), spectrum, starts)
+        alone = _together(known, block, block, starts) - np.einsum("spr,sqr->spq", offsets, offsets)
+        own = {0: alone}
+        for gap in GAPS:
+            if gap >= len(starts):
+                break
+            late = np.zeros_like(block)
+            late[..., gap * hold :] = block[..., : known.rows - gap * hold]
+            mixed = _together(known, block, late, starts)[:-gap]
+            mixed = mixed - np.einsum("spr,sqr->spq", offsets[:-gap], offsets[gap:])
+            pair = np.zeros_like(alone)
+            pair[:-gap] = alone[:-gap] + alone[gap:] - mixed - np.swapaxes(mixed, -1, -2)
+            own[gap] = pair
+        return cls(starts, block, shown, spectrum, offsets, own)
+
+    def mixed(self, known: Sensitivities, derivatives: Floats) -> Iterator[tuple[int, Floats, Floats]]:
+        """Of each gap how the information grows with an exchange, to first order and to second, by its start."""
+        shared = _at_starts(known, derivatives, self.spectrum, self.starts)
+        if len(known.nuisance):
+            flat = derivatives.reshape(len(derivatives), -1) @ known.nuisance.T
+            shared = shared - np.einsum("spr,qr->spq", self.offsets, flat)
+        shared = shared + np.swapaxes(shared, -1, -2)
+        for gap, own in self.own.items():
+            pair = shared
+            if gap:
+                pair = np.zeros_like(shared)
+                pair[:-gap] = shared[:-gap] - shared[gap:]
+            yield gap, pair, own
+
+    def after(self, series: Floats, at: int, gap: int, step: float, *, shown: bool) -> Floats:
+        """Derivatives, or outputs, after an exchange."""
+        block, out = self.shown if shown else self.block, series.copy()
+        for begins, size in ((self.starts[at], step), *(((self.starts[at + gap], -step),) if gap else ())):
+            out[..., begins:] += size * block[..., : block.shape[-1] - begins]
+        return out
+
+
+def _nearest(values: Floats) -> Floats:
+    """The nearest level of each value; from the middle between two, the outer one."""
+    levels = np.array(LEVELS)
+    return np.asarray(levels[np.argmin(np.abs(values[..., None] * (1 + 1e-9) - levels), axis=-1)])
+
+
+def _held(kernel: Floats, hold: int) -> Floats:
+    """What a held level does from its start on, from what one sample does."""
+    total = np.cumsum(kernel, axis=-1)
+    total[..., hold:] -= total[..., :-hold].copy()
+    return total
+
+
+def _together(known: Sensitivities, one: Floats, other: Floats, starts: NDArray[np.int64]) -> Floats:
+    """Products of what two things do from their start to the end of the run, by that start."""
+    grown = np.zeros((len(starts), len(one), len(other)))
+    for p, row in enumerate(one):
+        total = np.cumsum(np.einsum("ot,qot->qt", row, other), axis=-1)
+        grown[:, p] = total[:, known.rows - 1 - starts].T
+    return grown
+
+
+def _at_starts(known: Sensitivities, series: Floats, spectrum: Complex, starts: NDArray[np.int64]) -> Floats:
+    """Products of series (so many, outputs, rows) with holds that begin at given samples: (starts, numbers, series)."""
+    out = np.zeros((len(starts), spectrum.shape[0], len(series)))
+    for place, one in enumerate(np.fft.rfft(series, known.length)):
+        product = np.einsum("of,pof->pf", one, np.conj(spectrum))
+        out[..., place] = np.fft.irfft(product, known.length)[:, starts].T
+    return out

@@ -1,0 +1,195 @@
+"""What a designed experiment is: its input, what it is predicted to tell, and what binds it."""
+
+from __future__ import annotations
+
+import math
+import os
+from collections.abc import Mapping
+from dataclasses import dataclass, field
+from typing import Any
+
+import numpy as np
+
+from ftlm.data.run import Run
+from ftlm.experiment_design.problem import Kind
+from ftlm.experiment_design.spectrum import Spectrum
+from ftlm.utils.files import to_frame
+from ftlm.utils.formatting import unbounded
+from ftlm.utils.statistics import NORMAL_95
+from ftlm.utils.validation import Floats
+from ftlm.validation.comparison import finite
+
+#: A limit is said to bind from this share of it on.
+BINDS = 0.98
+#: Inputs that were tried, of which so many are printed.
+SHOWN = 6
+
+
+@dataclass(frozen=True)
+class Reached:
+    """How far a signal of the designed run goes, and how far it may; ``slew`` of an input a second."""
+
+    name: str
+    largest: float
+    limit: float
+
+    @property
+    def binds(self) -> bool:
+        """Whether the limit decides."""
+        return self.largest >= BINDS * self.limit
+
+    def __str__(self) -> str:
+        limit = "no limit" if math.isinf(self.limit) else f"of {self.limit:.4g}{', binds' if self.binds else ''}"
+        return f"{self.name} {self.largest:.4g} ({limit})"
+
+
+@dataclass(frozen=True)
+class DesignedInput:
+    """The input that is predicted to tell a model's numbers best within the limits of a machine.
+
+    Parameters
+    ----------
+    run
+        The designed run from rest: commands, held from row to row, and the model's answer to them.
+    reference
+        The square of the same length and peaks, likewise.
+    shape
+        How the input came to be, in words.
+    criterion
+        ``"D"`` or ``"E"``.
+    chosen
+        Numbers that it was designed for.
+    values
+        Free numbers of the model.
+    errors
+        Standard errors by number: ``"now"`` those of the model; ``"square"`` and ``"designed"`` predicted for a fit of
+        either run alone; ``"both"`` for one of the designed run together with those that the model came from.
+    gain
+        How many times smaller the product of the chosen numbers' intervals is than with the square.
+    gains
+        The same of every input that was tried, best first, in the criterion's own measure: of D the volume of the
+        ellipsoid of confidence, of E its widest axis to the power of their count.
+    reached
+        How far inputs, their slews and outputs go, and may go.
+    spectrum
+        The best periodic input in steady state under the same limits.
+    efficiency
+        Precision of the designed input over the most that a periodic input in steady state can have under the limits.
+        A run from rest tells something by its start, too, so that it may exceed 1.
+    warnings
+        What may make predictions wrong.
+    """
+
+    run: Run
+    reference: Run
+    shape: str
+    criterion: Kind
+    chosen: tuple[str, ...]
+    values: Mapping[str, float]
+    errors: Mapping[str, Mapping[str, float]]
+    gain: float
+    gains: tuple[tuple[str, float], ...]
+    reached: tuple[Reached, ...]
+    spectrum: Spectrum = field(repr=False)
+    efficiency: float
+    warnings: tuple[str, ...] = ()
+
+    @property
+    def input(self) -> dict[str, Floats]:
+        """Commands by input, as long as the run."""
+        return {n: np.array(self.run[n]) for n in self.run.inputs}
+
+    @property
+    def step(self) -> float:
+        """Step of the commands [s]."""
+        return self.run.step
+
+    @property
+    def intervals(self) -> dict[str, tuple[float, float]]:
+        """95 % intervals that a fit of the designed run alone is predicted to have, around the model's values."""
+        errors = self.errors["designed"]
+        return {n: (v - NORMAL_95 * errors[n], v + NORMAL_95 * errors[n]) for n, v in self.values.items()}
+
+    @property
+    def binding(self) -> tuple[str, ...]:
+        """Limits that decide."""
+        return tuple(r.name for r in self.reached if r.binds)
+
+    def save(self, path: str | os.PathLike[str], *, force: bool = False) -> None:
+        """Write the designed run as csv: its commands are what ``ftlm record --input csv --file PATH`` gives a rig.
+
+        Parameters
+        ----------
+        path
+            File to write.
+        force
+            Overwrite a file that exists.
+
+        Raises
+        ------
+        DataError
+            The file exists and ``force`` is not set, or it cannot be written.
+        """
+        self.run.to_csv(path, force=force)
+
+    def to_frame(self) -> Any:
+        """Numbers as a pandas frame: value, standard errors now, with the square, designed, with all runs together."""
+        rows = [
+            {"parameter": n, "value": v, **{kind: errors[n] for kind, errors in self.errors.items()}}
+            for n, v in self.values.items()
+        ]
+        return to_frame(rows, ["parameter"])
+
+    def to_dict(self) -> dict[str, Any]:
+        """For JSON, without the run."""
+        return {
+            "shape": self.shape,
+            "criterion": self.criterion,
+            "chosen": list(self.chosen),
+            "duration": self.run.duration,
+            "step": self.step,
+            "values": dict(self.values),
+            "standard_errors": {k: {n: finite(v) for n, v in e.items()} for k, e in self.errors.items()},
+            "gain": finite(self.gain),
+            "gains": dict(self.gains),
+            "reached": {
+                r.name: {"largest": r.largest, "limit": finite(r.limit), "binds": r.binds} for r in self.reached
+            },
+            "efficiency": finite(self.efficiency),
+            "spectrum": {
+                "frequencies": self.spectrum.lines.frequencies.tolist(),
+                "power": self.spectrum.power.tolist(),
+                "gap": finite(self.spectrum.gap),
+            },
+            "warnings": list(self.warnings),
+        }
+
+    def __str__(self) -> str:
+        square = self.reference.name
+        lines = [
+            f"{', '.join(self.run.inputs)}: {self.shape}, {self.run.duration:.6g} s in steps of {self.step:.6g} s, "
+            f"{self.criterion}-optimal for {', '.join(self.chosen)}",
+            "",
+            f"  {'standard error of':<18}{'now':>12}{'square':>12}{'this':>12}{'with now':>12}{'square / this':>15}",
+        ]
+        for name, value in self.values.items():
+            now, before, then, both = (self.errors[k][name] for k in ("now", "square", "designed", "both"))
+            mark = "*" if name in self.chosen else " "
+            ratio = before / then if then > 0 else math.nan
+            cells = "".join(f"{unbounded(v):>12}" for v in (now, before, then, both))
+            lines.append(f"{mark} {f'{name} = {value:.6g}':<18}{cells}{ratio:>15.2f}")
+        most, last = self.spectrum.gap, f"{100 * self.efficiency:.0f} %"
+        lines += [
+            "",
+            f"intervals of the numbers marked *: their product {self.gain:.3g} times smaller than with a {square} of "
+            "the same length and peak",
+            f"limits: {'; '.join(map(str, self.reached))}",
+            f"the best periodic input within them, in steady state, is known to {100 * most:.2g} %: this one has "
+            f"{last} of its precision (a start from rest may tell more)",
+            "tried: "
+            + ", ".join(f"{name} {value:.3g}" for name, value in self.gains[:SHOWN])
+            + (f" and {len(self.gains) - SHOWN} more" if len(self.gains) > SHOWN else "")
+            + f" (times better than the {square})",
+        ]
+        lines += [f"! {w}" for w in self.warnings]
+        return "\n".join(lines)

@@ -1,0 +1,247 @@
+"""How the samples of a run move with a model's free numbers, for any input: by what one held sample of it does."""
+
+from __future__ import annotations
+
+from collections.abc import Mapping
+from dataclasses import dataclass, replace
+from functools import cached_property
+
+import numpy as np
+
+from ftlm.data.run import Run
+from ftlm.errors import ModelError
+from ftlm.estimation.free_parameters import FreeProblem
+from ftlm.estimation.objective import Attempt, Grid
+from ftlm.estimation.output_error import freedom_of, problem_of
+from ftlm.model.model import Solved
+from ftlm.simulation.simulate import simulate
+from ftlm.structure.equation import Term
+from ftlm.structure.order import Order
+from ftlm.utils.linalg import orthonormal, singular
+from ftlm.utils.validation import Complex, Floats
+
+#: Share below which a direction of what offsets do is rounding.
+ROUNDING = 1e-10
+#: Relative change at which free runs that give sensitivities their level end.
+TOLERANCE = 1e-7
+
+
+@dataclass(frozen=True)
+class Laid:
+    """A model's fit as an experiment sees it: what is free, where it stands, and how loud each output is.
+
+    Parameters
+    ----------
+    model
+        The model, followed from its inputs alone.
+    problem, values
+        Its fit for a run at rest, and its free numbers.
+    noise
+        Standard deviation of each output's noise.
+    every
+        Pulses a sample interval.
+    """
+
+    model: Solved
+    problem: FreeProblem
+    values: tuple[float, ...]
+    noise: Mapping[str, float]
+    every: int
+
+    @classmethod
+    def of(cls, model: Solved, noise: Mapping[str, float]) -> Laid:
+        """Of a model that says what was free in its fit."""
+        problem, values = problem_of(model)
+        whole = replace(model, structure=replace(model.structure, coupling="simulated", initial="rest"))
+        return cls(whole, problem, tuple(values), noise, freedom_of(model).refinement)
+
+    @property
+    def names(self) -> tuple[str, ...]:
+        """Free numbers."""
+        return tuple(self.problem.names)
+
+    @property
+    def outputs(self) -> tuple[str, ...]:
+        """Modelled outputs."""
+        return self.problem.structure.outputs
+
+    @property
+    def inputs(self) -> tuple[str, ...]:
+        """Signals that drive the model as a whole."""
+        return tuple(s for s in self.problem.structure.signals if s not in self.outputs)
+
+    @property
+    def covariance(self) -> Floats:
+        """Of the free numbers, in their order, as the model's own runs left it."""
+        known = freedom_of(self.model)
+        at = [known.names.index(n) for n in self.names]
+        return np.asarray(known.covariance)[np.ix_(at, at)]
+
+    def run(self, commands: Floats, step: float, name: str) -> Run:
+        """What the model does on commands, a row an input."""
+        blank = Run.from_arrays(
+            step=step,
+            inputs=dict(zip(self.inputs, commands, strict=True)),
+            outputs={o: np.zeros(commands.shape[1]) for o in self.outputs},
+            units={s: u for s, u in self.model.units.items() if u and s in (*self.inputs, *self.outputs)},
+            name=name,
+        )
+        answer = simulate(self.model, blank, tolerance=TOLERANCE)
+        return blank.with_outputs({o: answer[o] for o in self.outputs})
+
+    def jacobian(self, run: Run, *, offset: bool = True) -> Floats:
+        """Derivatives of a simulated run's samples over their noise, a row a number, outputs one after another.
+
+        They are those of the fit itself, from the core and on its grid; the first and the last sample are not compared.
+        Offsets of each run, if the model has some, are projected out unless that is not asked for.
+        """
+        problem = self.problem
+        if not offset:
+            problem = replace(problem, structure=replace(problem.structure, offset="none"))
+        return _derivatives(problem, self.values, run, [1.0 / self.noise[o] for o in self.outputs], self.every)
+
+    def predicted(self, run: Run) -> Floats:
+        """Covariance of the free numbers that a fit of a simulated run alone would have, by its exact derivatives."""
+        return _inverse(self.jacobian(run))
+
+
+def _inverse(rows: Floats) -> Floats:
+    """Inverse of the information of derivatives over their noise; infinite variances where a number is not seen."""
+    size = np.linalg.norm(rows, axis=1)
+    scaled = rows / np.where(size > 0, size, 1.0)[:, None]
+    _, sizes, right = singular(scaled.T)
+    lost = np.finfo(np.float64).eps * np.sqrt(rows.shape[1])
+    if np.any(size == 0) or sizes[-1] <= lost * sizes[0]:
+        return np.diag(np.full(len(rows), np.inf))
+    half = right.T / sizes / size[:, None]
+    return np.asarray(half @ half.T)
+
+
+def _derivatives(problem: FreeProblem, values: tuple[float, ...], run: Run, weights: list[float], every: int) -> Floats:
+    orders, coefficients, inputs = problem.split(values)
+    grid = Grid(problem, [run], weights, every=every)
+    here = grid.descend(Attempt(orders, coefficients, "the model", {}, inputs), 1, plain=True)
+    return np.asarray(here.outcome["jacobian"])
+
+
+@dataclass(frozen=True)
+class Sensitivities:
+    """What one held sample of each input does, from which what any input does follows by convolution.
+
+    All equations are linear in what drives them and begin at rest, so this is exact: the fit's own derivatives of a run
+    agree to rounding.
+
+    Parameters
+    ----------
+    laid
+        The model and its fit.
+    step, rows
+        Of the run [s], and its compared rows: all but the last.
+    ramp
+        Samples over which a command changes: every input is a moving average of so many samples.
+    kernels
+        Derivatives over the noise, shape (inputs, numbers, outputs, rows).
+    answers
+        Outputs, shape (inputs, outputs, rows).
+    nuisance
+        Orthonormal rows of what offsets of the run can do, shape (so many, outputs · rows).
+    """
+
+    laid: Laid
+    step: float
+    rows: int
+    ramp: int
+    kernels: Floats
+    answers: Floats
+    nuisance: Floats
+
+    @classmethod
+    def of(cls, laid: Laid, step: float, rows: int, ramp: int) -> Sensitivities:
+        """Let a pulse of each input act on the model."""
+        kernels, answers, inputs = [], [], len(laid.inputs)
+        for k in range(inputs):
+            # The first sample of a run is not compared, so the pulse comes with the second.
+            commands = np.zeros((inputs, rows + 2))
+            commands[k, 1 : 1 + ramp] = 1.0 / ramp
+            run = laid.run(commands, step, "pulse")
+            found = laid.jacobian(run, offset=False)
+            kernels.append(found.reshape(len(laid.names), len(laid.outputs), rows))
+            answers.append(np.stack([run[o][1:-1] for o in laid.outputs]))
+        nuisance = _offsets(laid, step, rows)
+        return cls(laid, step, rows, ramp, np.stack(kernels), np.stack(answers), nuisance)
+
+    @cached_property
+    def length(self) -> int:
+        """Points of a transform that holds a convolution whole."""
+        return fast_length(2 * self.rows)
+
+    @cached_property
+    def spectra(self) -> tuple[Complex, Complex]:
+        """Transforms of the kernels and of the answers."""
+        return np.fft.rfft(self.kernels, self.length), np.fft.rfft(self.answers, self.length)
+
+    def derivatives(self, commands: Floats) -> Floats:
+        """Derivatives over the noise, shape (numbers, outputs, rows), of commands of shape (inputs, rows)."""
+        drive = np.fft.rfft(commands, self.length)
+        total = np.einsum("ipof,if->pof", self.spectra[0], drive)
+        return np.asarray(np.fft.irfft(total, self.length)[..., : self.rows])
+
+    def moved(self, commands: Floats) -> Floats:
+        """Outputs, shape (outputs, rows)."""
+        total = np.einsum("iof,if->of", self.spectra[1], np.fft.rfft(commands, self.length))
+        return np.asarray(np.fft.irfft(total, self.length)[..., : self.rows])
+
+    def information(self, derivatives: Floats) -> Floats:
+        """Fisher information of the free numbers, offsets of the run projected out."""
+        flat = derivatives.reshape(len(derivatives), -1)
+        told = flat @ flat.T
+        if len(self.nuisance):
+            shared = flat @ self.nuisance.T
+            told = told - shared @ shared.T
+        return np.asarray(told)
+
+    def written(self, commands: Floats) -> Floats:
+        """What a rig is given, shape (inputs, rows + 1): ramps over a change, and a last row that nothing shows."""
+        total = np.cumsum(commands, axis=1)
+        before = np.pad(total, ((0, 0), (self.ramp, 0)))[:, : self.rows]
+        smooth = commands if self.ramp == 1 else (total - before) / self.ramp
+        return np.pad(smooth, ((0, 0), (0, 1)))
+
+
+def _offsets(laid: Laid, step: float, rows: int) -> Floats:
+    """What unknown constants (and ramps) in the equations of one run do to its samples over their noise."""
+    structure = laid.problem.structure
+    drives = {"none": 0, "constant": 1, "ramp": 2}.get(structure.offset)
+    if drives is None:
+        raise ModelError(f"offset = {structure.offset!r} of the model is not decided; identify it again")
+    if not drives:
+        return np.zeros((0, len(laid.outputs) * rows))
+    taken = {*structure.signals, *structure.coefficient_names, *structure.order_names}
+    one = next(n for n in (f"one{k}" for k in range(len(taken) + 1)) if not any(t.startswith(n) for t in taken))
+    time = step * np.arange(rows + 2)
+    shapes = {f"{one}_{k}": np.asarray(time**k, dtype=np.float64) for k in range(drives)}
+    equations = tuple(
+        replace(e, terms=(*e.terms, *(Term(s, Order(), f"{s}_{e.output}") for s in shapes)))
+        for e in structure.equations
+    )
+    problem = FreeProblem.of(replace(structure, equations=equations, offset="none"))
+    values = dict(zip(laid.names, laid.values, strict=True))
+    still = laid.run(np.zeros((len(laid.inputs), rows + 2)), step, "still")
+    run = still.with_outputs(shapes)
+    found = _derivatives(
+        problem,
+        tuple(values.get(n, 0.0) for n in problem.names),
+        run,
+        [1.0 / laid.noise[o] for o in laid.outputs],
+        laid.every,
+    )
+    own = [i for i, n in enumerate(problem.names) if n not in values]
+    # They are told from the second sample on; at the first, a run from rest shows nothing of them.
+    told = found[own].reshape(len(own), len(laid.outputs), rows)
+    told = np.pad(told, ((0, 0), (0, 0), (1, 0)))[..., :rows]
+    return orthonormal(told.reshape(len(own), -1).T, ROUNDING).T
+
+
+def fast_length(least: int) -> int:
+    """The least 2^a, 3·2^a, 5·2^a or 15·2^a from there on: transforms of such lengths are quick."""
+    return min(f << max((least - 1) // f, 0).bit_length() for f in (1, 3, 5, 15))

@@ -1,1 +1,0 @@
-"""Estimators: from records to numbers with intervals."""

@@ -1,0 +1,465 @@
+"""Reads columns of numbers from text, refusing whatever it cannot be sure of."""
+
+from __future__ import annotations
+
+import codecs
+import functools
+import gzip
+import itertools
+import zlib
+from collections.abc import Callable, Iterator
+from dataclasses import dataclass, field, replace
+from pathlib import Path
+from typing import BinaryIO
+
+import numpy as np
+import numpy.typing as npt
+
+from ftlm.data.export import LONGEST_HEADER, header_of_line
+from ftlm.errors import DataError
+from ftlm.io.cell_parsing import (
+    DECIMAL_COMMA,
+    Moments,
+    behind_a_stroke,
+    grouping,
+    is_gap,
+    is_moment,
+    is_number,
+    may_group,
+    number,
+    split,
+    stated_unit,
+)
+from ftlm.io.dialect import SEPARATOR_WORDS, Assumption, Found, Layout, find_table
+from ftlm.io.table import Column, FileTable
+from ftlm.utils.validation import bad_rows
+
+_BLOCK = 8 << 20
+#: What is looked at before the rest is read in one go: so many characters, and at least so many lines.
+_SAMPLE, _SAMPLE_LINES = 1 << 16, 8
+_UTF16 = (codecs.BOM_UTF16_LE, codecs.BOM_UTF16_BE)
+_UTF32 = (codecs.BOM_UTF32_LE, codecs.BOM_UTF32_BE)
+_LARGEST_UNPACKED = 1 << 30
+_FILL = "fill or remove these rows yourself, or let them be missing with missing='weight' or missing='hold'"
+
+
+@dataclass
+class _Trouble:
+    """Cells of one column that are not numbers."""
+
+    line: int
+    row: int
+    cell: str
+    count: int
+    blank: bool
+    comma: bool
+    moments: bool = False
+    sheet: bool = False
+    other: str = ""
+
+    def error(self, column: str, source: str) -> DataError:
+        thing = f"{source}: column {column!r}, line {self.line}"
+        text = self.cell.strip()
+        shown = repr(text if len(text) <= 40 else text[:40] + "…")
+        way_out = "correct or remove these rows"
+        if not text:
+            what = "empty cell" + (", or one with an error or a formula that nobody computed" if self.sheet else "")
+            way_out = _FILL
+        elif is_gap(text):
+            what = f"{shown} stands for no number"
+            way_out = _FILL
+        elif (mark := grouping(text, comma=self.comma)) is not None:
+            what = f"{shown} has marks between thousands"
+            way_out = f"say layout=dict(thousands={mark!r}), or write all numbers without"
+        elif self.comma and "." in text and is_number(text):
+            what = f"{shown} has a point where decimals follow a comma"
+            way_out = "write all numbers alike"
+            if may_group(text, "point", comma=True):
+                way_out += ", or say layout=dict(thousands='point') where points group thousands"
+        elif DECIMAL_COMMA.fullmatch(text):
+            what = f"{shown} has a decimal comma"
+            way_out = "write all numbers alike, or say layout=dict(decimal='comma') where all of them have commas"
+        elif self.other:
+            what = f"{shown} and {self.other!r} are dates or times of day written in two ways"
+            way_out = "write all alike"
+        elif self.moments:
+            what = f"{shown} stands among numbers" if is_moment(text) else f"{shown} stands among dates or times of day"
+        else:
+            what = f"{shown} is not a number"
+        return bad_rows(thing, what, self.row, self.count, way_out)
+
+
+@dataclass
+class _Rows:
+    """What the blocks of a text hold so far."""
+
+    found: Found
+    sheet: bool = False
+    count: int = 0
+    ragged: int = 0
+    ragged_line: int = 0
+    ragged_cells: list[str] = field(default_factory=list)
+    blocks: list[npt.NDArray[np.float64]] = field(default_factory=list)
+    troubles: dict[int, _Trouble] = field(default_factory=dict)
+    moments: dict[int, list[Moments]] = field(default_factory=dict)
+
+
+def read_text(path: Path, layout: Layout) -> FileTable:
+    """Read the columns of one text file, packed by gzip or not."""
+    try:
+        with open(path, "rb") as stream:
+            if path.suffix.lower() != ".gz" and stream.read(2) != b"\x1f\x8b":
+                stream.seek(0)
+                return parse_text(path, stream, layout)
+            stream.seek(0)
+            return _unpacked(path, stream, layout)
+    except OSError as error:
+        raise DataError(f"{str(path)!r} cannot be read ({error.strerror}); check its permissions") from None
+
+
+def _unpacked(path: Path, packed: BinaryIO, layout: Layout) -> FileTable:
+    try:
+        with gzip.GzipFile(fileobj=packed) as stream:
+            table = parse_text(path, _Limited(path, stream), layout)
+    except (OSError, EOFError, zlib.error) as error:
+        raise DataError(
+            f"{path.name}: damaged file: it cannot be unpacked ({str(error)[:100]}); get an intact copy"
+        ) from None
+    return replace(table, kind=f"{table.kind}, packed by gzip")
+
+
+class _Limited:
+    """A stream that refuses to give more bytes than a file may have."""
+
+    def __init__(self, path: Path, stream: gzip.GzipFile) -> None:
+        self._path, self._stream = path, stream
+
+    def read(self, size: int) -> bytes:
+        if self._stream.tell() > _LARGEST_UNPACKED:
+            raise DataError(
+                f"{self._path.name}: unpacked, it has more than {_LARGEST_UNPACKED} bytes; split the record or lower "
+                "its rate"
+            )
+        return self._stream.read(size)
+
+    def readline(self, size: int) -> bytes:
+        return self._stream.readline(size)
+
+    def seek(self, place: int) -> int:
+        return self._stream.seek(place)
+
+
+def parse_text(path: Path, stream: BinaryIO | _Limited, layout: Layout, sheet: str | None = None) -> FileTable:
+    """Read the columns of text: of a file, or of a sheet whose rows are lines and whose cells stand between tabs."""
+    source = path.name if sheet is None else f"{path.name}, sheet {sheet!r}"
+    header = header_of_line(path, stream.readline(LONGEST_HEADER)) if sheet is None else None
+    stream.seek(0)
+    encoding, guessed = _encoding(stream, layout, path)
+    stream.seek(0)
+    blocks = _line_blocks(path, stream, encoding)
+    # Of sheets, no cell begins a remark.
+    mark = "#" if sheet is None else "\0"
+    begun, sample, remark = _sample(blocks, layout, mark)
+    if not sample:
+        raise DataError(f"{source}: the file is empty, 0 rows; choose a file that holds a record")
+    found = find_table(sample, layout, source, own=header is not None, sheet=sheet is not None)
+    found = _with_gaps(found, begun, sample, layout, sheet=sheet is not None)
+    rows = _Rows(found, sheet is not None)
+    for first, lines in itertools.chain(begun, blocks):
+        _take(rows, first, lines, mark, source)
+    columns = _columns(rows, path, source)
+    what = Layout(sheet=sheet) if sheet is not None else Layout(encoding=encoding)
+    if sheet is not None:
+        found = replace(found, layout=replace(found.layout, separator=None, decimal=None))
+    kind = f"sheet {sheet!r}" if sheet else f"text ({encoding}, {SEPARATOR_WORDS[found.separator]} between cells)"
+    assumed = () if header is not None else guessed + found.assumed
+    if found.names is None:
+        assumed = tuple(_with_remark(a, remark, found.width) for a in assumed)
+    return FileTable(path, columns, True, header, layout=what.under(found.layout), assumed=assumed, kind=kind)
+
+
+def _with_gaps(
+    found: Found, begun: list[tuple[int, list[str]]], sample: list[tuple[int, str]], layout: Layout, *, sheet: bool
+) -> Found:
+    """The table with the rows of empty cells that stand right below its names; a sheet's are said and left out."""
+    if found.separator != "\t" or found.names is None:
+        return found
+    above = max((at for at, _ in sample if at < found.begin), default=0)
+    lines = ((at, line) for first, part in begun for at, line in enumerate(part, first))
+    between = itertools.takewhile(lambda pair: pair[0] < found.begin, lines)
+    gaps = [at for at, line in between if at > above and not line.strip() and line.count("\t") == found.width - 1]
+    if not gaps or found.width == 1:
+        return found
+    if not sheet:
+        return replace(found, begin=gaps[0])
+    if layout.header is not None:
+        return found
+    words = f"line {gaps[0]}, right below the header, is empty and left out"
+    if len(gaps) > 1:
+        words = f"lines {gaps[0]} to {gaps[-1]}, right below the header, are empty and left out"
+    header = 1 if found.units is None else 2
+    return replace(found, assumed=(*found.assumed, Assumption("header", header, words, "layout=dict(header=1)")))
+
+
+def _with_remark(assumption: Assumption, remark: str, width: int) -> Assumption:
+    """What was assumed of names, with a remark above the rows that may hold them, as NumPy writes it."""
+    words = remark.lstrip("# \t").replace(",", " ").split()
+    if assumption.option != "header" or len(words) != width or any(map(is_number, words)):
+        return assumption
+    return replace(assumption, words=f"{assumption.words} (a remark above them has as many words: {' '.join(words)!r})")
+
+
+def _sample(
+    blocks: Iterator[tuple[int, list[str]]], layout: Layout, mark: str
+) -> tuple[list[tuple[int, list[str]]], list[tuple[int, str]], str]:
+    """The blocks that have begun, the first lines of the text that hold something, and the remark above them."""
+    begun: list[tuple[int, list[str]]] = []
+    sample: list[tuple[int, str]] = []
+    size, remark = 0, ""
+    for first, lines in blocks:
+        begun.append((first, lines))
+        for at, line in enumerate(lines, first):
+            if size > _SAMPLE and len(sample) >= _SAMPLE_LINES:
+                break
+            if not sample and line.lstrip()[:1] == mark:
+                remark = line[:400]
+            if _holds(line, mark):
+                sample.append((at, line))
+                size += len(line) if at > (layout.skip or 0) else 0
+        if size > _SAMPLE and len(sample) >= _SAMPLE_LINES:
+            break
+    return begun, sample, remark
+
+
+def _holds(line: str, mark: str) -> bool:
+    begun = line.lstrip()
+    return bool(begun) and begun[0] != mark
+
+
+def _take(rows: _Rows, first: int, lines: list[str], mark: str, source: str) -> None:
+    """Read the rows of one block."""
+    found = rows.found
+    kept = []
+    for at, line in enumerate(lines, first):
+        # Between tabs, a row of empty cells is a gap and no blank line.
+        gap = found.separator == "\t" and "\t" in line and not line.strip()
+        if at >= found.begin and (gap or _holds(line, mark)):
+            kept.append((at, line))
+        elif at >= found.begin and line.lstrip()[:1] == mark:
+            _check_remark(line, at, found, source)
+    if not kept:
+        return
+    cells = split([line for _, line in kept], found.separator, source, kept[0][0])
+    wrong = [index for index, row in enumerate(cells) if len(row) != found.width]
+    if wrong:
+        if not rows.ragged:
+            rows.ragged_line, rows.ragged_cells = kept[wrong[0]][0], cells[wrong[0]]
+        rows.ragged += len(wrong)
+    if not rows.ragged:
+        # Python's numbers may have underscores between their digits, those of files have not.
+        plain = not found.comma and found.mark is None and not any("_" in line for _, line in kept)
+        rows.blocks.append(_numbers(rows, cells, [at for at, _ in kept], plain=plain))
+    rows.count += len(cells)
+
+
+def _check_remark(line: str, at: int, found: Found, source: str) -> None:
+    """Refuse a line among the rows that may be a remark or a row whose first cell is one like #N/A."""
+    cells = line.split(found.separator)
+    numbers = any(is_number(cell, comma=found.comma, mark=found.mark) or is_moment(cell) for cell in cells)
+    error = len(cells) == 1 and cells[0].strip().endswith(("!", "?", "/A"))
+    if len(cells) == found.width and (found.width > 1 or error) and (numbers or error or found.separator is not None):
+        raise DataError(
+            f"{source}: line {at} begins with # and has as many cells as a row ({line.strip()[:40]!r}), so it may be a "
+            "remark or a row; remove that line, or write a number in its first cell"
+        )
+
+
+def _columns(rows: _Rows, path: Path, source: str) -> list[Column]:
+    found = rows.found
+    if rows.ragged:
+        raise _ragged(rows, source)
+    if rows.count == 0:
+        raise DataError(f"{source}: a header and no rows; choose a file that holds a record")
+    values = np.concatenate(rows.blocks).T.copy() if len(rows.blocks) > 1 else rows.blocks[0].T.copy()
+    names = found.names if found.names is not None else [f"c{index + 1}" for index in range(found.width)]
+    columns = []
+    for k, (name, column) in enumerate(zip(names, values, strict=True)):
+        trouble, pieces = rows.troubles.get(k), rows.moments.get(k)
+        moments = None if pieces is None else Moments.joined(pieces)
+        problem = None if trouble is None else trouble.error(name, source)
+        if pieces is not None and (moments is None or moments.clock.size != rows.count):
+            problem = problem or DataError(
+                f"{source}: column {name!r}: dates or times written in several ways; write all alike"
+            )
+            moments = None
+        elif moments is not None:
+            problem = bad_rows(
+                f"{source}: column {name!r}",
+                f"dates or times of day, not numbers ({moments.first!r})",
+                0,
+                rows.count,
+                "name it with time=, or choose another column",
+            )
+        unit = (found.units[k] if found.units is not None else "") or stated_unit(name)[1] or behind_a_stroke(name)[1]
+        blank = trouble is not None and trouble.blank
+        columns.append(Column(name, name, path, column, problem, blank=blank, moments=moments, stated=unit))
+    return columns
+
+
+def _ragged(rows: _Rows, source: str) -> DataError:
+    found = rows.found
+    first = "line of names" if found.names is not None else "first row"
+    others = [
+        words
+        for mark, words in SEPARATOR_WORDS.items()
+        if mark is not None
+        and mark != found.separator
+        and not (found.comma and mark == ",")
+        and sum(cell.count(mark) for cell in rows.ragged_cells) >= max(1, found.width - 1)
+    ]
+    mixed = f"; that line has {others[0]}s" if others and len(rows.ragged_cells) < found.width else ""
+    return DataError(
+        f"{source}: line {rows.ragged_line} has {len(rows.ragged_cells)} cells where the {first} has {found.width}, "
+        f"{rows.ragged} lines in all; give every line the same number of cells "
+        f"(separator: {SEPARATOR_WORDS[found.separator]}{mixed})"
+    )
+
+
+def _encoding(stream: BinaryIO | _Limited, layout: Layout, path: Path) -> tuple[str, tuple[Assumption, ...]]:
+    """How the bytes of a text stand for characters: as told, by its mark, by its zeros, else UTF-8 where they are."""
+    if layout.encoding is not None:
+        return layout.encoding, ()
+    head = stream.read(LONGEST_HEADER)
+    if head.startswith(_UTF32):
+        return "utf-32", ()
+    if head.startswith(_UTF16):
+        return "utf-16", ()
+    for offset, name in ((1, "utf-16-le"), (0, "utf-16-be")):
+        zeros, others = head[offset:4000:2].count(0), head[1 - offset : 4000 : 2].count(0)
+        if zeros > 4 and others == 0 and zeros > 0.8 * len(head[offset:4000:2]):
+            words = f"every other byte is 0, so the text is {name}"
+            return name, (Assumption("encoding", name, words, "layout=dict(encoding=NAME)", False),)
+    try:
+        codecs.getincrementaldecoder("utf-8")().decode(head)
+    except UnicodeDecodeError as error:
+        if any(code in head for code in (*range(9), *range(14, 32))):
+            at = head[: error.start].count(b"\n") + 1
+            zipped = ": it begins as workbooks do, whose names end in .xlsx or .ods" if head[:2] == b"PK" else ""
+            raise DataError(
+                f"{path.name}: line {at} is not UTF-8 text (byte {head[error.start]:#04x}), and other bytes are of no "
+                f"text at all{zipped}; say layout=dict(encoding=NAME), or pass a csv, text or .mat file"
+            ) from None
+        words = f"no UTF-8 (byte {head[error.start]:#04x}), taken for cp1252 of Windows, which numbers do not depend on"
+        otherwise = "layout=dict(encoding=NAME)"
+        try:
+            head.decode("cp1252")
+        except UnicodeDecodeError:
+            return "latin-1", (
+                Assumption("encoding", "latin-1", words.replace("cp1252 of Windows", "latin-1"), otherwise),
+            )
+        return "cp1252", (Assumption("encoding", "cp1252", words, otherwise),)
+    return "utf-8", ()
+
+
+def _line_blocks(path: Path, stream: BinaryIO | _Limited, encoding: str) -> Iterator[tuple[int, list[str]]]:
+    """Yield the number of a first line and the lines from there, a few megabytes at a time."""
+    decoder = codecs.getincrementaldecoder("utf-8-sig" if encoding == "utf-8" else encoding)()
+    carry, number_, newline = "", 1, ""
+    while True:
+        block = stream.read(_BLOCK)
+        try:
+            data = carry + decoder.decode(block, final=not block)
+        except UnicodeError as error:
+            raise _undecodable(path, error, number_ + carry.count("\n"), encoding) from None
+        if not block:
+            # What old programs end a text with.
+            data = data.removesuffix("\x1a")
+        if not newline:
+            newline = "\r" if "\r" in data and "\n" not in data else "\n" if data else ""
+        zero = data.find("\0")
+        if zero >= 0:
+            raise DataError(
+                f"{path.name}: a zero byte near line {number_ + data[:zero].count(newline)}, so it is not a text file "
+                "or is damaged; pass a csv, text or .mat file"
+            )
+        cut = data.rfind(newline) + 1 if block and newline else len(data) if not block else 0
+        if cut == 0 and len(data) > _BLOCK:
+            raise DataError(f"{path.name}: line {number_} is longer than {_BLOCK} bytes; pass a csv or text file")
+        if cut:
+            lines = data[:cut].split(newline)
+            yield number_, lines
+            number_ += len(lines) - 1
+        carry = data[cut:]
+        if not block:
+            return
+
+
+def _undecodable(path: Path, error: UnicodeError, line: int, encoding: str) -> DataError:
+    if not isinstance(error, UnicodeDecodeError):
+        return DataError(f"{path.name}: the text is no {encoding} ({error}); say layout=dict(encoding=NAME)")
+    at, byte = line + error.object[: error.start].count(b"\n"), error.object[error.start]
+    return DataError(
+        f"{path.name}: line {at} is not {encoding.upper()} text (byte {byte:#04x}); say layout=dict(encoding='cp1252') "
+        "if it is that of Windows, or save it as UTF-8"
+    )
+
+
+def _numbers(rows: _Rows, cells: list[list[str]], lines: list[int], *, plain: bool) -> npt.NDArray[np.float64]:
+    width = len(cells[0])
+    careful = functools.partial(number, comma=rows.found.comma, mark=rows.found.mark)
+    value: Callable[[str], float] = float if plain else careful
+    try:
+        flat = np.fromiter(map(value, itertools.chain.from_iterable(cells)), dtype=np.float64, count=len(cells) * width)
+    except ValueError:
+        pass
+    else:
+        return flat.reshape(len(cells), width)
+    values = np.zeros((len(cells), width))
+    for index in range(width):
+        column = [row[index] for row in cells]
+        try:
+            values[:, index] = list(map(careful, column))
+        except ValueError:
+            _not_numbers(rows, index, column, lines, values)
+    return values
+
+
+def _not_numbers(rows: _Rows, index: int, column: list[str], lines: list[int], values: npt.NDArray[np.float64]) -> None:
+    """Keep moments of a column, or which of its cells are none and no numbers."""
+    comma, mark = rows.found.comma, rows.found.mark
+    if is_moment(column[0]) and rows.count == sum(m.clock.size for m in rows.moments.get(index, [])):
+        moments = Moments.read(column)
+        if moments is not None:
+            rows.moments.setdefault(index, []).append(moments)
+            return
+    bad = [row for row, cell in enumerate(column) if not is_number(cell, comma=comma, mark=mark)]
+    dated = [row for row in bad if is_moment(column[row])]
+    if dated and 2 * len(dated) > len(column):
+        # Among dates it is the numbers that are wrong.
+        bad = [row for row in range(len(column)) if not is_moment(column[row])] or bad
+    # Where all are moments, the first that is written otherwise than the first of all.
+    ways = [row for row in bad if Moments.read([column[0], column[row]]) is None] if len(dated) == len(column) else []
+    bad = ways or bad
+    # What says nothing beside what says something wrong is not what is to be told of.
+    bad = [row for row in bad if not is_gap(column[row])] or bad
+    blank = all(is_gap(column[row]) for row in bad)
+    if blank and not dated:
+        values[:, index] = [np.nan if is_gap(cell) else number(cell, comma=comma, mark=mark) for cell in column]
+    known = rows.troubles.get(index)
+    if known is None:
+        rows.troubles[index] = _Trouble(
+            lines[bad[0]],
+            rows.count + bad[0],
+            column[bad[0]],
+            len(bad),
+            blank and not dated,
+            comma,
+            bool(dated),
+            rows.sheet,
+            column[0].strip()[:40] if ways else "",
+        )
+        return
+    if known.blank and (dated or not blank):
+        known.line, known.row, known.cell = lines[bad[0]], rows.count + bad[0], column[bad[0]]
+    known.count += len(bad)
+    known.blank &= blank and not dated

@@ -1,0 +1,274 @@
+"""Reads binary files in a process of its own, which they may crash."""
+
+from __future__ import annotations
+
+import importlib.util
+import io
+import json
+import signal
+import subprocess
+import sys
+from dataclasses import dataclass, replace
+from pathlib import Path
+from typing import cast
+
+import numpy as np
+import numpy.typing as npt
+
+from ftlm.data.export import Header
+from ftlm.errors import DataError
+from ftlm.io.cell_parsing import Moments
+from ftlm.io.delimited_text import parse_text
+from ftlm.io.dialect import Assumption, Layout
+from ftlm.io.table import Column, FileTable
+from ftlm.utils.validation import bad_rows
+
+_READER = Path(__file__).with_name("binary_reader.py")
+_READER_SECONDS = 60.0
+
+
+@dataclass(frozen=True)
+class Apart:
+    """A kind of file that is read in a process of its own.
+
+    Parameters
+    ----------
+    kind
+        What the reader calls it.
+    suffixes
+        How its files end.
+    package, extra
+        What reads it, and the extra of ftlm that installs that; "" where NumPy does.
+    words, again
+        What errors call it, and how it is saved again.
+    sheets
+        Whether it holds sheets of cells, which are laid out like text.
+    """
+
+    kind: str
+    suffixes: tuple[str, ...]
+    package: str
+    extra: str
+    words: str
+    again: str
+    sheets: bool = False
+
+
+_SAVE = "save it again with save('FILE.mat', '-v7')"
+MATLAB = Apart("mat", (".mat",), "scipy", "mat", ".mat", _SAVE)
+MATLAB_73 = Apart("hdf5", (), "h5py", "hdf5", ".mat (version 7.3)", _SAVE)
+HDF5 = Apart("hdf5", (".h5", ".hdf5", ".hdf", ".he5"), "h5py", "hdf5", "HDF5", "save it again")
+PARQUET = Apart("parquet", (".parquet", ".pq"), "pyarrow", "parquet", "parquet", "save it again")
+FEATHER = Apart("feather", (".feather", ".arrow"), "pyarrow", "parquet", "feather", "save it again")
+NUMPY = Apart("numpy", (".npz", ".npy"), "numpy", "", "NumPy", "save it again")
+SHEETS = Apart(
+    "sheet",
+    (".xlsx", ".xlsm", ".xlsb", ".xls", ".ods"),
+    "python_calamine",
+    "excel",
+    "sheet",
+    "save it again",
+    sheets=True,
+)
+KINDS = (MATLAB, HDF5, PARQUET, FEATHER, NUMPY, SHEETS)
+_HDF5_MARK = b"\x89HDF\r\n\x1a\n"
+
+
+def kind_of(path: Path) -> Apart | None:
+    """Which kind of binary file a path is, by its ending; None for text."""
+    suffixes = [suffix.lower() for suffix in path.suffixes[-2:]]
+    if suffixes and suffixes[-1] == ".gz":
+        inner = next((kind for kind in KINDS if suffixes[0] in kind.suffixes), None)
+        if inner is not None:
+            raise DataError(f"{str(path)!r}: {inner.words} files are read unpacked; unpack it with gunzip")
+        return None
+    found = next((kind for kind in KINDS if suffixes and suffixes[-1] in kind.suffixes), None)
+    return MATLAB_73 if found is MATLAB and _is_hdf5(path) else found
+
+
+def _is_hdf5(path: Path) -> bool:
+    """Whether a file holds what MATLAB writes since version 7.3."""
+    try:
+        with open(path, "rb") as stream:
+            head = stream.read(520)
+    except OSError:
+        return False
+    return head.startswith(b"MATLAB 7.3 MAT-file") or _HDF5_MARK in (head[:8], head[512:520])
+
+
+def read_apart(paths: list[Path], kind: Apart, layout: Layout) -> list[FileTable]:
+    """Read files of one kind; a crash of the reader is the fault of the first file that it did not answer for."""
+    folders = []
+    for package in dict.fromkeys(("numpy", kind.package)):
+        spec = importlib.util.find_spec(package)
+        if spec is None or not spec.submodule_search_locations:
+            raise DataError(
+                f"{str(paths[0])!r}: reading {kind.words} files needs {package.replace('_', '-')}; run: pip install "
+                f"'ftlm[{kind.extra}]'"
+            )
+        folders.append(str(Path(next(iter(spec.submodule_search_locations))).resolve().parent))
+    files = [str(path.resolve()) for path in paths]
+    told = json.dumps({"folders": folders, "sheet": layout.sheet})
+    command = [sys.executable, "-I", str(_READER), kind.kind, told, *files]
+    try:
+        done = subprocess.run(
+            command, stdin=subprocess.DEVNULL, capture_output=True, timeout=_READER_SECONDS, check=False
+        )
+    except subprocess.TimeoutExpired as stopped:
+        answers = _Answers(stopped.stdout or b"")
+        path = paths[min(answers.complete(len(paths)), len(paths) - 1)]
+        raise _damaged(path, f"did not finish in {_READER_SECONDS:g} s", kind) from None
+    except OSError as error:
+        raise DataError(
+            f"{str(paths[0])!r}: Python could not be started to read it ({error.strerror}); check the installation"
+        ) from None
+    answers = _Answers(done.stdout)
+    tables = []
+    for path in paths:
+        table = answers.table(path, layout)
+        if table is None:
+            raise _damaged(path, _ending(done.returncode), kind)
+        tables.append(table if table.kind else replace(table, kind=kind.words))
+    return tables
+
+
+def _ending(code: int) -> str:
+    """How the reader ended."""
+    if code >= 0:
+        return "ended too early" if code == 0 else f"ended with code {code}"
+    try:
+        return f"crashed (signal {-code}, {signal.Signals(-code).name})"
+    except ValueError:
+        return f"crashed (signal {-code})"
+
+
+def _damaged(path: Path, how: str, kind: Apart) -> DataError:
+    return DataError(f"{str(path)!r}: damaged file: the reader {how}; get an intact copy or {kind.again}")
+
+
+class _Answers:
+    """What the reader wrote, taken apart with care: it may have died at any byte."""
+
+    def __init__(self, content: bytes) -> None:
+        self._content = content
+        self._at = 0
+
+    def complete(self, most: int) -> int:
+        """Return how many files were answered for."""
+        count = 0
+        while count < most and self._next() is not None:
+            count += 1
+        return count
+
+    def _next(self) -> tuple[dict[str, object], list[_Array], bytes] | None:
+        end = self._content.find(b"\n", self._at)
+        if end < 0:
+            return None
+        try:
+            header = json.loads(self._content[self._at : end])
+        except (ValueError, RecursionError):
+            return None
+        if not isinstance(header, dict):
+            return None
+        at = end + 1
+        arrays = []
+        try:
+            for entry in header.get("arrays", []):
+                rows, columns = int(entry["rows"]), int(entry["columns"])
+                if rows < 0 or columns < 0:
+                    return None
+                flat = np.frombuffer(self._content, dtype="<f8", count=rows * columns, offset=at)
+                matrix = flat.reshape((rows, columns), order="F").astype(np.float64, copy=False)
+                since = int(entry["since"]) if "since" in entry else None
+                arrays.append(_Array(str(entry["name"]), str(entry["type"]), matrix, str(entry.get("unit", "")), since))
+                at += 8 * rows * columns
+            size = int(header.get("bytes", 0))
+            if size < 0 or at + size > len(self._content):
+                return None
+            cells = self._content[at : at + size]
+            at += size
+        except (ValueError, KeyError, TypeError, OverflowError, AttributeError):
+            return None
+        if not isinstance(header.get("skipped", {}), dict) or ("error" in header and "way_out" not in header):
+            return None
+        self._at = at
+        return header, arrays, cells
+
+    def table(self, path: Path, layout: Layout) -> FileTable | None:
+        """Return the next file's columns, or None when the reader did not get that far."""
+        answer = self._next()
+        if answer is None:
+            return None
+        header, arrays, cells = answer
+        if "error" in header:
+            raise DataError(f"{str(path)!r}: {header['error']}; {header['way_out']}")
+        if "sheet" in header:
+            return _sheet(path, header, cells, layout)
+        skipped = cast("dict[str, str]", header.get("skipped", {}))
+        columns = [column for array in arrays for column in _columns(path, array)]
+        if not columns:
+            why = ", ".join(f"{name!r} ({reason})" for name, reason in list(skipped.items())[:10]) or "it is empty"
+            raise DataError(f"{str(path)!r} holds no real numeric matrix: {why}; save the samples as matrices")
+        told = header.get("ftlm-run")
+        own = Header.read(path, "its metadata", told) if isinstance(told, str) else None
+        return FileTable(path, columns, text=header.get("text") is True, header=own, skipped=skipped)
+
+
+def _sheet(path: Path, header: dict[str, object], cells: bytes, layout: Layout) -> FileTable:
+    """The table of a sheet, whose cells came as text between tabs."""
+    sheet = str(header["sheet"])
+    table = parse_text(path, io.BytesIO(cells), layout, sheet)
+    others = header.get("others")
+    if layout.sheet is None and isinstance(others, list) and others:
+        words = f"sheet {sheet!r}, the only one that is not empty"
+        assumed = Assumption("sheet", sheet, words, "layout=dict(sheet=NAME)")
+        table = replace(table, assumed=(assumed, *table.assumed))
+    return table
+
+
+@dataclass(frozen=True)
+class _Array:
+    """One array of a file: numbers by column, or nanoseconds since a moment."""
+
+    name: str
+    kind: str
+    matrix: npt.NDArray[np.float64]
+    unit: str = ""
+    since: int | None = None
+
+
+def _columns(path: Path, array: _Array) -> list[Column]:
+    """Return a vector as a column under its name, a matrix as columns under its name and their numbers."""
+    name, matrix = array.name, array.matrix
+    # The time of a single-precision file is exact to its own digits only, which the step must know.
+    with np.errstate(over="ignore"):  # what overflows is no single; it is refused as infinite
+        values = matrix.astype(np.float32) if array.kind == "single" else matrix
+    if array.since is not None:
+        return [_moments(path, array)]
+    if 1 in matrix.shape:
+        return [Column(name, name, path, values.ravel(order="F"), stated=array.unit)]
+    rows, count = matrix.shape
+    if count > rows:
+        problem = DataError(
+            f"{path.name}: the matrix {name!r} has {rows} rows and {count} columns; "
+            f"samples belong in rows: transpose it in MATLAB ({name} = {name}.';) and save it again"
+        )
+        return [Column(name, f"{name}.1", path, values[:, 0], problem, name)]
+    return [Column(name, f"{name}.{k + 1}", path, values[:, k], matrix=name) for k in range(count)]
+
+
+def _moments(path: Path, array: _Array) -> Column:
+    """A column of dates."""
+    since, name = array.since or 0, array.name
+    values = array.matrix.ravel(order="F")
+    thing, gone = f"{path.name}: column {name!r}", np.isnan(values)
+    if gone.any():
+        rows = np.flatnonzero(gone)
+        problem = bad_rows(thing, "no date", int(rows[0]), rows.size, "remove or fill these rows yourself")
+        return Column(name, name, path, None, problem)
+    first = str(np.datetime64(since, "ns")) if abs(since) < 1 << 63 else "a date"
+    moments = Moments(np.zeros((values.size, 3), np.int64), "", np.clip(values, -9e18, 9e18).astype(np.int64), first)
+    problem = bad_rows(
+        thing, f"dates, not numbers ({first})", 0, values.size, "name it with time=, or choose another column"
+    )
+    return Column(name, name, path, values, problem, moments=moments)

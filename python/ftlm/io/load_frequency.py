@@ -1,0 +1,500 @@
+"""Frequency responses and impedance spectra from the files that analysers, potentiostats and programs write."""
+
+from __future__ import annotations
+
+import re
+from collections.abc import Mapping
+from dataclasses import dataclass, replace
+
+import numpy as np
+
+from ftlm.data.frequency_data import FREQUENCY_UNITS, FrequencyData, frequency_factor
+from ftlm.errors import DataError
+from ftlm.io.cell_parsing import stated_unit
+from ftlm.io.dialect import Layout
+from ftlm.io.load import PathLike, stem_of, tables_of
+from ftlm.io.table import Column, Pool
+from ftlm.utils.files import LOG
+from ftlm.utils.validation import Complex, Floats, listed, nearest
+
+#: What columns are called, without capitals, spaces and underscores; a minus before it turns its sign.
+_NAMES = {
+    "frequency": (
+        "f",
+        "freq",
+        "frequency",
+        "frequenz",
+        "fréquence",
+        "frecuencia",
+        "frequenza",
+        "hz",
+        "w",
+        "omega",
+        "ω",
+        "angularfrequency",
+        "kreisfrequenz",
+        "rad/s",
+    ),
+    "real": (
+        "re",
+        "real",
+        "realpart",
+        "realteil",
+        "z'",
+        "z′",
+        "z’",
+        "zreal",
+        "zre",
+        "rez",
+        "re(z)",
+        "zr",
+        "z'(a)",
+        "reh",
+        "re(h)",
+        "reg",
+        "re(g)",
+        "hreal",
+        "greal",
+        "real(z)",
+        "real(h)",
+        "real(g)",
+    ),
+    "imag": (
+        "im",
+        "imag",
+        "imaginary",
+        "imagpart",
+        "imaginarypart",
+        "imaginärteil",
+        "imaginaerteil",
+        "z''",
+        "z″",
+        "z′′",
+        "zimag",
+        "zim",
+        "imz",
+        "im(z)",
+        "zi",
+        "z''(b)",
+        "z’’",
+        "imh",
+        "im(h)",
+        "img",
+        "im(g)",
+        "himag",
+        "gimag",
+        "imag(z)",
+        "imag(h)",
+        "imag(g)",
+    ),
+    "magnitude": (
+        "mag",
+        "magnitude",
+        "gain",
+        "abs",
+        "amplitude",
+        "betrag",
+        "verstärkung",
+        "verstaerkung",
+        "modulus",
+        "|z|",
+        "|h|",
+        "|g|",
+        "zmod",
+        "zmag",
+        "amp",
+        "abs(z)",
+        "abs(h)",
+        "abs(g)",
+        "z",
+        "db",
+        "impedance",
+        "amplitudengang",
+    ),
+    "phase": (
+        "phase",
+        "phi",
+        "φ",
+        "ϕ",
+        "arg",
+        "angle",
+        "winkel",
+        "zphz",
+        "phase(z)",
+        "zphase",
+        "phz",
+        "theta",
+        "θ",
+        "deg",
+        "°",
+        "phasenwinkel",
+        "phasengang",
+        "arg(z)",
+        "arg(h)",
+        "arg(g)",
+        "phase(h)",
+        "phase(g)",
+    ),
+    "deviation": ("std", "sigma", "σ", "deviation", "stddev", "sd", "stdev", "standarddeviation", "standardabweichung"),
+}
+_ANGULAR = frozenset(("w", "omega", "ω", "angularfrequency", "kreisfrequenz", "rad/s"))
+_MINUS = re.compile(r"^(?:-|−|–|neg|minus)")
+#: The sign of the ohm, which looks like the Greek letter.
+_OHM_SIGN = "\u2126"
+_PREFIX = {"": 1.0, "m": 1e-3, "k": 1e3, "M": 1e6, "µ": 1e-6, "u": 1e-6, "G": 1e9}
+_PHASES = {
+    "deg": np.pi / 180.0,
+    "°": np.pi / 180.0,
+    "degree": np.pi / 180.0,
+    "degrees": np.pi / 180.0,
+    "grad": np.pi / 180.0,
+    "rad": 1.0,
+    "radian": 1.0,
+    "radians": 1.0,
+    "mrad": 1e-3,
+}
+_RATIO = ("", "1", "-", "abs", "lin", "linear")
+#: No name of a part has so many letters.
+_LONGEST = 60
+#: Magnitude and phase beside real and imaginary part may differ by so much of the size.
+_AGREE = 0.02
+
+
+@dataclass(frozen=True)
+class _Found:
+    """A column with its part, its unit as written, and whether its name turns the sign."""
+
+    column: Column
+    part: str
+    unit: str
+    turned: bool
+    word: str
+
+
+def load_frequency(
+    path: PathLike,
+    *,
+    columns: Mapping[str, str | int] | None = None,
+    frequency_unit: str | None = None,
+    magnitude_unit: str | None = None,
+    phase_unit: str | None = None,
+    negated: bool | None = None,
+    output: str = "",
+    input: str = "",
+    name: str | None = None,
+    layout: Layout | Mapping[str, object] | None = None,
+) -> FrequencyData:
+    """Load a frequency response or an impedance spectrum from a file of text or a sheet.
+
+    Parameters
+    ----------
+    path
+        Any file that :func:`ftlm.load` reads, with decimal points or commas, a line of units or none.
+    columns
+        Column by part: ``frequency``; ``real`` and ``imag``, or ``magnitude`` and ``phase``; ``deviation``, the
+        standard deviation of the real and of the imaginary part. By default columns are known by their names:
+        ``freq``, ``f``, ``omega``; ``Re``, ``Zreal``, ``Z'``; ``Im``, ``Zimag``, ``Z''`` and ``-Z''``, ``-Im(Z)`` (the
+        sign turned); ``|Z|``, ``gain``, ``magnitude``, ``dB``; ``phase``, ``deg``; ``sigma``.
+    frequency_unit
+        ``"Hz"``, ``"kHz"``, ``"MHz"``, ``"mHz"`` or ``"rad/s"``. Default what the column states, as in ``freq/Hz``,
+        ``f [Hz]``, ``f_Hz``; else rad/s of a column called omega, Hz of others, which is said.
+    magnitude_unit
+        ``"dB"`` or ``"abs"``; default what the column states, else abs, which is said.
+    phase_unit
+        ``"deg"`` or ``"rad"``; default what the column states, else deg, which is said.
+    negated
+        Whether the imaginary column (or the phase) holds the negative; default where its name begins with a minus.
+    output, input
+        What the response is of and from; left out, those of the only equation that is identified.
+    name
+        What reports call it; default the file's name.
+    layout
+        See :class:`ftlm.Layout`.
+
+    Returns
+    -------
+    FrequencyData
+        In rad/s, impedances in Ω; what was assumed stands in its `warnings`.
+
+    Raises
+    ------
+    DataError
+        A file that cannot be read, columns that cannot be told or hold no numbers, units that are not known,
+        frequencies that are not above 0.
+    """
+    (table,) = tables_of(path, Layout.of(layout))
+    pool = Pool([table])
+    if table.header is not None:
+        raise DataError(f"{table.path.name} is a run over time that ftlm wrote; load it with ftlm.load")
+    found = _asked(pool, columns) if columns is not None else _known(pool)
+    notes = [str(a) for a in table.assumed if a.counts]
+    omega = _frequencies(found["frequency"], frequency_unit, notes)
+    factor, unit = 1.0, ""
+    if "real" in found and "imag" in found:
+        if magnitude_unit is not None or phase_unit is not None:
+            which = "magnitude_unit" if magnitude_unit is not None else "phase_unit"
+            raise DataError(f"{which}= is not used: the file gives real and imaginary part; leave it out")
+        response, factor, unit = _cartesian(found, negated, notes)
+        if "magnitude" in found:
+            _compare(found, response / factor, notes)
+    else:
+        response, factor, unit = _polar(found, magnitude_unit, phase_unit, negated, notes)
+    deviation = None
+    if "deviation" in found:
+        deviation = factor * found["deviation"].column.numbers().astype(np.float64)
+    label = stem_of(table.path) if name is None else name
+    LOG.info("read: %s: %d frequencies", label, omega.size)
+    return FrequencyData(omega, response, deviation, output, input, unit, label, tuple(notes))
+
+
+def is_response(pool: Pool) -> bool:
+    """Whether names of columns tell the parts of a frequency response."""
+    try:
+        _known(pool)
+    except DataError:
+        return False
+    return True
+
+
+def _known(pool: Pool) -> dict[str, _Found]:
+    """Columns by what they are called; two of one part are refused."""
+    found: dict[str, _Found] = {}
+    for column in pool.columns:
+        item = _recognised(column)
+        if item is None:
+            continue
+        if item.part in found:
+            raise DataError(
+                f"the columns {found[item.part].column.name!r} and {column.name!r} may both be the {item.part}; name "
+                "one with columns={part: column}"
+            )
+        found[item.part] = item
+    _check_parts(found, pool)
+    return found
+
+
+def _asked(pool: Pool, columns: Mapping[str, str | int]) -> dict[str, _Found]:
+    if not isinstance(columns, Mapping):
+        raise DataError(f"columns is a {type(columns).__name__}; pass a dict of part: column")
+    found = {}
+    for part, spec in columns.items():
+        if part not in _NAMES:
+            raise DataError(
+                f"{part!r} is no part of a frequency response{nearest(part, _NAMES)}; the parts are {listed(_NAMES)}"
+            )
+        column = pool.find(spec, part)
+        item = _recognised(column)
+        word, unit = (item.word, item.unit) if item is not None else _parted(column)
+        found[part] = _Found(column, part, unit, item is not None and item.turned, word)
+    _check_parts(found, pool)
+    return found
+
+
+def _check_parts(found: Mapping[str, _Found], pool: Pool) -> None:
+    whole = {"real", "imag"} <= found.keys() or {"magnitude", "phase"} <= found.keys()
+    if "frequency" in found and whole:
+        return
+    known = ", ".join(f"{i.part} {i.column.name!r}" for i in found.values()) or "none"
+    missing = "the frequency" if "frequency" not in found else "real and imaginary part, or magnitude and phase"
+    raise DataError(
+        f"{missing} cannot be told from the names of the columns (known are: {known}); name them with "
+        f"columns={{part: column}}, parts frequency, real and imag, or frequency, magnitude and phase; "
+        f"{pool.described()}"
+    )
+
+
+def _parted(column: Column) -> tuple[str, str]:
+    """A column's name without its unit, and the unit as written: ``freq/Hz``, ``f_Hz``, ``f (Hz)``."""
+    bare, unit = stated_unit(column.written)
+    if unit:
+        return bare, unit
+    bare, unit = column.name.strip(), column.stated
+    if unit:
+        return bare, unit
+    if bare.casefold().endswith("_rad_s"):
+        return bare[:-6], "rad/s"
+    for mark in ("/", "_", " ", ","):
+        head, found, tail = bare.rpartition(mark)
+        if found and head and _unit_kind(tail.strip()) is not None:
+            return head.strip(), tail.strip()
+    return bare, ""
+
+
+def _unit_kind(unit: str) -> str | None:
+    """Of what a word is a unit: frequency, phase, size; None where it is none."""
+    if unit in FREQUENCY_UNITS or unit.casefold() in ("hz", "rad/s", "khz", "rad/sec", "1/s"):
+        return "frequency"
+    if unit.casefold() in _PHASES:
+        return "phase"
+    if unit.casefold() in ("db", "abs") or _ohms(unit) is not None:
+        return "size"
+    return None
+
+
+def _recognised(column: Column) -> _Found | None:
+    """A column by its whole name, as ``Re(Z)`` and ``dB``, or by its name without its unit; None for another one."""
+    whole, stated = column.name.strip(), column.stated
+    own = whole if _unit_kind(whole) else stated if _unit_kind(stated) else ""
+    for text, unit in ((whole, own), _parted(column)):
+        word = re.sub(r"[\s_]", "", text.replace(_OHM_SIGN, "Ω") if len(text) < _LONGEST else "").casefold()
+        word = word.replace('"', "''")
+        bare = _MINUS.sub("", word)
+        for name, turned in ((word, False), (bare, True)):
+            part = next((p for p, names in _NAMES.items() if name in names), None)
+            if part is not None:
+                return _Found(column, part, unit, turned, name)
+    return None
+
+
+def _frequencies(item: _Found, asked: str | None, notes: list[str]) -> Floats:
+    values = item.column.numbers().astype(np.float64)
+    stated = item.unit if _unit_kind(item.unit) == "frequency" else ""
+    if stated and stated not in FREQUENCY_UNITS:
+        folded = {"hz": "Hz", "khz": "kHz", "rad/s": "rad/s", "rad/sec": "rad/s", "1/s": "rad/s"}
+        stated = folded[stated.casefold()]
+    if asked is not None:
+        frequency_factor(asked)
+        if stated and stated != asked:
+            raise DataError(
+                f"column {item.column.name!r} states {stated}, and frequency_unit={asked!r} is asked for; leave "
+                "frequency_unit= out, or rename the column"
+            )
+    unit = asked or stated
+    if not unit:
+        if item.unit:
+            raise DataError(
+                f"column {item.column.name!r} states the unit {item.unit!r}, which is no unit of frequency; say "
+                f"frequency_unit=, one of {', '.join(FREQUENCY_UNITS)}"
+            )
+        unit = "rad/s" if item.word in _ANGULAR else "Hz"
+        notes.append(f"frequencies {item.column.name!r} taken for {unit}; otherwise frequency_unit=")
+    return values * FREQUENCY_UNITS[unit]
+
+
+def _ohms(unit: str) -> float | None:
+    """Ohms of one unit of an impedance, such as mΩ; None for what is none, and for squares of area."""
+    text = unit.replace(_OHM_SIGN, "Ω")
+    for ending in ("ohm", "Ohm", "OHM", "ohms", "Ohms", "Ω", "ω"):
+        if text.endswith(ending) and text[: -len(ending)] in _PREFIX:
+            return _PREFIX[text[: -len(ending)]]
+    return None
+
+
+def _sized(item: _Found) -> tuple[float, str]:
+    """Factor to SI and unit of a size."""
+    if not item.unit or item.unit.casefold() in _RATIO:
+        return 1.0, ""
+    factor = _ohms(item.unit)
+    return (factor, "Ω") if factor is not None else (1.0, item.unit)
+
+
+def _cartesian(found: Mapping[str, _Found], negated: bool | None, notes: list[str]) -> tuple[Complex, float, str]:
+    real, imag = found["real"], found["imag"]
+    factor, unit = _sized(real)
+    other, _ = _sized(imag)
+    if (factor, unit) != _sized(imag) and imag.unit and real.unit:
+        raise DataError(
+            f"columns {real.column.name!r} and {imag.column.name!r} have the units {real.unit!r} and {imag.unit!r}; "
+            "give both in one unit"
+        )
+    factor = factor if real.unit else other
+    turned = imag.turned if negated is None else _truth("negated", negated)
+    x, y = (i.column.numbers().astype(np.float64) for i in (real, imag))
+    if turned and negated is None:
+        notes.append(f"column {imag.column.name!r} holds the negative imaginary part, by its name; otherwise negated=")
+    elif negated is None and imag.word.startswith("z") and np.mean(y > 0) > 0.5:
+        notes.append(
+            f"the imaginary part {imag.column.name!r} is positive in {int(np.sum(y > 0))} of {y.size} rows, as of an "
+            "inductance; if it holds -Z'', say negated=True"
+        )
+    response: Complex = np.asarray(factor * (x - 1j * y if turned else x + 1j * y), dtype=np.complex128)
+    return response, factor, unit or _sized(imag)[1]
+
+
+def _polar(
+    found: Mapping[str, _Found],
+    magnitude_unit: str | None,
+    phase_unit: str | None,
+    negated: bool | None,
+    notes: list[str],
+) -> tuple[Complex, float, str]:
+    size, angle = found["magnitude"], found["phase"]
+    values, phase = (i.column.numbers().astype(np.float64) for i in (size, angle))
+    decibels = _chosen(
+        "magnitude",
+        size,
+        magnitude_unit,
+        ("abs", "dB"),
+        "dB" if size.unit.casefold() == "db" else "abs" if size.unit else None,
+        notes,
+    )
+    if decibels == "dB" and "deviation" in found:
+        raise DataError(
+            f"column {found['deviation'].column.name!r} is taken for the standard deviation of the real and of the "
+            "imaginary part, and sizes in dB have another; "
+            "give real and imaginary part, or name the others with columns={part: column}"
+        )
+    written = _PHASES.get(angle.unit.casefold())
+    stated = None if written is None else "rad" if written == 1.0 else "mrad" if written == 1e-3 else "deg"
+    radians = _PHASES[_chosen("phase", angle, phase_unit, ("deg", "rad", "mrad"), stated, notes)]
+    factor, unit = (1.0, "") if decibels == "dB" else _sized(size)
+    if decibels == "dB":
+        values = 10.0 ** (values / 20.0)
+    elif np.any(values < 0):
+        bad = values < 0
+        raise DataError(
+            f"column {size.column.name!r}: a size is negative, first at row {int(np.argmax(bad))}, {int(bad.sum())} in "
+            "all; say magnitude_unit='dB' if these are decibels"
+        )
+    turned = angle.turned if negated is None else _truth("negated", negated)
+    if turned and negated is None:
+        notes.append(f"column {angle.column.name!r} holds the negative phase, by its name; otherwise negated=")
+    response: Complex = factor * values * np.exp((-1j if turned else 1j) * radians * phase)
+    return response, factor, unit
+
+
+def _chosen(
+    what: str, item: _Found, asked: str | None, known: tuple[str, ...], stated: str | None, notes: list[str]
+) -> str:
+    """The unit that is asked for, stated, or assumed, which is said."""
+    if asked is not None:
+        if asked not in known:
+            hint = nearest(asked, known)
+            raise DataError(f"{what}_unit={asked!r} is unknown{hint}; the known ones are {listed(known)}")
+        if stated is not None and stated != asked:
+            raise DataError(
+                f"column {item.column.name!r} states {stated}, and {what}_unit={asked!r} is asked for; leave "
+                f"{what}_unit= out, or rename the column"
+            )
+        return asked
+    if stated is not None:
+        return stated
+    words = "a size, not decibels" if what == "magnitude" else "degrees"
+    notes.append(f"the {what} {item.column.name!r} is taken for {words}; otherwise {what}_unit={known[1]!r}")
+    return known[0]
+
+
+def _truth(name: str, value: object) -> bool:
+    if not isinstance(value, bool):
+        raise DataError(f"{name}={value!r} is neither True nor False")
+    return value
+
+
+def _compare(found: Mapping[str, _Found], response: Complex, notes: list[str]) -> None:
+    """Say that sizes beside real and imaginary part are not used, and refuse those of something else."""
+    item = found["magnitude"]
+    if item.unit.casefold() == "db" or item.column.problem is not None:
+        return
+    own, units = item.column.numbers(), _ohms(item.unit) or 1.0
+    scale = (_ohms(found["real"].unit) or 1.0) / units
+    off = np.abs(np.abs(response) * scale - own) > _AGREE * np.abs(own)
+    if np.any(off):
+        notes.append(
+            f"column {item.column.name!r} is not the size of real and imaginary part, first at row "
+            f"{int(np.argmax(off))}, {int(off.sum())} in all; real and imaginary part were used"
+        )
+
+
+def named(data: FrequencyData, output: str, source: str) -> FrequencyData:
+    """The same record with what it is of and from, where it does not say so itself."""
+    return replace(data, output=data.output or output, input=data.input or source)

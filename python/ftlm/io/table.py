@@ -1,0 +1,240 @@
+"""Columns of one or several files under the names that a person uses."""
+
+from __future__ import annotations
+
+import re
+from collections import Counter
+from dataclasses import dataclass, field, replace
+from pathlib import Path
+
+import numpy as np
+import numpy.typing as npt
+
+from ftlm.data.export import Header
+from ftlm.data.units import header_time, is_time_name
+from ftlm.errors import DataError
+from ftlm.io.cell_parsing import Moments, behind_a_stroke, is_time_unit, stated_unit
+from ftlm.io.dialect import Assumption, Layout
+from ftlm.utils.validation import bad_rows, listed, nearest
+
+_AGREE = 1e-9
+#: What the time is called beside t, time and seconds, without capitals and what joins words.
+_OTHER_TIMES = frozenset(
+    (
+        "timestamp",
+        "datetime",
+        "zeit",
+        "zeitstempel",
+        "datumzeit",
+        "datumuhrzeit",
+        "uhrzeit",
+        "elapsedtime",
+        "elapsed",
+        "timeelapsed",
+        "xvalue",
+        "temps",
+        "tiempo",
+        "tempo",
+        "sec",
+        "secs",
+        "second",
+        "sekunden",
+    )
+)
+_JOINED = str.maketrans("", "", " _-/.")
+_MATLAB_COLUMN = re.compile(r"(.+)\(:,\s*(\d+)\)")
+
+
+@dataclass(frozen=True)
+class Column:
+    """One column of numbers, or the reason why it is not one.
+
+    `blank` where that is empty cells alone (NaN); `moments` where it holds dates; `stated` is its unit in the file.
+    """
+
+    variable: str
+    name: str
+    source: Path
+    values: npt.NDArray[np.float64] | npt.NDArray[np.float32] | None
+    problem: DataError | None = None
+    matrix: str | None = None
+    blank: bool = False
+    moments: Moments | None = None
+    stated: str = ""
+
+    @property
+    def written(self) -> str:
+        """Its name, the unit behind a stroke in it, as in ``I/A``, in brackets."""
+        bare, unit = behind_a_stroke(self.name)
+        return f"{bare} [{unit}]" if unit and unit == self.stated else self.name
+
+    def numbers(self, *, blank: bool = False) -> npt.NDArray[np.float64] | npt.NDArray[np.float32]:
+        """Return its numbers, or raise why there are none; empty cells may be let pass."""
+        if blank and self.blank and self.values is not None:
+            return self.values
+        if self.problem is not None or self.values is None:
+            raise self.problem or DataError(f"column {self.name!r} holds no numbers; choose another column")
+        return self.values
+
+
+@dataclass(frozen=True)
+class FileTable:
+    """The columns of one file, what kind of file it is, how it is laid out, and what of that was assumed."""
+
+    path: Path
+    columns: list[Column]
+    text: bool
+    header: Header | None = None
+    skipped: dict[str, str] = field(default_factory=dict)
+    layout: Layout = field(default_factory=Layout)
+    assumed: tuple[Assumption, ...] = ()
+    kind: str = ""
+
+
+class Pool:
+    """The columns of all files under the names a person uses."""
+
+    def __init__(self, tables: list[FileTable]) -> None:
+        self._tables = tables
+        files = Counter(variable for variable, _ in {(c.variable, t.path) for t in tables for c in t.columns})
+        self._columns: dict[str, Column] = {}
+        for table in tables:
+            for column in table.columns:
+                prefix = f"{table.path.stem}/" if files[column.variable] > 1 else ""
+                name = prefix + column.name
+                if name in self._columns and name:
+                    raise DataError(
+                        f"column {name!r} is in {str(self._columns[name].source)!r} and {str(table.path)!r}; "
+                        "rename one of the files"
+                    )
+                matrix = None if column.matrix is None else prefix + column.matrix
+                self._columns[name] = replace(column, name=name, matrix=matrix)
+
+    @property
+    def columns(self) -> list[Column]:
+        """All of them, in the order of the files."""
+        return list(self._columns.values())
+
+    @property
+    def names(self) -> tuple[str, ...]:
+        """What can be asked for by name."""
+        return tuple(name for name in self._columns if name)
+
+    def described(self) -> str:
+        """Return what there is to choose from, in words."""
+        skipped = {name: why for table in self._tables for name, why in table.skipped.items()}
+        text = f"the columns are {listed(self.names)}"
+        if skipped:
+            text += "; not read: " + ", ".join(f"{name!r} ({why})" for name, why in list(skipped.items())[:10])
+        return text
+
+    def find(self, spec: object, thing: str) -> Column:
+        """Return the column that a person names."""
+        if isinstance(spec, int) and not isinstance(spec, bool):
+            return self._at(spec, thing)
+        if not isinstance(spec, str):
+            raise DataError(f"column {spec!r} ({thing}) is neither a name nor a position; give one of them")
+        name = spec
+        written = _MATLAB_COLUMN.fullmatch(spec)
+        if spec not in self._columns and written:
+            name = f"{written[1]}.{int(written[2])}" if len(written[2]) < 10 else spec
+        column = self._columns.get(name)
+        if column is None:
+            # Without the unit in brackets that it ends in, where that leaves one.
+            bare = [c for c in self._columns.values() if stated_unit(c.written) == (spec, c.stated) and c.stated]
+            column = bare[0] if len(bare) == 1 else None
+        if column is None:
+            raise DataError(
+                f"column {spec!r} ({thing}) is not in {listed(table.path.name for table in self._tables)}"
+                f"{nearest(spec, self._columns)}; {self.described()}"
+            )
+        return column
+
+    def _at(self, position: int, thing: str) -> Column:
+        if len(self._tables) > 1 or not self._tables[0].text:
+            raise DataError(f"column {position} ({thing}): positions are for single text files; {self.described()}")
+        columns = self._tables[0].columns
+        if not 0 <= position < len(columns):
+            raise DataError(
+                f"column {position} ({thing}) is out of range, positions go from 0 to {len(columns) - 1}; "
+                f"{self.described()}"
+            )
+        return columns[position]
+
+    def time(self, spec: object, used: list[Column]) -> tuple[Column, Assumption | None]:
+        """Return the time: the column asked for, or the one that names or places itself, and what was assumed of it."""
+        if spec is not None:
+            return self.find(spec, "time"), None
+        clocks, assumed = [], None
+        for table in self._tables:
+            named, why = self._clocks(table)
+            if len(named) > 1:
+                raise DataError(
+                    f"{table.path.name}: the columns {listed(column.name for column in named)} may all be the time; "
+                    "name one with time="
+                )
+            if named and why:
+                assumed = Assumption("time", named[0].name, why, "time=COLUMN")
+            clocks += named
+        if not clocks:
+            matrices = dict.fromkeys(column.matrix for column in used if column.matrix is not None)
+            clocks = [self._columns[f"{matrix}.1"] for matrix in matrices]
+        if not clocks:
+            raise DataError(
+                "time: no column is called t, time or seconds, alone or with a unit as in time [ms], time_ms or t (s); "
+                f"name it with time=, or give the time between rows with step=; {self.described()}"
+            )
+        for other in clocks[1:]:
+            _check_agreement(clocks[0], other)
+        return clocks[0], assumed
+
+    def _clocks(self, table: FileTable) -> tuple[list[Column], str]:
+        """Columns of a file that may be the time, the surest kind that there is, and why where that is to be said."""
+        own = [c for c in self._columns.values() if c.source == table.path and c.matrix is None]
+        sure = [c for c in own if is_time_name(c.variable)]
+        if sure:
+            return sure, ""
+        named = [c for c in own if header_time(c.variable)[0].translate(_JOINED) in _OTHER_TIMES]
+        if named:
+            return named, f"the time is column {named[0].name!r}, by its name"
+        dated = [c for c in own if c.moments is not None]
+        if dated:
+            return dated, f"the time is column {dated[0].name!r}, which holds dates or times of day"
+        if own and own[0].stated and is_time_unit(own[0].stated):
+            return own[:1], f"the time is the first column, {own[0].name!r}, by its unit {own[0].stated}"
+        return [], ""
+
+
+def order_of_dates(clock: Column, dates: str | None) -> Assumption | None:
+    """What was assumed of the order of day and month in a column of dates."""
+    order = "" if clock.moments is None else clock.moments.inferred(dates)
+    if clock.moments is None or not order:
+        return None
+    first = "day" if order == "dmy" else "month"
+    words = f"dates begin with the {first}, as in {clock.moments.first!r}"
+    return Assumption("dates", order, words, "layout=dict(dates=ORDER)")
+
+
+def _check_agreement(one: Column, other: Column) -> None:
+    names = f"time: the columns {one.name!r} of {one.source.name} and {other.name!r} of {other.source.name}"
+    if one.moments is not None and other.moments is not None:
+        own, its = (np.column_stack([c.parts, c.clock]) for c in (one.moments, other.moments))
+        if one.moments.mark != other.moments.mark or not np.array_equal(own, its):
+            raise DataError(f"{names} differ; give files of one record, or name the time to use with time=")
+        return
+    a, b = one.numbers(), other.numbers()
+    if a.size != b.size:
+        raise DataError(
+            f"{names} have {a.size} and {b.size} rows; give files of one record, or name the time with time="
+        )
+    with np.errstate(invalid="ignore", over="ignore"):
+        same = np.abs(np.subtract(a, b, dtype=np.float64)) <= _AGREE * max(1.0, float(np.abs(a[[0, -1]]).max()))
+    rows = np.flatnonzero(~same & ~(np.isnan(a) & np.isnan(b)))
+    if rows.size:
+        raise bad_rows(
+            names,
+            f"differ, {float(a[rows[0]])!r} and {float(b[rows[0]])!r}",
+            int(rows[0]),
+            rows.size,
+            "give files of one record, or name the time to use with time=",
+        )

@@ -1,1 +1,0 @@
-"""Results held against measurements: both errors, residual tests, criteria."""

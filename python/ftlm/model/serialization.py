@@ -1,0 +1,267 @@
+"""The file of a model: what stands in it, and how it is read and written."""
+
+from __future__ import annotations
+
+import os
+from collections.abc import Collection, Sequence
+from pathlib import Path
+from typing import Literal
+
+import msgspec
+from msgspec import UNSET, UnsetType
+
+from ftlm.errors import DataError, ModelError
+from ftlm.model.model import Estimate, Solved
+from ftlm.structure.equation import Equation, Friction, Stribeck, Term
+from ftlm.structure.input_nonlinearity import Limit, LimitLaw
+from ftlm.structure.order import Order
+from ftlm.structure.sensor_filter import SensorFilter
+from ftlm.structure.structure import Offset, Structure, check_initial
+from ftlm.utils.files import Saved, write_atomically
+from ftlm.utils.validation import words_of
+
+#: Schema of a model that every version since the first reads, of one that has an offset, of one that has intervals by
+#: profile likelihood or whose sensor filter names what is no output, of one that has friction, of one whose inputs have
+#: limits, of one whose friction falls with speed, and of one that says what was free in its fit or what spoke against.
+SCHEMA, OFFSET_SCHEMA, PROFILE_SCHEMA, FRICTION_SCHEMA, LIMIT_SCHEMA, STRIBECK_SCHEMA, FIT_SCHEMA = 2, 3, 4, 5, 6, 7, 8
+
+
+class TermFile(msgspec.Struct, forbid_unknown_fields=True):
+    """A term: coefficient is its number without the factor, name what it was called while it was free."""
+
+    signal: str
+    order: float
+    coefficient: float
+    factor: float = 1.0
+    name: str | None = None
+
+
+class StribeckFile(msgspec.Struct, forbid_unknown_fields=True):
+    """What friction has more near rest: coefficient is its number without the factor, speed that at which it falls."""
+
+    coefficient: float
+    speed: float
+    factor: float = -1.0
+    name: str | None = None
+    speed_name: str | None = None
+
+
+class FrictionFile(msgspec.Struct, forbid_unknown_fields=True):
+    """Friction of an equation's own output: coefficient is Coulomb's number without the factor."""
+
+    coefficient: float
+    factor: float = -1.0
+    name: str | None = None
+    stribeck: StribeckFile | UnsetType = UNSET
+
+    @classmethod
+    def of(cls, rubs: Friction) -> FrictionFile:
+        """Write friction."""
+        out, near = cls(float(rubs.coefficient), rubs.factor, rubs.name), rubs.stribeck
+        if near is not None:
+            more = StribeckFile(float(near.coefficient), float(near.speed), near.factor, near.name, near.speed_name)
+            out.stribeck = more
+        return out
+
+    def friction(self) -> Friction:
+        """Give the friction back."""
+        s = self.stribeck
+        near = UNSET if s is UNSET else Stribeck(s.coefficient, s.speed, s.factor, s.name, s.speed_name)
+        return Friction(self.coefficient, self.factor, self.name, near)
+
+    @property
+    def count(self) -> int:
+        """Numbers of it."""
+        return 1 if self.stribeck is UNSET else 3
+
+
+class LimitFile(msgspec.Struct, forbid_unknown_fields=True):
+    """A saturation or a dead zone of an input, in its unit."""
+
+    signal: str
+    law: LimitLaw
+    value: float
+
+
+class EquationFile(msgspec.Struct, forbid_unknown_fields=True):
+    """An equation whose orders are numbers."""
+
+    output: str
+    order: float
+    terms: list[TermFile]
+    friction: FrictionFile | UnsetType = UNSET
+
+    @classmethod
+    def of(cls, item: Equation) -> EquationFile:
+        """Write an equation."""
+        terms = [TermFile(t.signal, t.order.constant, float(t.coefficient), t.factor, t.name) for t in item.terms]
+        friction = UNSET if item.friction is None else FrictionFile.of(item.friction)
+        return cls(item.output, item.order.constant, terms, friction)
+
+    def equation(self) -> Equation:
+        """Give the equation back."""
+        terms = tuple(Term(t.signal, Order(t.order), t.coefficient, t.factor, t.name) for t in self.terms)
+        rubs = UNSET if self.friction is UNSET else self.friction.friction()
+        return Equation(self.output, Order(self.order), terms, rubs)
+
+    @property
+    def count(self) -> int:
+        """Numbers of it, as a covariance has them."""
+        return 1 + 2 * len(self.terms) + (0 if self.friction is UNSET else self.friction.count)
+
+    @property
+    def friction_schema(self) -> int:
+        """Schema that its friction needs."""
+        if self.friction is UNSET:
+            return SCHEMA
+        return FRICTION_SCHEMA if self.friction.stribeck is UNSET else STRIBECK_SCHEMA
+
+
+class FilterFile(msgspec.Struct, forbid_unknown_fields=True):
+    """A sensor filter: of outputs alone, as every version reads it, or of any signals."""
+
+    numerator: tuple[tuple[float, float], ...]
+    denominator: tuple[tuple[float, float], ...]
+    outputs: tuple[str, ...] | UnsetType = UNSET
+    signals: tuple[str, ...] | UnsetType = UNSET
+
+    @classmethod
+    def of(cls, structure: Structure) -> FilterFile | None:
+        """Write the sensor filter of a structure, if it has one."""
+        sensor = structure.sensor_filter
+        if sensor is None:
+            return None
+        if set(sensor.signals) <= set(structure.outputs):
+            return cls(sensor.numerator, sensor.denominator, outputs=sensor.signals)
+        return cls(sensor.numerator, sensor.denominator, signals=sensor.signals)
+
+    def sensor(self, *, followed: Collection[str]) -> SensorFilter | None:
+        """Give the filter back; ``followed`` are the outputs of equations that act together, else empty.
+
+        A filter of outputs filtered those that follow together, and where none do whatever it named; an input that it
+        named beside the former did not count.
+        """
+        if isinstance(self.signals, UnsetType) == isinstance(self.outputs, UnsetType):
+            raise ModelError("its sensor filter has neither signals nor outputs, or both; one of them names them")
+        if not isinstance(self.signals, UnsetType):
+            return SensorFilter(self.signals, self.numerator, self.denominator)
+        named = () if isinstance(self.outputs, UnsetType) else self.outputs
+        kept = tuple(n for n in named if n in followed or not followed)
+        return SensorFilter(kept, self.numerator, self.denominator) if kept else None
+
+
+class ModelFile(msgspec.Struct, forbid_unknown_fields=True):
+    """A model, without what is of use only before identification."""
+
+    format: Literal["ftlm-model"]
+    schema: int
+    name: str
+    equations: list[EquationFile]
+    coupling: Literal["measured", "simulated"]
+    delay: dict[str, float]
+    initial: str | list[float]
+    sensor_filter: FilterFile | None
+    units: dict[str, str]
+    orders: dict[str, float]
+    m: int | None
+    about: dict[str, str | float | int | bool | None]
+    estimate: Estimate | None = None
+    offset: Offset | UnsetType = UNSET
+    limits: list[LimitFile] | UnsetType = UNSET
+
+    @classmethod
+    def of(cls, model: Solved) -> ModelFile:
+        """Write a model."""
+        s = model.structure
+        # Written only where there is one, so that what has none is as it was.
+        offset: Offset | UnsetType = UNSET if s.offset == "none" else s.offset
+        sensor = FilterFile.of(s)
+        known = [(limit, limit.value) for limit in s.limits]
+        limits = [LimitFile(limit.signal, limit.law, v) for limit, v in known if not isinstance(v, tuple)] or UNSET
+        equations = [EquationFile.of(e) for e in s.equations]
+        return cls(
+            "ftlm-model",
+            schema_of(equations, limits, offset, sensor, model.estimate),
+            s.name,
+            equations,
+            s.coupling,
+            dict(s.delay),
+            s.initial if isinstance(s.initial, str) else list(s.initial),
+            sensor,
+            dict(model.units),
+            dict(model.orders),
+            model.m,
+            dict(model.about),
+            model.estimate,
+            offset,
+            limits,
+        )
+
+    def solved(self) -> Solved:
+        """Give the record of the model back.
+
+        Raises
+        ------
+        ModelError
+            Equations that are none, or a covariance of another size than they need.
+        """
+        followed = [e.output for e in self.equations] if self.coupling == "simulated" else []
+        sensor = None if self.sensor_filter is None else self.sensor_filter.sensor(followed=followed)
+        structure = Structure(
+            equations=tuple(e.equation() for e in self.equations),
+            coupling=self.coupling,
+            delay=self.delay,
+            initial=check_initial(self.initial),
+            sensor_filter=sensor,
+            name=self.name,
+            offset="none" if self.offset is UNSET else self.offset,
+            limited=UNSET if self.limits is UNSET else tuple(Limit(x.signal, x.law, x.value) for x in self.limits),
+        )
+        if self.estimate is not None and self.estimate.covariance is not None:
+            count = sum(e.count for e in self.equations)
+            rows = self.estimate.covariance
+            if len(rows) != count or any(len(row) != count for row in rows):
+                raise ModelError(f"its covariance is not of {count} by {count} numbers, as its equations need")
+        return Solved(structure, self.orders, self.units, self.m, self.about, self.estimate)
+
+
+#: A model is a few kilobytes.
+MODEL = Saved("model", "a file written by save()", ModelFile, FIT_SCHEMA)
+
+
+def schema_of(
+    equations: Sequence[EquationFile],
+    limits: list[LimitFile] | UnsetType,
+    offset: Offset | UnsetType,
+    sensor: FilterFile | None,
+    estimate: Estimate | None,
+) -> int:
+    """Schema of a model: the least that has all of it, so that what has less is as it was."""
+    profiled = estimate is not None and estimate.intervals is not UNSET
+    doubted = estimate is not None and estimate.against is not UNSET
+    named = sensor is not None and not isinstance(sensor.signals, UnsetType)
+    known = estimate is not None and estimate.free is not UNSET
+    return max(
+        SCHEMA if isinstance(offset, UnsetType) else OFFSET_SCHEMA,
+        PROFILE_SCHEMA if profiled or named else SCHEMA,
+        SCHEMA if isinstance(limits, UnsetType) else LIMIT_SCHEMA,
+        *(e.friction_schema for e in equations),
+        FIT_SCHEMA if known or doubted else SCHEMA,
+    )
+
+
+def write_model(model: Solved, path: str | os.PathLike[str], *, force: bool) -> Path:
+    """Write a model as JSON, atomically."""
+    data = msgspec.json.format(msgspec.json.encode(ModelFile.of(model)), indent=2)
+    return write_atomically(path, data + b"\n", force=force)
+
+
+def read_model(path: str | os.PathLike[str]) -> Solved:
+    """Read the record of a model; the errors are those of :func:`ftlm.load_model`."""
+    read = MODEL.read(path)
+    of = schema_of(read.equations, read.limits, read.offset, read.sensor_filter, read.estimate)
+    MODEL.check_schema(path, read, of)
+    try:
+        return read.solved()
+    except ModelError as error:
+        raise DataError(f"{path} holds no usable model: {words_of(error)}") from error

@@ -1,0 +1,187 @@
+"""What is proved of all orders in some intervals, not of those of a lattice alone."""
+
+from __future__ import annotations
+
+from collections.abc import Callable, Sequence
+from typing import Any
+
+from ftlm import _core
+from ftlm.data.run import Run
+from ftlm.errors import ModelError
+from ftlm.order_search.options import Settings
+from ftlm.order_search.result import OrderCertificate
+from ftlm.order_search.search import Job, make_job
+from ftlm.simulation.discretization import named_signals
+from ftlm.structure.equation import Equation
+from ftlm.structure.order_grid import STEP, Lattice
+from ftlm.structure.structure import Structure
+from ftlm.utils.resources import memory_limit
+from ftlm.utils.validation import check_threads, real_number, whole_number
+
+#: How much better than the best found other orders may be, and boxes of orders after which a proof ends.
+WITHIN = 0.05
+CELLS = 20_000_000
+#: How large an equation's terms may be beside the output: larger ones cancel but for a hundredth.
+LARGEST = 100.0
+#: What a certificate is of, as settings of an order search.
+PROVED: dict[str, Any] = {"criterion": "equation-error", "norm": "l2", "coefficients": "least-squares"}
+_WAY_OUT = (
+    "rank by squared equation errors with least-squares coefficients (criterion='equation-error', norm='l2', "
+    "coefficients='least-squares'), or ask for none"
+)
+
+
+def certify_orders(
+    runs: Run | Sequence[Run],
+    equation: Structure,
+    lattice: Lattice | None = None,
+    *,
+    within: float = WITHIN,
+    apart: float | None = None,
+    largest: float = LARGEST,
+    cells: int = CELLS,
+    m: int | None = None,
+    threads: int | None = None,
+    progress: Callable[[int, int], None] | None = None,
+) -> OrderCertificate:
+    """Prove that no orders in the intervals of a lattice, on it or between, have a much smaller equation error.
+
+    Boxes of orders are halved until each is proved to leave, with the coefficients that suit each of its orders best,
+    an RMS equation error of at least the best one found times ``1 - within``. What is proved is of the equation error
+    in squares, of equations at rest and of coefficients that are all free; of free runs no such certificate is known.
+
+    Parameters
+    ----------
+    runs
+        One run or several with the same names and units; squares add up.
+    equation
+        One equation with free orders.
+    lattice
+        Its intervals count; the values between do not.
+    within
+        How much better than the best that is found other orders may be, as a share below 1.
+    apart
+        How far orders of the output stay below its highest one, and orders of one signal from one another: where they
+        meet, every equation is fulfilled. By default the step of the lattice.
+    largest
+        How many times the RMS size of the output those of an equation's terms may have together. Beyond, terms that
+        cancel are told from nothing by nothing.
+    cells
+        Boxes of orders after which the proof ends with what it has.
+    m
+        Block pulses a run; default 2 048, or what the runs carry.
+    threads
+        Threads; default all cores.
+    progress
+        Called about twenty times a second with (boxes done, boxes known of so far): halves are added as they come.
+
+    Returns
+    -------
+    OrderCertificate
+        What is proved, which may be less than was asked for, and says so.
+
+    Raises
+    ------
+    DataError
+        Runs that do not fit.
+    ModelError
+        A stage under its order law, initial terms, known coefficients, numbers out of range, intervals without orders
+        or with too many boxes.
+    KeyboardInterrupt
+        Ctrl-C, within half a second.
+    """
+    share = _check_within(within)
+    most = whole_number(cells)
+    if most is None or not 1 <= most < 1 << 62:
+        raise ModelError(f"cells = {cells!r} is no whole number from 1; the default is {CELLS}")
+    gap = real_number("apart", (lattice.step if isinstance(lattice, Lattice) else STEP) if apart is None else apart)
+    if not 0 < gap <= 1:
+        raise ModelError(f"apart = {apart!r} is outside (0, 1]; the step of the lattice is usual")
+    size = real_number("largest", largest)
+    if not 1 <= size <= 1e9:
+        raise ModelError(f"largest = {largest!r} is outside [1, 1e9]; the default is {LARGEST:g}")
+    job = make_job(runs, equation, lattice, Settings.check(**PROVED, threads=check_threads(threads)), m=m)
+    return certify_job(job, within=share, apart=gap, largest=size, cells=most, progress=progress)
+
+
+def check_certifiable(job: Job, within: float) -> None:
+    """Refuse a certificate of what nothing is proved of, or of no share."""
+    _check_within(within)
+    for name, value in PROVED.items():
+        given = getattr(job.settings, name)
+        if given != value:
+            raise ModelError(f"there is no certificate over all orders for {name} = {given!r}; {_WAY_OUT}")
+    if job.structure.has_order_law:
+        raise ModelError(
+            "there is no certificate over all orders of a stage under its law; take its equations one by one"
+        )
+    item = job.structure.equations[0]
+    if tuple(job.records[0].start) != (False, []):
+        raise ModelError("there is no certificate over all orders with initial terms; give the equation initial='rest'")
+    known = [t for t in item.terms if t.fixed is not None]
+    if known:
+        raise ModelError(
+            f"there is no certificate over all orders with known coefficients, and {len(known)} of the terms of "
+            f"{item.output} have one (the first is {known[0].fixed:g}); name them"
+        )
+
+
+def _check_within(within: float) -> float:
+    share = real_number("within", within)
+    if not 0 < share < 1:
+        raise ModelError(
+            f"within={within!r} (--certify) is outside (0, 1); 0.05 asks that nothing be better by more than 5 %"
+        )
+    return share
+
+
+def certify_job(
+    job: Job,
+    *,
+    within: float,
+    apart: float,
+    largest: float = LARGEST,
+    cells: int = CELLS,
+    progress: Callable[[int, int], None] | None = None,
+) -> OrderCertificate:
+    """Prove it of a search that is ready; see :func:`certify_orders`."""
+    check_certifiable(job, within)
+    record, item = job.records[0], job.structure.equations[0]
+    intervals = {name: (min(values), max(values)) for name, values in job.values.items()}
+    region = _region(item, intervals, record.signals)
+    try:
+        found = _core.certify(
+            [r.core() for r in job.records],
+            (*region, apart),
+            (within, largest, cells, job.settings.threads, memory_limit()),
+            None if progress is None else lambda done, total, _pruned: progress(done, total),
+        )
+    except ModelError as error:
+        raise named_signals(error, record.signals) from None
+    values = [found["alpha"], *found["orders"]] if found["orders"] else []
+    names = [item.order, *(t.order for t in item.terms)]
+    orders = {o.names[0]: v for o, v in zip(names, values, strict=False) if o.names}
+    return OrderCertificate(
+        found["at_least"],
+        found["best"],
+        orders,
+        within,
+        intervals,
+        apart,
+        largest,
+        found["cells"],
+        found["open"],
+        record.m,
+    )
+
+
+def _region(
+    item: Equation, intervals: dict[str, tuple[float, float]], signals: Sequence[str]
+) -> tuple[int, tuple[float, float], list[tuple[int, float, float]]]:
+    """Output, interval of its order, and signal and interval of each term, as the core takes them."""
+
+    def interval(order: Any) -> tuple[float, float]:
+        return intervals[order.names[0]] if order.names else (order.constant, order.constant)
+
+    terms = [(signals.index(t.signal), *interval(t.order)) for t in item.terms]
+    return signals.index(item.output), interval(item.order), terms

@@ -1,0 +1,686 @@
+"""Frames of a search store: what each holds, and the bytes around it."""
+
+from __future__ import annotations
+
+import bisect
+import contextlib
+import hashlib
+import math
+import os
+import stat
+import struct
+import time
+import zlib
+from collections.abc import Iterator, Sequence
+from dataclasses import dataclass, field
+from pathlib import Path
+from types import TracebackType
+from typing import Annotated, Literal, cast
+
+import msgspec
+import numpy as np
+
+from ftlm import _core
+from ftlm._core import __version__
+from ftlm.errors import DataError, ModelError
+from ftlm.simulation.discretization import Record
+from ftlm.structure.structure import Offset, Structure, check_initial
+from ftlm.utils.files import write_atomically
+
+MAGIC = b"ftlm search store 1\n"
+HEAD = struct.Struct("<II")
+DIGEST = 16
+#: Number of the algorithm that rounds follow; rounds of different ones must not be joined.
+ALGORITHM = 5
+#: Earlier ones whose half-finished stores go on where the rounds of a search have not changed since: 2 screens lattices
+#: of 2²⁵ candidates and more in boxes and in longer rounds, 3 in sharper boxes and by squared equation errors too, 4
+#: proves free runs of 2¹⁸ candidates and more closely, 5 bounds free runs by coefficients that cancel and lays boxes by
+#: the coefficients of all of their candidates; all leave the others as they were.
+CONTINUED = (1, 2, 3, 4)
+#: Largest payload: a table of 100 000 rows of many coefficients is far below.
+MAX_PAYLOAD = 1 << 30
+Natural = Annotated[int, msgspec.Meta(ge=0, le=(1 << 63) - 1)]
+Row = tuple[Natural, float, tuple[float, ...], tuple[tuple[float, ...], ...]]
+#: Candidates, kept, beaten, bounded, stopped early, singular, diverged; of the bounded those in boxes, if any.
+Counts = Annotated[tuple[Natural, ...], msgspec.Meta(min_length=7, max_length=8)]
+Failures = tuple[tuple[Natural, bool], ...]
+#: Rows (index, raw score, coefficients, initial terms by record), counts, failures (index, whether diverged).
+Part = tuple[tuple[Row, ...], Counts, Failures]
+#: Round, candidates followed, end and length of the batch, its limit.
+Place = tuple[Natural, Natural, Natural, Natural, float]
+#: Where to go on with a stretch half done, with the digest of the visiting order, and whether it was begun anew.
+Checkpoint = tuple[tuple[Natural, Natural, Natural, Natural, float, Natural], bool, Part]
+#: Equation, first candidate, the one behind the last, limit.
+Span = tuple[int, int, int, float]
+#: What candidates under an order law came to: values and kinds (see :class:`Verdicts`).
+Outcomes = tuple[bytes, bytes]
+
+
+#: Most free motions of a sensor filter that a record may hold.
+MAX_STATES = 10
+
+
+class RecordFile(msgspec.Struct, frozen=True, forbid_unknown_fields=True, omit_defaults=True):
+    """A record: pulse means as little-endian doubles, row by row; an offset is written where there is one."""
+
+    signals: tuple[str, ...]
+    step: float
+    shape: tuple[int, int]
+    means: bytes
+    inputs: tuple[bool, ...]
+    sensor: bytes | None
+    initial: str | tuple[float, ...]
+    offset: Offset = "none"
+    states: int = 0
+
+    @classmethod
+    def of(cls, record: Record) -> RecordFile:
+        """Write a record."""
+        sensor = None if record.sensor is None else np.ascontiguousarray(record.sensor, "<f8").tobytes()
+        rows, m = record.means.shape
+        means = np.ascontiguousarray(record.means, "<f8").tobytes()
+        return cls(
+            record.signals,
+            float(record.step),
+            (rows, m),
+            means,
+            record.inputs,
+            sensor,
+            record.initial,
+            record.offset,
+            record.states,
+        )
+
+    def record(self) -> Record:
+        """Give the record back, or refuse sizes that do not fit one another."""
+        rows, m = self.shape
+        sizes = (len(self.signals), len(self.inputs), len(self.means))
+        if rows < 1 or m < 1 or sizes != (rows, rows, 8 * rows * m) or len(self.sensor or b"") % 8:
+            raise ModelError("the sizes of a record do not fit one another")
+        if not 0 <= self.states <= (0 if self.sensor is None else MAX_STATES):
+            raise ModelError(f"a record with {self.states} states of its sensor filter")
+        means = np.frombuffer(self.means, "<f8").astype(np.float64).reshape(rows, m)
+        sensor = None if self.sensor is None else np.frombuffer(self.sensor, "<f8").astype(np.float64)
+        return Record(
+            self.signals, self.step, means, self.inputs, sensor, check_initial(self.initial), self.offset, self.states
+        )
+
+
+class Request(msgspec.Struct, frozen=True, forbid_unknown_fields=True):
+    """One search: what it is computed from, and what its result is called."""
+
+    name: str
+    structure: Structure
+    values: dict[str, tuple[float, ...]]
+    settings: dict[str, str | int | float | bool]
+    records: tuple[RecordFile, ...]
+    runs: tuple[str, ...]
+    units: dict[str, str]
+
+    def difference(self, other: Request) -> str | None:
+        """Say what sets another request apart, or None."""
+        if [r.offset for r in self.records] != [r.offset for r in other.records]:
+            return "another offset"
+        if self.records != other.records:
+            return "other data"
+        if self.structure.equations != other.structure.equations:
+            return "another equation"
+        if self.values != other.values:
+            return "another lattice"
+        changed = [n for n in self.settings if self.settings[n] != other.settings.get(n)]
+        if changed:
+            return "other settings: " + ", ".join(f"{n} = {self.settings[n]}" for n in changed)
+        return None
+
+
+class Requests(msgspec.Struct, frozen=True, forbid_unknown_fields=True, tag="requests"):
+    """The first frame."""
+
+    algorithm: int
+    version: str
+    requests: tuple[Request, ...]
+
+
+class Begun(msgspec.Struct, frozen=True, forbid_unknown_fields=True, tag="progress"):
+    """A stretch of rounds, half done; rows are those found since the frame before, failures None where unchanged.
+
+    Where the stretch was begun anew, frames before do not count. Order is the digest of the order in which the round is
+    visited; 0, which older stores mean, is that of none.
+    """
+
+    search: Natural
+    first: Natural
+    last: Natural
+    place: Place
+    rows: tuple[Row, ...]
+    counts: Counts
+    failures: Failures | None
+    order: Natural = 0
+    anew: bool = False
+
+
+class Rounds(msgspec.Struct, frozen=True, forbid_unknown_fields=True, tag="rounds"):
+    """A stretch of rounds, done."""
+
+    search: Natural
+    first: Natural
+    last: Natural
+    part: Part
+
+
+class Verdicts(msgspec.Struct, frozen=True, forbid_unknown_fields=True, tag="verdicts"):
+    """A stretch of the candidates that a search under an order law follows, in its order, done.
+
+    Values are raw sums as little-endian doubles; a byte each of kinds tells of what: 0 the whole record, 1 a bound, 2 a
+    partial sum, 3 singular, 4 diverged.
+    """
+
+    search: Natural
+    first: Natural
+    last: Natural
+    values: bytes
+    kinds: bytes
+
+
+#: Index, score, free orders, and of each equation score, alpha, orders, coefficients, initial terms by record.
+StagePart = tuple[float, float, tuple[float, ...], tuple[float, ...], tuple[tuple[float, ...], ...]]
+StageRow = tuple[Natural, float, tuple[float, ...], tuple[StagePart, ...]]
+#: Index, free orders, reason.
+StageFailure = tuple[Natural, tuple[float, ...], Literal["singular", "diverged"]]
+
+
+class Joined(msgspec.Struct, frozen=True, forbid_unknown_fields=True, tag="joined"):
+    """What a search under an order law came to: table, counts by reason, first failures."""
+
+    search: Natural
+    rows: tuple[StageRow, ...]
+    counts: dict[str, Natural]
+    failures: tuple[StageFailure, ...]
+
+
+Frame = Begun | Rounds | Verdicts | Joined
+DECODER = msgspec.msgpack.Decoder(Requests | Frame)
+ENCODER = msgspec.msgpack.Encoder()
+
+
+def _check(length: bytes, offset: int) -> int:
+    return zlib.crc32(length + struct.pack("<Q", offset))
+
+
+def _digest(before: bytes, length: bytes, payload: bytes) -> bytes:
+    return hashlib.blake2b(before + length + payload, digest_size=DIGEST).digest()
+
+
+def framed(payload: bytes, offset: int, before: bytes) -> tuple[bytes, bytes]:
+    """Bytes of a frame and its digest."""
+    length = struct.pack("<I", len(payload))
+    digest = _digest(before, length, payload)
+    return length + struct.pack("<I", _check(length, offset)) + payload + digest, digest
+
+
+def next_frame(data: memoryview, offset: int, before: bytes) -> tuple[bytes, bytes, int] | str:
+    """Payload, digest and end of the frame at an offset, or what is wrong: "torn" or words."""
+    rest = len(data) - offset
+    if rest < HEAD.size:
+        return "torn"
+    length, check = HEAD.unpack_from(data, offset)
+    if check != _check(bytes(data[offset : offset + 4]), offset):
+        # Blocks that were set aside and never written read as zeros.
+        return "torn" if not any(data[offset:]) else f"the frame at byte {offset} has a damaged length"
+    end = offset + HEAD.size + length + DIGEST
+    if length > MAX_PAYLOAD:
+        return f"the frame at byte {offset} has a length of {length} bytes"
+    if end > len(data):
+        return "torn"
+    payload = bytes(data[offset + HEAD.size : end - DIGEST])
+    digest = bytes(data[end - DIGEST : end])
+    if digest != _digest(before, bytes(data[offset : offset + 4]), payload):
+        return "torn" if end == len(data) else f"the frame at byte {offset} does not match its digest"
+    return payload, digest, end
+
+
+#: Most bytes of a store: a layout of the largest search under a law takes under a tenth.
+LARGEST = 4 << 30
+
+
+@dataclass(frozen=True)
+class Kind:
+    """What a store is called, and the bytes that it opens with."""
+
+    name: str
+    magic: bytes
+
+
+#: The stores of an order search and of a selection.
+SEARCH, SELECTION = KINDS = (Kind("search", MAGIC), Kind("selection", b"ftlm selection store 1\n"))
+
+
+def check(path: str | os.PathLike[str], handle: int, kind: Kind) -> None:
+    """Refuse what is no file, or none of ours, or too large to be one, before its gigabytes are read."""
+    status = os.fstat(handle)
+    if not stat.S_ISREG(status.st_mode):
+        raise DataError(f"store {path} is no regular file; choose another file")
+    begins = os.read(handle, max(len(k.magic) for k in KINDS))
+    other = next((k.name for k in KINDS if k != kind and begins.startswith(k.magic)), None)
+    if other is not None:
+        raise DataError(
+            f"{path} is the store of a {other}, not of a {kind.name}; go on with it by the call that began it"
+        )
+    if not kind.magic.startswith(begins[: len(kind.magic)]):
+        raise DataError(f"{path} is no ftlm {kind.name} store; give a file written with store= (--store)")
+    if status.st_size > LARGEST:
+        raise DataError(
+            f"{path} has {status.st_size} bytes, more than the {LARGEST} of the largest store; start the {kind.name} "
+            "again in another file"
+        )
+    os.lseek(handle, 0, os.SEEK_SET)
+
+
+class Log:
+    """A store's file, locked until it is closed; without `create` it must be there.
+
+    What is appended stands behind `end`, chained to the `digest` of the frame before it; whoever reads the file says
+    where its last whole frame ends.
+    """
+
+    def __init__(self, path: str | os.PathLike[str], kind: Kind, *, create: bool) -> None:
+        self.path, self.kind = Path(path), kind
+        self.end, self.digest = 0, bytes(DIGEST)
+        # A pipe that nobody reads would keep the open waiting.
+        flags = os.O_RDWR | getattr(os, "O_NONBLOCK", 0) | (os.O_CREAT if create else 0) | getattr(os, "O_BINARY", 0)
+        try:
+            self.handle = os.open(self.path, flags | getattr(os, "O_CLOEXEC", 0), 0o666)
+        except (OSError, ValueError) as error:
+            why = error.strerror if isinstance(error, OSError) else None
+            raise DataError(f"store {self.path} cannot be opened: {why or error}; choose another file") from error
+        try:
+            check(self.path, self.handle, kind)
+            self._lock()
+        except BaseException:
+            self.close()
+            raise
+
+    def _lock(self) -> None:
+        """Keep other writers out."""
+        try:
+            if os.name == "nt":
+                import msvcrt  # noqa: PLC0415
+
+                os.lseek(self.handle, 1 << 40, os.SEEK_SET)
+                msvcrt.locking(self.handle, msvcrt.LK_NBLCK, 1)  # type: ignore[attr-defined,unused-ignore]
+            else:
+                import fcntl  # noqa: PLC0415
+
+                fcntl.flock(self.handle, fcntl.LOCK_EX | fcntl.LOCK_NB)
+        except OSError as error:
+            raise DataError(
+                f"store {self.path} is in use by another {self.kind.name}; wait for it, stop it, or choose another file"
+            ) from error
+
+    def read(self) -> bytes:
+        """All bytes of the file."""
+        os.lseek(self.handle, 0, os.SEEK_SET)
+        return b"".join(iter(lambda: os.read(self.handle, 1 << 20), b""))
+
+    def unbegun(self, data: bytes) -> bool:
+        """Whether a file is empty or what is left of a store whose first frame was never finished."""
+        magic = self.kind.magic
+        if not data.startswith(magic):
+            return magic.startswith(data)
+        return next_frame(memoryview(data), len(magic), bytes(DIGEST)) == "torn"
+
+    def begin(self, payload: bytes) -> bytes:
+        """Write the first frame; the bytes of the file."""
+        frame, digest = framed(payload, len(self.kind.magic), bytes(DIGEST))
+        self.end = 0
+        self._write(self.kind.magic + frame)
+        self.digest = digest
+        self._sync_folder()
+        return self.kind.magic + frame
+
+    def append(self, payloads: Sequence[bytes]) -> None:
+        """Write frames behind the last one, and flush to disk."""
+        data, digest, offset = [], self.digest, self.end
+        for payload in payloads:
+            piece, digest = framed(payload, offset, digest)
+            data.append(piece)
+            offset += len(piece)
+        self._write(b"".join(data))
+        self.digest = digest
+
+    def cut(self) -> None:
+        """Drop what stands behind the end."""
+        with self._writing():
+            os.ftruncate(self.handle, self.end)
+            os.fsync(self.handle)
+
+    @contextlib.contextmanager
+    def _writing(self) -> Iterator[None]:
+        """Leave the store as it was where writing fails, and say so."""
+        try:
+            yield
+        except OSError as error:
+            # Where even that fails the next reader drops the torn frame.
+            with contextlib.suppress(OSError):
+                os.ftruncate(self.handle, self.end)
+            raise DataError(
+                f"store {self.path} cannot be written: {error.strerror or error}; what it holds is whole: make room, "
+                "or move it to another folder, and resume it"
+            ) from error
+
+    def _sync_folder(self) -> None:
+        with contextlib.suppress(OSError):  # some file systems do not sync folders, and Windows opens none
+            folder = os.open(self.path.parent, os.O_RDONLY)
+            try:
+                os.fsync(folder)
+            finally:
+                os.close(folder)
+
+    def _write(self, data: bytes) -> None:
+        with self._writing():
+            os.lseek(self.handle, self.end, os.SEEK_SET)
+            left = memoryview(data)
+            while left:
+                left = left[os.write(self.handle, left) :]
+            os.fsync(self.handle)
+        self.end += len(data)
+
+    def close(self) -> None:
+        """Give the lock back."""
+        os.close(self.handle)
+
+
+@dataclass
+class Half:
+    """A stretch of rounds, half done, with all rows found since its start."""
+
+    last: int
+    place: Place
+    order: int
+    rows: list[Row]
+    counts: Counts
+    failures: Failures
+
+    @property
+    def checkpoint(self) -> Checkpoint:
+        """Where to go on, as the core takes it."""
+        return (*self.place, self.order), False, (tuple(self.rows), self.counts, self.failures)
+
+
+@dataclass
+class Section:
+    """What is known of one search: stretches done (of rounds, or of candidates under an order law) and half done.
+
+    Both stand under their first round or candidate.
+    """
+
+    law: bool = False
+    done: dict[int, Rounds | Verdicts] = field(default_factory=dict)
+    open: dict[int, Half] = field(default_factory=dict)
+    joined: Joined | None = None
+    _firsts: list[int] = field(default_factory=list)
+
+    def take(self, frame: Frame) -> None:
+        """Take a frame in; refuse one that is there already, that is no stretch, or of another kind of search."""
+        if self.joined is not None or (isinstance(frame, Joined) and not self.law):
+            raise ModelError("a table stands where none belongs")
+        if isinstance(frame, Joined):
+            self.joined = frame
+            return
+        if frame.first >= frame.last or isinstance(frame, Verdicts) != self.law:
+            raise ModelError(f"rounds {frame.first} to {frame.last} are no stretch")
+        place = bisect.bisect_left(self._firsts, frame.last)
+        if place and self.done[self._firsts[place - 1]].last > frame.first:
+            raise ModelError(f"rounds {frame.first} to {frame.last} are there twice")
+        if isinstance(frame, Begun):
+            self._take_begun(frame)
+            return
+        count = frame.last - frame.first
+        if isinstance(frame, Verdicts) and (len(frame.values), len(frame.kinds)) != (8 * count, count):
+            raise ModelError(f"candidates {frame.first} to {frame.last} have other verdicts")
+        self.open.pop(frame.first, None)
+        self.done[frame.first] = frame
+        self._firsts.insert(place, frame.first)
+
+    def _take_begun(self, frame: Begun) -> None:
+        half = self.open.get(frame.first)
+        if not frame.first <= frame.place[0] < frame.last or (half is not None and half.last != frame.last):
+            raise ModelError(f"rounds {frame.first} to {frame.last} are continued as something else")
+        _, followed, end, size, limit = frame.place
+        if not (followed <= end and size >= (end > 0) and not math.isnan(limit)):
+            raise ModelError(f"rounds {frame.first} to {frame.last} stand nowhere")
+        if half is None or frame.anew:
+            half = self.open[frame.first] = Half(frame.last, frame.place, frame.order, [], frame.counts, ())
+        half.place, half.order, half.counts = frame.place, frame.order, frame.counts
+        half.rows.extend(frame.rows)
+        half.failures = half.failures if frame.failures is None else frame.failures
+
+    @property
+    def dealt(self) -> int:
+        """Candidates dealt with."""
+        done = (len(f.kinds) if isinstance(f, Verdicts) else sum(f.part[1][1:7]) for f in self.done.values())
+        return sum(done) + sum(sum(half.counts[1:7]) for half in self.open.values())
+
+    @property
+    def best(self) -> float | None:
+        """Smallest raw score so far, of one equation's candidates."""
+        rows = [row for frame in self.done.values() if isinstance(frame, Rounds) for row in frame.part[0]]
+        return min((row[1] for row in (*rows, *(r for half in self.open.values() for r in half.rows))), default=None)
+
+
+@dataclass
+class Contents:
+    """What a store holds."""
+
+    requests: tuple[Request, ...]
+    sections: list[Section]
+    version: str
+    algorithm: int
+    #: Offset behind the last whole frame, and that frame's digest.
+    end: int
+    digest: bytes
+    #: Bytes behind it that a power cut or a kill left, or that are being written.
+    torn: int = 0
+    #: What is damaged, with its offset, where frames or bytes follow that cannot be read; None for a whole store.
+    damage: str | None = None
+
+
+def read_store(path: str | os.PathLike[str]) -> Contents:
+    """Read a store as far as it is whole; it may be in use."""
+    try:
+        # A pipe that nobody writes to would keep the open waiting.
+        handle = os.open(path, os.O_RDONLY | getattr(os, "O_NONBLOCK", 0) | getattr(os, "O_BINARY", 0))
+        with os.fdopen(handle, "rb") as stream:
+            check(path, handle, SEARCH)
+            data = stream.read()
+    except DataError:
+        raise
+    except (OSError, ValueError) as error:
+        why = error.strerror if isinstance(error, OSError) else None
+        raise DataError(f"store {path} cannot be read: {why or error}; check the path") from error
+    return contents_of(path, memoryview(data))
+
+
+def contents_of(path: str | os.PathLike[str], data: memoryview) -> Contents:
+    """Contents of a store's bytes; refuse what is none, has no first frame, or is of a later version."""
+    start = bytes(data[: len(MAGIC)])
+    if not MAGIC.startswith(start):
+        raise DataError(f"{path} is no ftlm search store; give a file written with store= (--store)")
+    contents: Contents | None = None
+    offset, digest = len(MAGIC), bytes(DIGEST)
+    while offset < len(data):
+        got = next_frame(data, offset, digest)
+        if isinstance(got, str):
+            if contents is None:
+                why = "it ends before its first frame does" if got == "torn" else got
+                raise DataError(f"{path} cannot be used: {why}; start the search again in another file")
+            contents.torn = len(data) - offset if got == "torn" else 0
+            contents.damage = None if got == "torn" else got
+            break
+        payload, digest, end = got
+        try:
+            frame = DECODER.decode(payload)
+            if contents is None:
+                contents = _opened(frame, end, digest)
+            elif isinstance(frame, Requests):
+                raise ModelError("requests stand twice")
+            else:
+                if frame.search >= len(contents.sections):
+                    raise ModelError(f"there is no search {frame.search}")
+                contents.sections[frame.search].take(frame)
+        except (msgspec.MsgspecError, ValueError, RecursionError, OverflowError) as error:
+            raise DataError(
+                f"{path} holds something else at byte {offset}: {error}; start the search again in another file"
+            ) from error
+        offset = end
+        contents.end, contents.digest = end, digest
+    if contents is None:
+        raise DataError(f"{path} ends before its first frame: its search had not begun; start it again with store=")
+    return contents
+
+
+def _opened(frame: Requests | Frame, end: int, digest: bytes) -> Contents:
+    if not isinstance(frame, Requests) or not frame.requests:
+        raise ModelError("the first frame holds no request")
+    sections = [Section(law=r.structure.has_order_law) for r in frame.requests]
+    return Contents(frame.requests, sections, frame.version, frame.algorithm, end, digest)
+
+
+#: Longest time [s] between two writes, each flushed to disk: with the time between checkpoints, under a second is lost.
+INTERVAL = 0.3
+
+
+class Store:
+    """A store opened for writing: locked until it is closed; what is appended is on disk within :data:`INTERVAL`.
+
+    The requests are the searches of a new store, or what an existing one must hold; None takes what it holds. With
+    `salvage` a damaged one goes on with its whole frames, and the damaged file is kept beside it.
+    """
+
+    def __init__(
+        self, path: str | os.PathLike[str], requests: Sequence[Request] | None = None, *, salvage: bool = False
+    ) -> None:
+        self.path = Path(path)
+        #: What was mended, in words.
+        self.notes: list[str] = []
+        self._last = time.monotonic()
+        #: By search and first round: what is not written yet, and the failures written last.
+        self._waiting: dict[tuple[int, int], Begun] = {}
+        self._failures: dict[tuple[int, int], Failures | None] = {}
+        self._log = Log(path, SEARCH, create=requests is not None)
+        try:
+            self._begin(requests, salvage=salvage)
+        except BaseException:
+            self._log.close()
+            raise
+
+    def _begin(self, requests: Sequence[Request] | None, *, salvage: bool) -> None:
+        data = self._log.read()
+        if requests is not None and self._log.unbegun(data):
+            # A payload read back must be the one asked for: what would not survive is found before any work.
+            payload = ENCODER.encode(Requests(ALGORITHM, __version__, tuple(requests)))
+            data = self._log.begin(payload)
+        self.contents = held = contents_of(self.path, memoryview(data))
+        if requests is not None:
+            self._check_same(requests, held.requests)
+        self._log.end, self._log.digest = held.end, held.digest
+        if held.damage is not None:
+            self._salvage(data, salvage=salvage)
+        elif held.torn:
+            self.notes.append(f"{held.torn} bytes of an unfinished write at byte {held.end} were dropped")
+        if held.end < len(data):
+            self._log.cut()
+
+    def _check_same(self, asked: Sequence[Request], held: Sequence[Request]) -> None:
+        if [r.name for r in asked] != [r.name for r in held]:
+            names = ", ".join(r.name for r in held)
+            raise DataError(f"store {self.path} holds searches of {names}; choose another file")
+        for one, other in zip(asked, held, strict=True):
+            difference = one.difference(other)
+            if difference is not None:
+                raise DataError(
+                    f"store {self.path} holds another search of {one.name} (asked is {difference}); choose another file"
+                )
+
+    def _salvage(self, data: bytes, *, salvage: bool) -> None:
+        lost = len(data) - self.contents.end
+        if not salvage:
+            raise DataError(
+                f"store {self.path} is damaged: {self.contents.damage}; {lost} bytes from there on cannot be trusted: "
+                "resume with salvage=True (--salvage) to keep what stands before and compute the rest again"
+            )
+        copy = self.path.with_name(self.path.name + ".damaged")
+        write_atomically(copy, data, force=False)
+        self.notes.append(f"{lost} damaged bytes from byte {self.contents.end} on were dropped; {copy} keeps them")
+        self.contents.damage = None
+
+    def outdated(self) -> DataError:
+        """Say why a search that another version began does not go on."""
+        held = self.contents
+        return DataError(
+            f"store {self.path} is of ftlm {held.version}, whose rounds follow algorithm {held.algorithm}; this "
+            f"version's is {ALGORITHM}: finish the search with that version, or start it again in another "
+            "file"
+        )
+
+    def _append(self, added: Sequence[Frame]) -> None:
+        held = self.contents
+        if held.algorithm not in (ALGORITHM, *CONTINUED):
+            # A finished search is only read, whatever made it.
+            raise self.outdated()
+        self._log.append([ENCODER.encode(frame) for frame in added])
+        self._last = time.monotonic()
+        for frame in added:
+            self.contents.sections[frame.search].take(frame)
+
+    def save(self, search: int, first: int, last: int, checkpoint: Checkpoint | None) -> None:
+        """Note how far a stretch of rounds is; it is written with others, or when it is time."""
+        if checkpoint is not None:
+            (*place, order), anew, (rows, counts, failures) = checkpoint
+            before = self._waiting.get((search, first))
+            rows = (*(before.rows if before else ()), *rows)
+            anew = anew or (before is not None and before.anew)
+            told = cast("Place", tuple(place))
+            self._waiting[search, first] = Begun(search, first, last, told, rows, counts, failures, order, anew)
+        if time.monotonic() - self._last >= INTERVAL:
+            self.flush()
+
+    def flush(self) -> None:
+        """Write what waits."""
+        due = []
+        for key, frame in self._waiting.items():
+            same = not frame.anew and self._failures.get(key) == frame.failures
+            due.append(msgspec.structs.replace(frame, failures=None) if same else frame)
+            self._failures[key] = frame.failures
+        self._waiting.clear()
+        if due:
+            self._append(due)
+
+    def done(self, frame: Rounds | Verdicts) -> None:
+        """Append a stretch that is done."""
+        self._waiting.pop((frame.search, frame.first), None)
+        self._failures.pop((frame.search, frame.first), None)
+        self._append([frame])
+
+    def joined(self, search: int, table: _core._FoundStage) -> None:
+        """Append the table of a search under an order law."""
+        frame = {"type": "joined", "search": search, **{k: table[k] for k in ("rows", "counts", "failures")}}
+        self._append([msgspec.convert(frame, Joined)])
+
+    def close(self) -> None:
+        """Write what waits and give the lock back."""
+        try:
+            self.flush()
+        finally:
+            self._log.close()
+
+    def __enter__(self) -> Store:
+        return self
+
+    def __exit__(
+        self, kind: type[BaseException] | None, error: BaseException | None, trace: TracebackType | None
+    ) -> None:
+        if kind is not None and issubclass(kind, DataError):
+            # Writing failed: what waits would fail too, and hide why.
+            self._waiting.clear()
+        self.close()

@@ -1,0 +1,142 @@
+"""Checked settings of an estimator and of an order search."""
+
+from __future__ import annotations
+
+import math
+from collections.abc import Iterable
+from dataclasses import dataclass
+from typing import Any, Literal
+
+from ftlm.errors import ModelError
+from ftlm.utils.resources import memory_limit
+from ftlm.utils.validation import check_threads, real_number, whole_number
+
+Criterion = Literal["output-error", "equation-error"]
+Coefficients = Literal["multi-innovation", "least-squares", "instrumental-variables"]
+Loss = Literal["squares", "huber"]
+Intervals = Literal["auto", "quadratic", "profile"]
+LOSSES = ("squares", "huber")
+INTERVALS = ("auto", "quadratic", "profile")
+METHODS = ("output-error", "instrumental-variables", "multi-innovation", "least-squares", "genetic")
+_LATTICE = METHODS[1:4]
+#: The methods of `identify` that use an option; one that is not here (runs, structure, m, threads, progress) is of all.
+USED_BY: dict[str, tuple[str, ...]] = {
+    "lattice": METHODS[1:],
+    "criterion": _LATTICE,
+    "norm": METHODS[1:],
+    "keep": _LATTICE,
+    "innovation_length": ("multi-innovation",),
+    "prior_covariance": ("multi-innovation",),
+    "rows": ("multi-innovation",),
+    "genetic": ("genetic",),
+    "loss": METHODS[:1],
+    "reference": METHODS[:1],
+    "intervals": METHODS[:1],
+    "start": METHODS[:1],
+    "store": _LATTICE,
+    "executor": _LATTICE,
+}
+#: What belongs to the search of orders: lattice methods use it only where an order is free.
+OF_SEARCHES = ("lattice", "criterion", "norm", "keep", "store", "executor")
+#: Innovation lengths that are laid side by side: those of the paper's tables.
+COMPARED_LENGTHS = (1, 3, 5, 7)
+#: Steps of refined instrumental variables a candidate; most stand still before.
+REFINEMENTS = 5
+
+
+def check_used(method: str, given: Iterable[str], *, free: bool = True, argument: str = "method") -> None:
+    """Refuse options that a method does not use with a `ModelError` that names the first and how many they are.
+
+    Parameters
+    ----------
+    method
+        One of :data:`METHODS`.
+    given
+        Names of the options that somebody gave, whatever their values.
+    free
+        Whether an order is free.
+    argument
+        What the caller calls the method.
+    """
+    useless = [n for n in given if method not in USED_BY.get(n, METHODS)]
+    fixed = [n for n in given if not free and method in _LATTICE and n in OF_SEARCHES and n not in useless]
+    count = len(useless) + len(fixed)
+    others = f", nor {count - 1} other{'s' if count > 2 else ''} given here" if count > 1 else ""
+    if useless:
+        users = " or ".join(f"{argument}={m!r}" for m in USED_BY[useless[0]])
+        raise ModelError(f"{useless[0]}= is not used by {argument}={method!r}{others}; leave it out, or use {users}")
+    if fixed:
+        raise ModelError(
+            f"{fixed[0]}= is not used{others}: it is for order searches, and every order here is a number; leave it "
+            "out, or free an order"
+        )
+
+
+@dataclass(frozen=True)
+class Settings:
+    """Checked settings of an estimator of coefficients, and of the order search that ranks by it."""
+
+    criterion: str = "output-error"
+    norm: str = "l1"
+    coefficients: str = "multi-innovation"
+    innovation_length: int = 7
+    prior_covariance: float = 1.0
+    rows: str = "haar"
+    keep: int = 20
+    threads: int = 1
+    early_stopping: bool = True
+
+    @classmethod
+    def check(
+        cls,
+        criterion: str = "output-error",
+        norm: str = "l1",
+        coefficients: str = "multi-innovation",
+        innovation_length: int = 7,
+        prior_covariance: float = 1.0,
+        rows: str = "haar",
+        keep: int = 20,
+        threads: int | None = None,
+        early_stopping: bool = True,
+    ) -> Settings:
+        """Refuse words and numbers that mean nothing with a `ModelError` that names the argument."""
+        for name, value, known in (
+            ("criterion", criterion, ("output-error", "equation-error")),
+            ("norm", norm, ("l1", "l2")),
+            ("coefficients", coefficients, ("multi-innovation", "least-squares", "instrumental-variables")),
+            ("rows", rows, ("haar", "time")),
+        ):
+            if value not in known:
+                raise ModelError(
+                    f"{name} = {value!r} is not known in this version; use {' or '.join(map(repr, known))}"
+                )
+        rows_kept, p = whole_number(keep), whole_number(innovation_length)
+        if rows_kept is None or not 1 <= rows_kept <= 100_000:
+            raise ModelError(f"keep = {keep!r} is outside [1, 100000]; keep as many rows as you will read")
+        if p is None or not 1 <= p < 1 << 62:
+            raise ModelError(f"innovation length p = {innovation_length!r} is no whole number from 1; the paper's is 7")
+        k0 = real_number("prior covariance K0", prior_covariance)
+        if not 0 < k0 < math.inf:
+            raise ModelError(f"prior covariance K0 = {prior_covariance!r} is not positive; a large one is a weak prior")
+        return cls(criterion, norm, coefficients, p, k0, rows, rows_kept, check_threads(threads), early_stopping)
+
+    @property
+    def needs_haar(self) -> bool:
+        """Whether m must be a power of two."""
+        return self.coefficients == "multi-innovation" and self.rows == "haar"
+
+    def core(self, memory: int | None = None) -> tuple[str, str, int, float, bool, int, int, bool, int, int]:
+        """As the core takes them; memory that is not given is asked for here and now, where the search runs."""
+        p = self.innovation_length if self.coefficients == "multi-innovation" else 0
+        steps = REFINEMENTS if self.coefficients == "instrumental-variables" else 0
+        ranked = (self.criterion, self.norm, p, self.prior_covariance, self.rows == "haar")
+        most = memory_limit() if memory is None else memory
+        return *ranked, self.keep, self.threads, self.early_stopping, steps, most
+
+    def to_dict(self) -> dict[str, Any]:
+        """For results and reports."""
+        out: dict[str, Any] = {"criterion": self.criterion, "norm": self.norm, "coefficients": self.coefficients}
+        if self.coefficients == "multi-innovation":
+            out |= {"innovation_length": self.innovation_length, "prior_covariance": self.prior_covariance}
+            out["rows"] = self.rows
+        return out

@@ -1,0 +1,614 @@
+"""An order search ready to be done: one equation, or a stage under its order law."""
+
+from __future__ import annotations
+
+import contextlib
+import math
+import os
+import time
+from collections.abc import Callable, Iterator, Mapping, Sequence
+from concurrent.futures import Executor
+from dataclasses import dataclass, fields, replace
+from typing import Any, Literal, cast
+
+import numpy as np
+from msgspec import UNSET
+
+from ftlm import _core
+from ftlm.data.run import Run, as_runs
+from ftlm.errors import DataError, FtlmError, ModelError
+from ftlm.model.model import Model
+from ftlm.order_search.checkpoint import RecordFile, Request, Store, read_store
+from ftlm.order_search.options import Coefficients, Criterion, Settings, check_used
+from ftlm.order_search.result import SearchResult, SearchRow, StoreStatus
+from ftlm.order_search.schedule import (
+    CoreRecord,
+    EquationWork,
+    StageWork,
+    Told,
+    equation_state,
+    search_equation,
+    search_stage,
+    stage_state,
+)
+from ftlm.progress import Progress
+from ftlm.simulation.discretization import (
+    InitialTuple,
+    Record,
+    check_held,
+    check_linear,
+    named_coefficients,
+    named_signals,
+    prepare,
+)
+from ftlm.structure.order import Order
+from ftlm.structure.order_grid import Lattice, axis_of, check_lattice
+from ftlm.structure.structure import Structure
+from ftlm.svg.heat_map import Landscape
+from ftlm.utils.validation import check_threads
+
+#: Settings that tell one search from another; threads make no difference to it.
+KEPT = tuple(f.name for f in fields(Settings) if f.name != "threads")
+Failures = list[tuple[dict[str, float], str]]
+
+
+@dataclass(frozen=True)
+class Job:
+    """What a search works on."""
+
+    runs: tuple[str, ...]
+    units: Mapping[str, str]
+    structure: Structure
+    values: Mapping[str, tuple[float, ...]]
+    records: list[Record]
+    settings: Settings
+    progress: Told | None
+
+    @property
+    def name(self) -> str:
+        """What its result is called among others."""
+        return "stage" if self.structure.has_order_law else self.structure.outputs[0]
+
+    def request(self, name: str) -> Request:
+        """As a store keeps it."""
+        settings = {n: getattr(self.settings, n) for n in KEPT}
+        records = tuple(RecordFile.of(r) for r in self.records)
+        # Hints are not written: they tell a fit where to start and change no search.
+        structure = replace(self.structure, hints=UNSET)
+        # The records say it, where there is one: what has none is written as it always was.
+        object.__setattr__(structure, "offset", UNSET)
+        return Request(name, structure, dict(self.values), settings, records, self.runs, dict(self.units))
+
+    @classmethod
+    def of(cls, request: Request, threads: int, progress: Told | None) -> Job:
+        """From a store; refuse a request that is none."""
+        try:
+            kept: dict[str, Any] = {n: request.settings[n] for n in KEPT}
+        except KeyError as error:
+            raise ModelError(f"setting {error} is missing") from None
+        settings = Settings.check(**kept | {"threads": threads, "early_stopping": bool(kept["early_stopping"])})
+        records = [r.record() for r in request.records]
+        structure = replace(request.structure, offset=records[0].offset if records else "none")
+        signals = structure.signals
+        if not records or (len(structure.equations) != 1 and not structure.has_order_law):
+            raise ModelError("it is not the search of one equation, or of some under a law, on a record")
+        if any(r.signals != signals or r.inputs != records[0].inputs for r in records):
+            raise ModelError("its records do not hold the signals of its equation")
+        if any(n not in request.values for n in structure.order_names):
+            raise ModelError("an order has no values")
+        return cls(request.runs, request.units, structure, request.values, records, settings, progress)
+
+    def _recorded(self) -> tuple[tuple[CoreRecord, ...], list[bool], InitialTuple, Settings]:
+        record = self.records[0]
+        runs = tuple(r.core() for r in self.records)
+        return runs, list(record.inputs), record.start, self.settings
+
+    def equation_work(self) -> EquationWork:
+        """What the rounds of one equation are computed from."""
+        item, signals = self.structure.equations[0], self.records[0].signals
+        axes = [
+            (signals.index(t.signal), axis_of(t.order, self.values), bool(t.order.names) and t.fixed is None)
+            for t in item.terms
+        ]
+        return EquationWork(
+            *self._recorded(),
+            orders=(signals.index(item.output), axis_of(item.order, self.values), axes),
+            fixed=[t.fixed for t in item.terms],
+        )
+
+    def stage_work(self) -> StageWork:
+        """What the search of a stage is computed from."""
+        structure, signals = self.structure, self.records[0].signals
+        names = structure.order_names
+
+        def affine(order: Order) -> tuple[float, list[float]]:
+            weights = dict(order.weights)
+            return order.constant, [weights.get(n, 0.0) for n in names]
+
+        laws = [
+            (signals.index(e.output), affine(e.order), [(signals.index(t.signal), affine(t.order)) for t in e.terms])
+            for e in structure.equations
+        ]
+        points = sum(r.m for r in self.records)
+        return StageWork(
+            *self._recorded(),
+            axes=[list(self.values[n]) for n in names],
+            laws=laws,
+            fixed=[[t.fixed for t in e.terms] for e in structure.equations],
+            scales=[s * points if self.settings.norm == "l1" else s for s in self._spreads(points)],
+        )
+
+    def _spreads(self, points: int) -> list[float]:
+        """Each output's deviation, which makes radians of hub and of deflection weigh alike."""
+        spreads = []
+        for output in self.structure.outputs:
+            with np.errstate(over="ignore", invalid="ignore"):
+                squares = sum(float(((r.of(output) - r.of(output).mean()) ** 2).sum()) for r in self.records)
+            spread = math.sqrt(squares / points)
+            if not 0 < spread < math.inf:
+                raise ModelError(f"the deviation of {output} is {spread:g}; scale it so that its squares are numbers")
+            spreads.append(spread)
+        return spreads
+
+
+def run_job(job: Job, *, store: Store | None = None, number: int = 0, executor: Executor | None = None) -> SearchResult:
+    """Search; with a store, as search `number` of it."""
+    if executor is not None and not isinstance(executor, Executor):
+        raise ModelError(
+            f"executor = {executor!r} is no executor of concurrent.futures; pass ProcessPoolExecutor(…) or "
+            "Client(…).get_executor()"
+        )
+    if job.structure.has_order_law:
+        stage = search_stage(job.stage_work(), store=store, number=number, executor=executor, progress=job.progress)
+        return _result(job, *_stage_rows(job.structure, stage), stage["counts"], 0)
+    try:
+        one = search_equation(job.equation_work(), store=store, number=number, executor=executor, progress=job.progress)
+    except ModelError as error:
+        raise named_signals(error, job.records[0].signals) from None
+    return _result(job, *_equation_rows(job.structure, one), one["counts"], one["boxed"])
+
+
+def _equation_rows(structure: Structure, found: _core._Found) -> tuple[list[SearchRow], Failures]:
+    """Rows and failures of one equation by the names of its orders and coefficients."""
+    item = structure.equations[0]
+
+    def named(alpha: float, orders: list[float]) -> dict[str, float]:
+        pairs = zip((item.order, *(t.order for t in item.terms)), (alpha, *orders), strict=True)
+        return {o.names[0]: v for o, v in pairs if o.names}
+
+    table = [
+        SearchRow(rank, index, score, named(alpha, orders), named_coefficients(item, c))
+        for rank, (index, score, alpha, orders, c, _) in enumerate(found["rows"], 1)
+    ]
+    return table, [(named(alpha, orders), str(reason)) for _, alpha, orders, reason in found["failures"]]
+
+
+def _stage_rows(structure: Structure, found: _core._FoundStage) -> tuple[list[SearchRow], Failures]:
+    """Rows and failures of a stage by the names of its free orders and of all coefficients."""
+    names, table = structure.order_names, []
+    for rank, (index, score, free, parts) in enumerate(found["rows"], 1):
+        coefficients: dict[str, float] = {}
+        for item, (_, _, _, c, _) in zip(structure.equations, parts, strict=True):
+            coefficients |= named_coefficients(item, c)
+        table.append(SearchRow(rank, index, score, dict(zip(names, free, strict=True)), coefficients))
+    return table, [(dict(zip(names, free, strict=True)), str(reason)) for _, free, reason in found["failures"]]
+
+
+def _result(job: Job, table: list[SearchRow], failures: Failures, counts: _core._Counts, boxed: int) -> SearchResult:
+    structure, values, settings = job.structure, job.values, job.settings
+    m = job.records[0].m
+    if not table:
+        raise ModelError(f"none of {counts['candidates']} candidates has a finite score; check the data and the orders")
+    best = table[0]
+    model = Model(
+        structure.with_orders(best.orders).with_coefficients(best.coefficients),
+        orders=best.orders,
+        units=job.units,
+        m=m,
+        about={"runs": ", ".join(job.runs), "orders from": "order search", **settings.to_dict()},
+    )
+    edges = {
+        n: v for n, v in best.orders.items() if len(values[n]) > 2 and v in (values[n][0], values[n][-1]) and v != 0
+    }
+    # alpha = 2 is where the physics puts it, not an accident of the interval.
+    highest = {n for e in structure.equations for n in e.order.names}
+    edges = {n: v for n, v in edges.items() if not (v == 2.0 and n in highest)}
+    pruned = {k: cast("int", v) for k, v in counts.items() if k not in ("candidates", "kept")}
+    return SearchResult(table, model, counts["candidates"], pruned, failures, m, settings.to_dict(), edges, boxed)
+
+
+def search_orders(
+    runs: Run | Sequence[Run],
+    equation: Structure,
+    lattice: Lattice | None = None,
+    *,
+    criterion: Criterion = "output-error",
+    coefficients: Coefficients = "multi-innovation",
+    norm: Literal["l1", "l2"] = "l1",
+    innovation_length: int | None = None,
+    prior_covariance: float | None = None,
+    rows: Literal["haar", "time"] | None = None,
+    m: int | None = None,
+    keep: int = 20,
+    threads: int | None = None,
+    progress: Callable[[int, int], None] | None = None,
+    early_stopping: bool = True,
+    store: str | os.PathLike[str] | None = None,
+    executor: Executor | None = None,
+) -> SearchResult:
+    """Exhaustive search over the orders of an equation, or of a stage under its order law.
+
+    Each candidate gets its coefficients on the equation error, then its score; the table is that of evaluating every
+    candidate to the end, the same bits for any number of threads on one kind of processor (paper Table 2, steps 5-7).
+
+    Parameters
+    ----------
+    runs
+        One run or several with the same names and units; scores add up.
+    equation
+        Structure with free orders; see :func:`ftlm.equation` and :func:`ftlm.flexible_link`.
+    lattice
+        Intervals and step; see :func:`ftlm.lattice`.
+    criterion
+        ``"output-error"``: the free run, each equation driven by the measured other outputs. ``"equation-error"``:
+        measured signals on the right-hand side; it prefers near-identities.
+    coefficients
+        ``"multi-innovation"`` (closed form of paper (44)), ``"least-squares"``, or ``"instrumental-variables"``:
+        refined instrumental variables for every candidate, which noise on the outputs does not bias. Measured outputs
+        that drive an equation are replaced by their projections on what the inputs excite, as instruments and in the
+        score.
+    norm
+        ``"l1"`` (paper (45)) or ``"l2"`` (paper (46)).
+    innovation_length, prior_covariance, rows
+        p and K0 of paper (43)-(44), and whether rows come in Haar coordinates (``"haar"``) or in the order of time
+        (``"time"``); by default 7, 1 and ``"haar"``. Of ``"multi-innovation"`` alone; with other coefficients they are
+        refused.
+    m
+        Block pulses a run; default 2 048, or what the runs carry.
+    keep
+        Rows of the table.
+    threads
+        Threads; default all cores.
+    progress
+        Called about twenty times a second with (candidates done, candidates in all).
+    early_stopping
+        Whether to leave a candidate once it cannot be kept, by a proved bound of its score or by its partial sum;
+        False is brute force, with the same table.
+    store
+        File in which finished work is kept, on disk within a second; the same call goes on with it after a power cut,
+        and so does :func:`resume_search`.
+    executor
+        Any :class:`concurrent.futures.Executor` to work for this search: threads, processes, or a cluster's, such as
+        ``dask.distributed.Client(…).get_executor()``. The result is the same to the last bit on processors of one kind.
+        `threads` are those of one task then, one by default.
+
+    Returns
+    -------
+    SearchResult
+        Table, best model and counts.
+
+    Raises
+    ------
+    DataError
+        Runs that do not fit, or a constant output; a store of another search, in use, damaged, or that cannot be
+        written.
+    ModelError
+        Nothing to search, a lattice without or with too many candidates, settings out of range, an option that these
+        coefficients do not use; what needs more memory than the machine has left, or than ``FTLM_MEMORY`` allows.
+    ConvergenceError
+        An executor that has lost its workers.
+    KeyboardInterrupt
+        Ctrl-C, within half a second.
+
+    Notes
+    -----
+    One Gram matrix of distinct regressors serves all candidates; each costs a k x k solve and a lower bound of its
+    score from a few inner products. Those that the bound does not exclude are run until their partial sum has lost,
+    likely ones first. Candidates are generated by index, so memory does not grow with their number.
+    """
+    if executor is not None and threads is None:
+        threads = 1
+    checked = as_runs(runs)
+    weighted = {"innovation_length": innovation_length, "prior_covariance": prior_covariance, "rows": rows}
+    words: dict[str, Any] = {n: value for n, value in weighted.items() if value is not None}
+    settings = Settings.check(
+        criterion, norm, coefficients, keep=keep, threads=threads, early_stopping=early_stopping, **words
+    )
+    check_used(coefficients, words, argument="coefficients")
+    job = make_job(checked, equation, lattice, settings, m=m, progress=progress)
+    if store is None:
+        return run_job(job, executor=executor)
+    with Store(store, [job.request(job.name)]) as kept:
+        return run_job(job, store=kept, executor=executor)
+
+
+def make_job(
+    runs: Run | Sequence[Run],
+    equation: Structure,
+    lattice: Lattice | None = None,
+    settings: Settings | None = None,
+    *,
+    m: int | None = None,
+    progress: Callable[[int, int], None] | None = None,
+    **words: Any,
+) -> Job:
+    """Check what :func:`search_orders` is given, and make it what a search works on.
+
+    Settings come checked, or in the words of :meth:`.Settings.check`.
+    """
+    checked = as_runs(runs)
+    settings = settings or Settings.check(**words)
+    if not isinstance(equation, Structure):
+        raise ModelError(f"equation is {type(equation).__name__}, not a structure; use ftlm.equation or flexible_link")
+    if not equation.order_names:
+        raise ModelError("every order is a number, so there is nothing to search; name one, as in D^alpha y")
+    check_linear(equation.equations, "an order search")
+    if len(equation.equations) > 1 and not equation.has_order_law:
+        raise ModelError(
+            "the equations share no order law, so they are searched one by one: "
+            f"pass .equation({equation.outputs[0]!r}) or use identify"
+        )
+    check_lattice(lattice)
+    values = (lattice or Lattice()).values(equation)
+    known = {n: v[0] for n, v in values.items() if len(v) == 1}
+    for run in checked:
+        check_held(run, equation, known)
+    records = prepare(checked, equation, m, power_of_two=settings.needs_haar)
+    units = {n: u for n, u in checked[0].units.items() if n in equation.signals}
+    return Job(tuple(r.name for r in checked), units, equation, values, records, settings, _told(progress))
+
+
+def resume_search(
+    path: str | os.PathLike[str],
+    *,
+    threads: int | None = None,
+    progress: Callable[[int, int], None] | None = None,
+    executor: Executor | None = None,
+    salvage: bool = False,
+) -> dict[str, SearchResult]:
+    """Go on with the searches of a store; it holds all that they are computed from.
+
+    Parameters
+    ----------
+    path
+        A file written with ``store=``.
+    threads, progress, executor
+        As for :func:`search_orders`.
+    salvage
+        Whether to go on with a damaged store: what stands before the damage is kept, the rest is computed again, and
+        the damaged file stays beside it as ``….damaged``.
+
+    Returns
+    -------
+    dict of SearchResult
+        By output, or under ``"stage"`` for a search under an order law; those of the uninterrupted searches to the last
+        bit. A store that is complete is only read.
+
+    Raises
+    ------
+    DataError
+        No store, one in use, damaged (with its offset), or one that cannot be written.
+    ModelError
+        Threads out of range.
+    ConvergenceError
+        An executor that has lost its workers.
+    KeyboardInterrupt
+        Ctrl-C, within half a second; the store can be resumed.
+    """
+    with Store(path, salvage=salvage) as store:
+        return {
+            request.name: resume_job(store, number, threads=threads, progress=progress, executor=executor)
+            for number, request in enumerate(store.contents.requests)
+        }
+
+
+def resume_job(
+    store: Store,
+    number: int,
+    *,
+    threads: int | None,
+    progress: Callable[[int, int], None] | None,
+    executor: Executor | None = None,
+) -> SearchResult:
+    """Go on with one search of a store."""
+    threads = 1 if executor is not None and threads is None else threads
+    job = replace(job_of(store, number, threads), progress=_told(progress))
+    with _usable(store.path, store.contents.requests[number]):
+        return run_job(job, store=store, number=number, executor=executor)
+
+
+def job_of(store: Store, number: int, threads: int | None) -> Job:
+    """One search of a store as what it works on."""
+    request = store.contents.requests[number]
+    with _usable(store.path, request):
+        return Job.of(request, check_threads(threads), None)
+
+
+@contextlib.contextmanager
+def _usable(path: str | os.PathLike[str], request: Request) -> Iterator[None]:
+    """Say of a search that makes no sense which one it is, and in which store."""
+    try:
+        yield
+    except ModelError as error:
+        raise DataError(
+            f"{path} holds no usable search of {request.name}: {error}; start it again in another file"
+        ) from error
+
+
+def search_status(path: str | os.PathLike[str]) -> dict[str, StoreStatus]:
+    """How far the searches of a store are; it may be in use.
+
+    Of an unfinished stage under its order law the tables are laid out again, which takes seconds for a fine lattice.
+
+    Parameters
+    ----------
+    path
+        A file written with ``store=``.
+
+    Returns
+    -------
+    dict of StoreStatus
+        By output, or under ``"stage"``.
+
+    Raises
+    ------
+    DataError
+        No store.
+    """
+    contents = read_store(path)
+    states = {}
+    for request, section in zip(contents.requests, contents.sections, strict=True):
+        with _usable(path, request):
+            job = Job.of(request, 1, None)
+            if section.law:
+                candidates, best = stage_state(job.stage_work(), section)
+            else:
+                candidates, best = equation_state(job.equation_work(), section)
+        states[request.name] = StoreStatus(
+            request.name,
+            candidates,
+            section.dealt,
+            best,
+            job.settings.to_dict(),
+            request.runs,
+            contents.version,
+            contents.torn,
+            contents.damage,
+        )
+    return states
+
+
+def _told(progress: Callable[[int, int], None] | None) -> Told | None:
+    """What the core calls: the bar shows the share pruned too, others are told what is done."""
+    if progress is None or isinstance(progress, Progress):
+        return progress
+    return lambda done, total, _pruned: progress(done, total)
+
+
+def landscape(
+    runs: Run | Sequence[Run],
+    structure: Structure,
+    search: SearchResult,
+    lattice: Lattice | None = None,
+    *,
+    orders: tuple[str, str] | None = None,
+    threads: int | None = None,
+) -> Landscape:
+    """Score every pair of values of two orders by the search's own criterion.
+
+    Parameters
+    ----------
+    runs, structure, lattice
+        What was searched: an equation, or a stage under its order law.
+    search
+        What was found.
+    orders
+        Names of the two; by default the first two free orders that the lattice gives several values.
+    threads
+        See :func:`ftlm.search_orders`.
+
+    Returns
+    -------
+    Landscape
+
+    Raises
+    ------
+    ModelError
+        Fewer than two orders with several values, or a name that is none of them.
+    """
+    axes = {n: v for n, v in (lattice or Lattice()).values(structure).items() if len(v) > 1}
+    best = search.orders
+    names = orders or tuple(list(axes)[:2])
+    if len(names) != 2 or names[0] == names[1] or any(n not in axes for n in names):
+        free = ", ".join(axes) or "none"
+        raise ModelError(f"a landscape needs two different orders with several values each; this lattice has {free}")
+    x, y = (np.array(axes[n]) for n in names)
+    fixed = structure.with_orders({n: v for n, v in best.items() if n not in names})
+    table = search_orders(
+        runs,
+        fixed,
+        Lattice(orders={names[0]: x.tolist(), names[1]: y.tolist()}),
+        m=search.m,
+        keep=x.size * y.size,
+        threads=threads,
+        **search.settings,
+    ).table
+    scores = np.full((y.size, x.size), np.inf)
+    columns = np.array([r.orders[names[0]] for r in table])
+    rows = np.array([r.orders[names[1]] for r in table])
+    values = np.array([r.score for r in table])
+    scores[np.abs(y[:, None] - rows).argmin(axis=0), np.abs(x[:, None] - columns).argmin(axis=0)] = values
+    return Landscape((names[0], names[1]), x, y, scores)
+
+
+#: Every so manieth value of each order is tried, the coarsest lattices first.
+COARSER = (16, 12, 10, 8, 6, 5, 4, 3, 2)
+#: What is tried has at most this share of the candidates; enough is known once it takes so long [s].
+SHARE, ENOUGH = 1 / 12, 0.3
+#: Time grows as candidates to a power between these: of finer lattices more is excluded.
+GROWTH = (0.7, 1.1)
+#: Searches came to between these multiples of what coarse lattices told of them.
+CAME_TO = (0.6, 4.0)
+#: Candidates from which on whole boxes of them may be excluded, which no coarse lattice shows, and the growth then.
+BOXED, IN_BOXES = 1 << 25, 0.5
+
+
+def announce(progress: object, jobs: Sequence[Job], store: Store | None = None) -> None:
+    """Say how long all of these searches take together, where somebody sees it; with a store, what is left of them."""
+    if not isinstance(progress, Progress) or progress.quiet:
+        return
+    least = most = 0.0
+    for number, job in enumerate(jobs):
+        left = 1.0 if store is None else _left(job, store, number)
+        low, high = expected_seconds(job) if left > 0 else (0.0, 0.0)
+        least, most = least + left * low, most + left * high
+    progress.expect("the search", least, most)
+
+
+def expected_seconds(job: Job, clock: Callable[[], float] = time.perf_counter) -> tuple[float, float]:
+    """Least and most time that a search is expected to take here [s]; both 0 where its lattice is too small to tell.
+
+    Takes up to a tenth of the search or half a second, whichever is less.
+    """
+    whole = _candidates(job)
+    tried: list[tuple[float, float]] = []
+    for every in COARSER:
+        part = replace(job, values={name: axis[::every] for name, axis in job.values.items()}, progress=None)
+        try:
+            count = _candidates(part)
+            if tried and count <= tried[-1][0]:
+                continue
+            if count > SHARE * whole:
+                break
+            begun = clock()
+            (part.stage_work() if job.structure.has_order_law else part.equation_work()).search(None)
+        except FtlmError:
+            # So coarse a lattice may have no candidate, or none with a finite score.
+            continue
+        tried.append((count, clock() - begun))
+        if tried[-1][1] >= ENOUGH:
+            break
+    if not tried:
+        return 0.0, 0.0
+    (count, took), power = tried[-1], GROWTH[1]
+    if len(tried) > 1 and tried[-2][1] > 0:
+        power = math.log(max(took / tried[-2][1], 1e-9)) / math.log(count / tried[-2][0])
+        power = min(max(power, GROWTH[0]), GROWTH[1])
+    grown = took * (whole / count) ** power
+    boxed = grown if whole < BOXED else took * (BOXED / count) ** power * (whole / BOXED) ** IN_BOXES
+    return CAME_TO[0] * boxed, CAME_TO[1] * grown
+
+
+def _candidates(job: Job) -> float:
+    """How many candidates a search has; under an order law, points of the lattice."""
+    if job.structure.has_order_law:
+        return float(math.prod(len(axis) for axis in job.values.values()))
+    return float(job.equation_work().plan()[0])
+
+
+def _left(job: Job, store: Store, number: int) -> float:
+    """The share of a search that a store does not hold."""
+    section = store.contents.sections[number]
+    if job.structure.has_order_law:
+        return 0.0 if section.joined is not None else 1.0
+    return 1.0 - min(section.dealt / _candidates(job), 1.0)

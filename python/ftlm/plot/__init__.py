@@ -1,0 +1,73 @@
+"""Figures for papers as matplotlib objects (``ax=`` in every function), and charts of reports as SVG (``svg_…``)."""
+
+from ftlm.estimation.cost_surface import correlated_orders
+from ftlm.estimation.cost_surface import output_error_landscape as svg_output_error_landscape
+from ftlm.estimation.linear import trace_chart as svg_trace_chart
+from ftlm.order_search.search import landscape as svg_landscape
+from ftlm.plot.comparison_charts import compared_bars as svg_compared_bars
+from ftlm.plot.comparison_charts import comparison_charts as svg_comparison_charts
+from ftlm.plot.comparison_charts import error_chart as svg_error_chart
+from ftlm.plot.comparison_charts import input_charts as svg_input_charts
+from ftlm.plot.comparison_charts import residual_charts as svg_residual_charts
+from ftlm.plot.comparison_charts import residual_series as svg_residual_series
+from ftlm.plot.matplotlib_figures import (
+    bode,
+    correlation,
+    design,
+    fit,
+    impulse,
+    landscape,
+    models,
+    nyquist,
+    poles,
+    residual_series,
+    residuals,
+    response,
+    run,
+    step,
+)
+from ftlm.plot.model_charts import bode_charts as svg_bode_charts
+from ftlm.plot.model_charts import pole_charts as svg_pole_charts
+from ftlm.plot.model_charts import response_charts as svg_response_charts
+from ftlm.svg.bar_chart import bar_chart as svg_bar_chart
+from ftlm.svg.bar_chart import histogram as svg_histogram
+from ftlm.svg.complex_plane import plane_chart as svg_plane_chart
+from ftlm.svg.heat_map import correlation_map as svg_correlation_map
+from ftlm.svg.heat_map import heat_map as svg_heat_map
+from ftlm.svg.line_chart import line_chart as svg_line_chart
+
+__all__ = [
+    "bode",
+    "correlated_orders",
+    "correlation",
+    "design",
+    "fit",
+    "impulse",
+    "landscape",
+    "models",
+    "nyquist",
+    "poles",
+    "residual_series",
+    "residuals",
+    "response",
+    "run",
+    "step",
+    "svg_bar_chart",
+    "svg_bode_charts",
+    "svg_compared_bars",
+    "svg_comparison_charts",
+    "svg_correlation_map",
+    "svg_error_chart",
+    "svg_heat_map",
+    "svg_histogram",
+    "svg_input_charts",
+    "svg_landscape",
+    "svg_line_chart",
+    "svg_output_error_landscape",
+    "svg_plane_chart",
+    "svg_pole_charts",
+    "svg_residual_charts",
+    "svg_residual_series",
+    "svg_response_charts",
+    "svg_trace_chart",
+]

@@ -1,0 +1,286 @@
+"""Comparisons and residual tests as charts."""
+
+from __future__ import annotations
+
+from collections.abc import Mapping, Sequence
+
+import numpy as np
+
+from ftlm.data.run import Measured, Run
+from ftlm.errors import DataError
+from ftlm.svg.bar_chart import bar_chart, histogram
+from ftlm.svg.figure import POINTS, SMALL, Figure, Figures
+from ftlm.svg.line_chart import line_chart
+from ftlm.utils.formatting import number, symbol
+from ftlm.utils.validation import Floats
+from ftlm.validation.comparison import Comparison
+from ftlm.validation.residual_tests import CorrelationTest, Residuals
+
+
+def pulse_times(comparison: Comparison, run: int = 0) -> Floats:
+    """Return when each value of a run of a comparison holds [s]: its instants, or the middle of every block pulse."""
+    if comparison.times:
+        return comparison.times[run]
+    return np.asarray((np.arange(comparison.m) + 0.5) * comparison.step[run], dtype=np.float64)
+
+
+def comparison_charts(
+    comparison: Comparison, *, units: Mapping[str, str] | None = None, label: str = "", points: int = POINTS
+) -> list[Figure]:
+    """Measured and simulated output, a chart for every output of every run.
+
+    Parameters
+    ----------
+    comparison
+        From :func:`ftlm.compare` or an identification.
+    units
+        Units of the outputs.
+    label
+        What the data were to the model, such as "estimation".
+    points
+        Most points of a line.
+    """
+    return [
+        line_chart(
+            pulse_times(comparison, k),
+            [("measured", comparison.measured[name][k]), ("simulated", comparison.simulated[name][k])],
+            title=f"{symbol(name)}, {f'{label}: ' if label else ''}{run}",
+            x_label="time [s]",
+            y_label=with_unit(symbol(name), units, name),
+            points=points,
+            slider=True,
+            caption=f"Free run: fit {number(figures.fit)}\u00a0%, NR {number(figures.nr)}.",
+        )
+        for k, (run, _, output_error) in enumerate(comparison.per_run)
+        for name, figures in output_error.items()
+    ]
+
+
+def input_charts(runs: Sequence[Run], signals: Sequence[str], *, points: int = POINTS) -> list[Figure]:
+    """Inputs of every run, to stand below its outputs.
+
+    Parameters
+    ----------
+    runs
+        The runs.
+    signals
+        Which inputs, as far as a run has them.
+    points
+        Most points of a line.
+    """
+    return [
+        line_chart(
+            run.time,
+            [(f"input {symbol(name)}", run[name])],
+            x_label="time [s]",
+            title=f"Input {symbol(name)}, {run.name}",
+            y_label=with_unit(symbol(name), run.units, name),
+            points=points,
+            height=180,
+        )
+        for run in runs
+        for name in signals
+        if name in run.inputs
+    ]
+
+
+def residual_series(
+    comparison: Comparison, *, units: Mapping[str, str] | None = None, label: str = "", points: int = POINTS
+) -> list[Figure]:
+    """Residuals of the free run over time and how often each size occurs, for every output of every run.
+
+    Parameters
+    ----------
+    comparison, units, label, points
+        See :func:`comparison_charts`.
+    """
+    figures = []
+    suffix = f", {label}" if label else ""
+    for k, (run, _, _) in enumerate(comparison.per_run):
+        for name in comparison.output_error:
+            missed = comparison.measured[name][k] - comparison.simulated[name][k]
+            what = f"Residual of {symbol(name)}{suffix}, {run}"
+            axis = with_unit(f"residual of {symbol(name)}", units, name)
+            figures.append(
+                line_chart(
+                    pulse_times(comparison, k),
+                    [("", missed)],
+                    title=f"{what}: over time",
+                    x_label="time [s]",
+                    y_label=axis,
+                    points=points,
+                    width=SMALL,
+                    height=190,
+                )
+            )
+            if np.sum(np.isfinite(missed)) >= 2:
+                words = "Line: the normal curve of the same mean and deviation."
+                figures.append(histogram(missed, title=f"{what}: how often", x_label=axis, caption=words))
+    return figures
+
+
+def compared_bars(
+    compared: Sequence[tuple[str, Sequence[tuple[str, Comparison]]]], *, title: str = "Fit of the free run"
+) -> list[Figure]:
+    """Fits of several models side by side, a chart for every output.
+
+    Parameters
+    ----------
+    compared
+        (name of the model, its comparisons as (what the data were to it, comparison)), such as
+        ``("integer", [("estimation", a), ("validation", b)])``; the same kinds of data for every model.
+    title
+        What the charts are called.
+
+    Raises
+    ------
+    DataError
+        No model, or models with other outputs or data than the first.
+    """
+    if not compared:
+        raise DataError("bars need at least one model; give (name, comparisons) pairs")
+    first, kinds = compared[0], [kind for kind, _ in compared[0][1]]
+    outputs = list(first[1][0][1].output_error) if first[1] else []
+    for name, parts in compared:
+        if [kind for kind, _ in parts] != kinds or any(list(c.output_error) != outputs for _, c in parts):
+            raise DataError(f"model {name!r} has other outputs or data than {first[0]!r}; compare like with like")
+    return [
+        bar_chart(
+            [name for name, _ in compared],
+            [(kind, [parts[i][1].output_error[o].fit for _, parts in compared]) for i, kind in enumerate(kinds)],
+            title=f"{title} of {symbol(o)}",
+            x_label="fit [%]",
+            low=0.0,
+            high=100.0,
+            caption="100 % is no error; a bar ends at 0, its number says how far below it is.",
+        )
+        for o in outputs
+    ]
+
+
+def error_chart(
+    compared: Sequence[tuple[str, Comparison]],
+    output: str,
+    *,
+    run: int = 0,
+    title: str = "",
+    units: Mapping[str, str] | None = None,
+    points: int = POINTS,
+) -> Figure:
+    """Absolute error of the free runs of several models on one run, as in the paper's Figure 4(a).
+
+    Parameters
+    ----------
+    compared
+        (name of the model, its comparison); all on the same run with the same m.
+    output
+        Whose error.
+    run
+        Index of the run in the comparisons.
+    title
+        Default: says what is shown.
+    units
+        Units of the outputs.
+    points
+        Most points of a line.
+    """
+    if not compared:
+        raise DataError("an error chart needs at least one comparison; give (name, comparison) pairs")
+    errors = [(name, np.abs(c.measured[output][run] - c.simulated[output][run])) for name, c in compared]
+    return line_chart(
+        pulse_times(compared[0][1], run),
+        errors,
+        title=title or f"{symbol(output)}: absolute error of the free run",
+        x_label="time [s]",
+        y_label=with_unit("|error|", units, output),
+        points=points,
+    )
+
+
+def with_unit(text: str, units: Mapping[str, str] | None, name: str) -> str:
+    """Return the label of an axis with the unit of a signal, where it is known."""
+    unit = (units or {}).get(name, "")
+    return f"{text} [{unit}]" if unit else text
+
+
+def residual_charts(tests: Residuals, *, label: str = "") -> list[Figure]:
+    """Autocorrelation and cross-correlations of the residuals of every output, with their 99 % bands.
+
+    Parameters
+    ----------
+    tests
+        From :func:`ftlm.resid`.
+    label
+        What the data were to the model, such as "validation".
+    """
+    figures = []
+    suffix = f", {label}" if label else ""
+    for output, judged in tests.outputs.items():
+        drawn = [("itself", judged.whiteness), *judged.inputs.items()]
+        for name, test in drawn:
+            own = name == "itself"
+            # Lag 0 of an autocorrelation is 1 and says nothing.
+            keep = test.lags != 0 if own else np.ones(test.lags.size, dtype=bool)
+            lags, values = test.lags[keep].astype(np.float64), test.values[keep]
+            band = np.full(lags.size, test.band)
+            other = "itself" if own else symbol(name)
+            figures.append(
+                line_chart(
+                    lags,
+                    [("", values)],
+                    stems=True,
+                    width=SMALL,
+                    height=190,
+                    bands=[(-band, band)],
+                    title=f"Residual of {symbol(output)} with {other}{suffix}",
+                    x_label="lag [samples]",
+                    y_label="correlation",
+                    caption=_residual_caption(test, values, "" if own else symbol(name)),
+                )
+            )
+    return figures
+
+
+def _residual_caption(test: CorrelationTest, drawn: Floats, signal: str) -> str:
+    """What the bars of one test show, and what they were judged by; no signal stands for the residual itself."""
+    if not test.decided:
+        why = f"{signal} does not move" if np.isnan(test.limit) else f"its limit is {number(test.limit)}, above 1"
+        return f"Whether the residual follows {signal} is undecided: {why}."
+    if not np.isfinite(test.statistic):
+        return "The residual is not finite, so there are no correlations."
+    outside = int(np.sum(np.abs(drawn) > test.band))
+    bars = f"Shade: 99 % band of one bar; {outside} of {drawn.size} bars leave{'s' if outside == 1 else ''} it."
+    if signal:
+        word = "could be independent of" if test.passed else "is not independent of"
+        judged = f"largest bar at lags from 0 on {number(test.statistic)}, limit {number(test.limit)}"
+        return f"{bars} The residual {word} earlier {signal}: {judged} (99 %, both through the whitening filter)."
+    word = "could be" if test.passed else "is not"
+    judged = f"Ljung-Box sum {number(test.statistic)}, limit {number(test.limit)}"
+    return f"{bars} The residual {word} white noise: {judged} (99 %)."
+
+
+def picture(run: Measured, *signals: str) -> Figures:
+    """Charts of a run; see :meth:`ftlm.Run.plot`."""
+    unknown = [name for name in signals if name not in run]
+    if unknown:
+        raise DataError(f"signal {unknown[0]!r} is not in run {run.name!r}; its signals are {', '.join(run.signals)}")
+    charts = []
+    for name in signals or (*run.outputs, *run.inputs):
+        unit = run.units[name]
+        role = "input" if name in run.inputs else "output"
+        # A command is held until the next row: a straight line to it was never sent.
+        times, values = run.time, run[name]
+        if run.intersample.get(name) == "zoh":
+            times, values = times.repeat(2)[1:], values.repeat(2)[:-1]
+        charts.append(
+            line_chart(
+                times,
+                [("", values)],
+                title=f"{symbol(name)}, {role} of {run.name}",
+                x_label="time [s]",
+                y_label=f"{symbol(name)} [{unit}]" if unit else symbol(name),
+                points=POINTS,
+                height=240 if role == "output" else 180,
+            )
+        )
+    return Figures(charts)

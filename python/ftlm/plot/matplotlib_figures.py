@@ -1,0 +1,790 @@
+"""Figures and axes of matplotlib, made without pyplot so that nothing is kept or shown."""
+
+from __future__ import annotations
+
+import importlib
+import io
+import math
+from collections.abc import Mapping, Sequence
+from typing import Any
+
+import numpy as np
+from numpy.typing import ArrayLike
+
+from ftlm.data.frequency_data import FrequencyData
+from ftlm.data.run import Run
+from ftlm.errors import ModelError
+from ftlm.estimation.cost_surface import output_error_landscape
+from ftlm.estimation.frequency_result import (
+    DECIBEL,
+    FrequencyIdentification,
+    FrequencyValidation,
+    curve_of,
+    grid_of,
+    placed,
+)
+from ftlm.estimation.result import Identification
+from ftlm.experiment_design.result import DesignedInput
+from ftlm.model.model import Model
+from ftlm.order_search.search import landscape as scores_of
+from ftlm.plot.comparison_charts import pulse_times, with_unit
+from ftlm.plot.model_charts import Answer, bode_curves, pole_points, response_frequencies
+from ftlm.svg.heat_map import Landscape
+from ftlm.svg.line_chart import LINES
+from ftlm.utils.formatting import symbol
+from ftlm.utils.statistics import NORMAL_95
+from ftlm.validation.comparison import Comparison
+from ftlm.validation.residual_tests import Residuals
+
+#: Width of a figure, and height of one row of axes [inches]: a journal's double column.
+WIDTH, ROW = 7.0, 2.2
+#: Resolution in a notebook.
+NOTEBOOK_DPI = 110
+
+
+def figure_of(rows: int, columns: int = 1, *, row: float = ROW, **options: Any) -> tuple[Any, Any]:
+    """A figure with a grid of axes, made without pyplot so that nothing is kept or shown."""
+    try:
+        module = importlib.import_module("matplotlib.figure")
+    except ImportError:
+        raise ModelError("matplotlib is not installed; pip install 'ftlm[plot]'") from None
+
+    class Drawing(module.Figure):  # type: ignore[misc, name-defined]
+        """A figure that a notebook shows although pyplot does not know it."""
+
+        def _repr_png_(self) -> bytes:
+            data = io.BytesIO()
+            self.savefig(data, format="png", dpi=NOTEBOOK_DPI)
+            return data.getvalue()
+
+    figure = Drawing(figsize=(WIDTH, max(row * rows, 2.0)), layout="constrained")
+    return figure, figure.subplots(rows, columns, squeeze=False, **options)
+
+
+def axes_for(ax: Any, rows: int, columns: int = 1, **options: Any) -> tuple[Any, Any]:
+    """The axes that were given, or those of a new figure: (figure, grid of rows by columns)."""
+    if ax is None:
+        return figure_of(rows, columns, **options)
+    given = np.atleast_1d(np.asarray(ax, dtype=object)).ravel()
+    strange = [type(a).__name__ for a in given if not hasattr(a, "plot") or not hasattr(a, "figure")]
+    if strange:
+        raise ModelError(f"ax holds {strange[0]}, which is no matplotlib axes; give what subplots returns")
+    if given.size != rows * columns:
+        raise ModelError(
+            f"this picture has {rows * columns} axes ({rows} by {columns}), and ax has {given.size}; give as many, "
+            f"such as subplots({rows}, {columns})[1], or leave ax out"
+        )
+    return given[0].figure, given.reshape(rows, columns)
+
+
+def plain(text: str) -> str:
+    """Text that matplotlib does not take for mathematics, whatever a name holds."""
+    return text.replace("$", r"\$")
+
+
+def label_of(name: str, units: Mapping[str, str]) -> str:
+    """A signal's name with its unit."""
+    return plain(with_unit(symbol(name), units, name))
+
+
+#: A fit has its error beneath it at this share of its height.
+BENEATH = 0.4
+
+
+def fit(
+    result: Identification | Model | Comparison,
+    runs: Run | Sequence[Run] | None = None,
+    *,
+    inputs: bool = False,
+    ax: Any = None,
+) -> Any:
+    """Measured and simulated outputs, the residual beneath each.
+
+    Parameters
+    ----------
+    result
+        A comparison; an identification (on its own runs unless others are given); or a model, which needs runs.
+    runs
+        Runs to compare with.
+    inputs
+        Draw the inputs of each run below its outputs.
+    ax
+        Axes to draw into, as many as the figure would have; by default those of a new figure.
+
+    Returns
+    -------
+    matplotlib.figure.Figure
+        Two axes for every output of every run, in SI units, and one for every input that was asked for.
+
+    Raises
+    ------
+    ModelError
+        A model without runs, inputs without runs, something that is no result, axes that are none or too many or
+        few, or no matplotlib.
+    DataError
+        Runs that do not fit the model.
+    """
+    units: Mapping[str, str] = {}
+    if isinstance(result, Comparison):
+        comparison = result
+    elif not isinstance(result, (Identification, Model)):
+        raise ModelError(
+            f"result is {type(result).__name__}; give an identification, a model with runs or a comparison"
+        )
+    else:
+        model = result.model if isinstance(result, Identification) else result
+        units = model.units
+        if runs is not None:
+            comparison = model.compare(runs)
+        elif isinstance(result, Identification):
+            comparison = result.comparison
+        else:
+            raise ModelError("a model alone has nothing to be compared with; give runs")
+    drawn: list[tuple[int, str, str]] = []
+    shown = _runs_of(result, runs) if inputs else []
+    for k in range(len(comparison.per_run)):
+        drawn += [(k, name, kind) for name in comparison.output_error for kind in ("fit", "residual")]
+        drawn += [(k, name, "input") for name in (shown[k].inputs if inputs else ())]
+    heights = [BENEATH if kind == "residual" else 1.0 if kind == "fit" else 0.7 for _, _, kind in drawn]
+    figure, axes = axes_for(ax, len(drawn), row=ROW * 0.75, height_ratios=heights)
+    upper = None
+    for axis, (k, name, kind) in zip(axes[:, 0], drawn, strict=True):
+        if kind == "input":
+            _line_of(axis, shown[k], name)
+            continue
+        run, _, figures = comparison.per_run[k]
+        time = pulse_times(comparison, k)
+        measured, simulated = comparison.measured[name][k], comparison.simulated[name][k]
+        if kind == "fit":
+            upper = axis
+            label = f"simulated, fit {figures[name].fit:.4g} %"
+            axis.plot(time, measured, color=LINES[0][0], linewidth=2.2, label="measured")
+            axis.plot(time, simulated, color=LINES[1][0], linewidth=1.0, label=label)
+            # A run that runs away would flatten what it is to be compared with.
+            height = float(np.ptp(measured)) or 1.0
+            low, high = float(np.min(measured)) - 0.5 * height, float(np.max(measured)) + 0.5 * height
+            axis.set(ylim=(low, high), ylabel=label_of(name, units))
+            axis.set_title(plain(run), fontsize="medium", loc="left")
+            axis.legend(loc="upper right", fontsize="small", ncols=2)
+            axis.tick_params(labelbottom=False)
+            continue
+        if ax is None:
+            axis.sharex(upper)
+        axis.plot(time, measured - simulated, color=LINES[2][0], linewidth=0.7)
+        axis.set(ylabel="residual", xlabel="time [s]")
+    return figure
+
+
+def _runs_of(result: Identification | Model | Comparison, runs: Run | Sequence[Run] | None) -> list[Run]:
+    """The runs of a comparison, for their inputs."""
+    if runs is not None:
+        return [runs] if isinstance(runs, Run) else list(runs)
+    task = result.task if isinstance(result, Identification) else None
+    if task is None:
+        raise ModelError("inputs=True needs the runs; give them")
+    return list(task.runs)
+
+
+def _line_of(axis: Any, run: Run, name: str) -> None:
+    """One signal of a run: outputs as they were read, commands held between rows."""
+    held = run.intersample.get(name) == "zoh"
+    axis.plot(
+        run.time,
+        run[name],
+        color=LINES[2 if name in run.inputs else 0][0],
+        linewidth=1.0,
+        drawstyle="steps-post" if held else "default",
+    )
+    axis.set(ylabel=label_of(name, run.units), xlabel="time [s]")
+    axis.grid(visible=True, alpha=0.3)
+
+
+def run(run: Run, *, ax: Any = None) -> Any:
+    """A run as it was recorded: its outputs, and its inputs below them.
+
+    Parameters
+    ----------
+    run
+        The run.
+    ax
+        Axes to draw into, as many as the figure would have; by default those of a new figure.
+
+    Returns
+    -------
+    matplotlib.figure.Figure
+        One axes for every signal, in SI units.
+
+    Raises
+    ------
+    ModelError
+        Something that is no run, axes that are none or too many or few, or no matplotlib.
+    """
+    if not isinstance(run, Run):
+        raise ModelError(f"run is {type(run).__name__}; give a run, such as ftlm.load returns")
+    names = [*run.outputs, *run.inputs]
+    figure, axes = axes_for(ax, len(names), row=ROW * 0.6)
+    for axis, name in zip(axes[:, 0], names, strict=True):
+        _line_of(axis, run, name)
+    axes[0, 0].set_title(plain(run.name), fontsize="medium", loc="left")
+    return figure
+
+
+def residuals(tests: Residuals | Identification, *, ax: Any = None) -> Any:
+    """Correlations of the residuals with themselves and with every input, with their 99 % bands.
+
+    Parameters
+    ----------
+    tests
+        From :func:`ftlm.resid`, or an identification (on its own runs).
+    ax
+        Axes to draw into, as many as the figure would have; by default those of a new figure.
+
+    Returns
+    -------
+    matplotlib.figure.Figure
+        A row for every output.
+
+    Raises
+    ------
+    ModelError
+        An identification whose runs were too short for tests, something that is no result, or no matplotlib.
+    """
+    found = tests.residuals if isinstance(tests, Identification) else tests
+    if found is None:
+        raise ModelError("the runs were too short for residual tests, so there is nothing to draw")
+    if not isinstance(found, Residuals):
+        raise ModelError(f"tests is {type(found).__name__}; give what resid returns, or an identification")
+    drawn = {output: [("itself", part.whiteness), *part.inputs.items()] for output, part in found.outputs.items()}
+    columns = max(map(len, drawn.values()))
+    figure, axes = axes_for(ax, len(drawn), columns)
+    for row, (output, correlations) in zip(axes, drawn.items(), strict=True):
+        for axis, (name, test) in zip(row, correlations, strict=False):
+            keep = test.lags != 0 if name == "itself" else np.ones(test.lags.size, dtype=bool)
+            axis.axhspan(-test.band, test.band, color=LINES[1][0], alpha=0.2, linewidth=0)
+            axis.vlines(test.lags[keep], 0, test.values[keep], color=LINES[1][0], linewidth=1.2)
+            axis.axhline(0, color=LINES[0][0], linewidth=0.6)
+            other = name if name == "itself" else symbol(name)
+            axis.set_title(plain(f"{symbol(output)} with {other}: {test.verdict}"), fontsize="small")
+            axis.set_xlabel("lag [samples]")
+        row[0].set_ylabel("correlation")
+        for axis in row[len(correlations) :]:
+            axis.set_axis_off()
+    return figure
+
+
+def landscape(result: Identification | Landscape, output: str | None = None, *, ax: Any = None) -> Any:
+    """Score of an order search, or cost of a joint fit, over two of its orders.
+
+    Parameters
+    ----------
+    result
+        An identification by output error or with an order search, or a landscape (``ftlm.report.landscape``,
+        ``ftlm.report.output_error_landscape``), which may be of any two orders.
+    output
+        Which search of an identification; by default its first.
+    ax
+        Axes to draw into, as many as the figure would have; by default those of a new figure.
+
+    Returns
+    -------
+    matplotlib.figure.Figure
+
+    Raises
+    ------
+    ModelError
+        An identification without a search, or without that one; fewer than two free orders; no matplotlib.
+    """
+    found: Landscape | Identification | None = result
+    if isinstance(result, Identification) and result.joint is not None:
+        found = output_error_landscape(result)
+        if found is None:
+            raise ModelError("this fit has no two free orders with standard errors, so it has no landscape")
+    elif isinstance(result, Identification):
+        if not result.searches or result.task is None:
+            raise ModelError("this identification searched no lattice, so it has no landscape")
+        name = next(iter(result.searches)) if output is None else output
+        if name not in result.searches:
+            raise ModelError(f"there is no search {name!r}; there are {', '.join(result.searches)}")
+        part = result.task.structure if name == "stage" else result.task.structure.equation(name)
+        found = scores_of(result.task.runs, part, result.searches[name], result.task.lattice_of(part))
+    if not isinstance(found, Landscape):
+        raise ModelError(f"result is {type(found).__name__}; give an identification or a landscape")
+    figure, axes = axes_for(ax, 1, row=3.2)
+    axis = axes[0, 0]
+    scores = np.where(np.isfinite(found.scores) & (found.scores > 0), found.scores, np.nan)
+    if np.all(np.isnan(scores)):
+        raise ModelError("no candidate of this lattice has a finite score; widen it")
+    norm = importlib.import_module("matplotlib.colors").LogNorm()
+    drawn = axis.pcolormesh(found.x, found.y, scores, norm=norm, cmap="viridis", shading="nearest")
+    axis.set_facecolor("0.8")
+    row, column = divmod(int(np.nanargmin(scores)), scores.shape[1])
+    ring = {"markersize": 9, "fillstyle": "none", "color": LINES[1][0], "markeredgewidth": 2}
+    axis.plot(found.x[column], found.y[row], "o", **ring)
+    xlabel, ylabel = (plain(f"order {symbol(name)}") for name in found.names)
+    axis.set(xlabel=xlabel, ylabel=ylabel)
+    figure.colorbar(drawn, ax=axis, label=f"{found.score} (grey: no candidate, or diverged)")
+    return figure
+
+
+def bode(model: Model | Identification, w: ArrayLike | None = None, *, ax: Any = None) -> Any:
+    """Gain and phase of every output from every input, with 95 % bands where the model has a covariance.
+
+    Parameters
+    ----------
+    model
+        A model or an identification.
+    w
+        Frequencies [rad/s]; by default around the model's own.
+    ax
+        Axes to draw into, as many as the figure would have; by default those of a new figure.
+
+    Returns
+    -------
+    matplotlib.figure.Figure
+        Gain on the left, phase on the right, a row for every pair.
+
+    Raises
+    ------
+    ModelError
+        Something that is no model, or no matplotlib.
+    DataError
+        Frequencies that are not finite numbers from 0.
+    """
+    found = model.model if isinstance(model, Identification) else model
+    if not isinstance(found, Model):
+        raise ModelError(f"model is {type(found).__name__}; give a model or an identification")
+    omega = response_frequencies(found) if w is None else np.asarray(w, dtype=np.float64)
+    curves = bode_curves(found, omega)
+    figure, axes = axes_for(ax, max(len(curves), 1), 2)
+    for i, curve in enumerate(curves):
+        sides = ((curve.gain, curve.gain_spread, "gain [dB]"), (curve.phase, curve.phase_spread, "phase [degrees]"))
+        for axis, (values, spread, label) in zip(axes[i], sides, strict=True):
+            axis.semilogx(omega, values, color=LINES[1][0], linewidth=1.2)
+            if spread is not None:
+                axis.fill_between(omega, values - spread, values + spread, color=LINES[1][0], alpha=0.25, linewidth=0)
+            axis.set(ylabel=label, xlabel="frequency [rad/s]")
+            axis.grid(visible=True, alpha=0.3)
+            axis.set_title(plain(f"{symbol(curve.output)} from {symbol(curve.input)}"), fontsize="small")
+    return figure
+
+
+def _model_of(model: Model | Identification) -> Model:
+    """The model that was meant; refuses what is none."""
+    found = model.model if isinstance(model, Identification) else model
+    if not isinstance(found, Model):
+        raise ModelError(f"model is {type(model).__name__}; give a model or an identification")
+    return found
+
+
+def poles(model: Model | Identification, *, ax: Any = None) -> Any:
+    """Poles in the plane of s^q with the sector in which they make a model grow; s itself for whole orders.
+
+    Parameters
+    ----------
+    model
+        A model or an identification.
+    ax
+        Axes to draw into, as many as the figure would have; by default those of a new figure.
+
+    Returns
+    -------
+    matplotlib.figure.Figure
+
+    Raises
+    ------
+    ModelError
+        Something that is no model, one with friction or without poles, axes that are none, or no matplotlib.
+    """
+    found = _model_of(model)
+    q, points = pole_points(found)
+    if not points.size:
+        raise ModelError("this model has no poles to draw: it has friction, or it only integrates")
+    figure, axes = axes_for(ax, 1, row=4.0)
+    axis = axes[0, 0]
+    reach = 1.18 * float(np.max(np.abs(points)))
+    angle = np.linspace(-q * np.pi / 2, q * np.pi / 2, 61)
+    corner = 4 * reach * np.concatenate([[0.0], np.exp(1j * angle)])
+    axis.fill(corner.real, corner.imag, color=LINES[1][0], alpha=0.16, linewidth=0, label="not stable")
+    axis.plot(points.real, points.imag, "x", color=LINES[2][0], markersize=8, markeredgewidth=2)
+    plane = "s" if q == 1 else f"s^{{{q:.4g}}}"
+    axis.set(xlim=(-reach, reach), ylim=(-reach, reach), xlabel=f"real part of ${plane}$", ylabel="imaginary part")
+    axis.set_aspect("equal")
+    axis.axhline(0, color=LINES[0][0], linewidth=0.6)
+    axis.axvline(0, color=LINES[0][0], linewidth=0.6)
+    axis.grid(visible=True, alpha=0.3)
+    axis.legend(loc="upper left", fontsize="small")
+    return figure
+
+
+def step(model: Model | Identification, time: ArrayLike | None = None, *, ax: Any = None) -> Any:
+    """Answer to unit steps from rest, with its 95 % band where the model has a covariance.
+
+    Parameters
+    ----------
+    model
+        A model or an identification.
+    time
+        Regular instants from 0 [s]; by default until the model has settled.
+    ax
+        Axes to draw into, as many as the figure would have; by default those of a new figure.
+
+    Returns
+    -------
+    matplotlib.figure.Figure
+        A row for every output, a column for every input.
+
+    Raises
+    ------
+    ModelError
+        Something that is no model, one whose input saturates or has a dead zone, axes that are none, no matplotlib.
+    DataError
+        Instants that are not regular from 0.
+    """
+    return _answered(_model_of(model).step(time), ax)
+
+
+def impulse(model: Model | Identification, time: ArrayLike | None = None, *, ax: Any = None) -> Any:
+    """Answer to unit impulses, as the mean over each interval; else as :func:`step`."""
+    return _answered(_model_of(model).impulse(time), ax)
+
+
+def _answered(found: Answer, ax: Any) -> Any:
+    figure, axes = axes_for(ax, len(found.outputs), max(len(found.inputs), 1))
+    for i, output in enumerate(found.outputs):
+        for j, signal in enumerate(found.inputs):
+            axis, values = axes[i, j], found.values[i, j]
+            axis.plot(found.time, values, color=LINES[1][0], linewidth=1.2)
+            if found.deviation is not None:
+                half = NORMAL_95 * found.deviation[i, j]
+                axis.fill_between(found.time, values - half, values + half, color=LINES[1][0], alpha=0.25, linewidth=0)
+            axis.set(xlabel="time [s]", ylabel=label_of(output, found.units))
+            axis.set_title(plain(f"{found.kind} of {symbol(signal)}"), fontsize="small")
+            axis.grid(visible=True, alpha=0.3)
+    return figure
+
+
+def correlation(result: Identification, *, ax: Any = None) -> Any:
+    """Correlations of the estimates of a joint fit, with their numbers.
+
+    Parameters
+    ----------
+    result
+        An identification by output error.
+    ax
+        Axes to draw into, as many as the figure would have; by default those of a new figure.
+
+    Returns
+    -------
+    matplotlib.figure.Figure
+
+    Raises
+    ------
+    ModelError
+        Something that is no identification, one without a joint covariance, axes that are none, or no matplotlib.
+    """
+    if not isinstance(result, Identification):
+        raise ModelError(f"result is {type(result).__name__}; give an identification")
+    if result.joint is None:
+        raise ModelError(f"method {result.method!r} gives no joint covariance; identify by method='output-error'")
+    names, values = result.joint.names, result.joint.correlation
+    figure, axes = axes_for(ax, 1, row=4.0)
+    axis = axes[0, 0]
+    drawn = axis.imshow(values, vmin=-1, vmax=1, cmap="RdBu_r")
+    labels = [plain(symbol(n)) for n in names]
+    axis.set_xticks(range(len(names)), labels)
+    axis.set_yticks(range(len(names)), labels)
+    for i, j in np.ndindex(values.shape):
+        if i != j:
+            ink = "white" if abs(values[i, j]) > 0.6 else "black"
+            axis.text(j, i, f"{values[i, j]:.2f}", ha="center", va="center", fontsize="x-small", color=ink)
+    figure.colorbar(drawn, ax=axis, label="correlation")
+    return figure
+
+
+def residual_series(result: Identification | Comparison, *, ax: Any = None) -> Any:
+    """Residuals of the free run over time, and how often each size occurs.
+
+    Parameters
+    ----------
+    result
+        An identification (on its own runs) or a comparison.
+    ax
+        Axes to draw into, as many as the figure would have; by default those of a new figure.
+
+    Returns
+    -------
+    matplotlib.figure.Figure
+        Over time on the left, how often on the right, a row for every output of every run.
+
+    Raises
+    ------
+    ModelError
+        Something that is no result, axes that are none or too many or few, or no matplotlib.
+    """
+    comparison = result.comparison if isinstance(result, Identification) else result
+    if not isinstance(comparison, Comparison):
+        raise ModelError(f"result is {type(result).__name__}; give an identification or a comparison")
+    units = result.model.units if isinstance(result, Identification) else {}
+    pairs = [(k, name) for k in range(len(comparison.per_run)) for name in comparison.output_error]
+    figure, axes = axes_for(ax, len(pairs), 2, **({} if ax is not None else {"width_ratios": [2.0, 1.0]}))
+    for (left, right), (k, name) in zip(axes, pairs, strict=True):
+        missed = comparison.measured[name][k] - comparison.simulated[name][k]
+        there = missed[np.isfinite(missed)]
+        left.plot(pulse_times(comparison, k), missed, color=LINES[2][0], linewidth=0.7)
+        left.set(xlabel="time [s]", ylabel=label_of(name, units))
+        left.set_title(plain(f"residual, {comparison.per_run[k][0]}"), fontsize="small", loc="left")
+        right.hist(there, bins=31, color=LINES[2][0], alpha=0.7)
+        right.set(xlabel=label_of(name, units), ylabel="samples")
+        right.locator_params(axis="x", nbins=3)
+    return figure
+
+
+def models(compared: Mapping[str, Comparison], *, ax: Any = None) -> Any:
+    """Fits of the free runs of several models on the same runs, as bars.
+
+    Parameters
+    ----------
+    compared
+        Comparisons by the name of the model.
+    ax
+        Axes to draw into, as many as the figure would have; by default those of a new figure.
+
+    Returns
+    -------
+    matplotlib.figure.Figure
+        A bar for every model and output.
+
+    Raises
+    ------
+    ModelError
+        No model, something that is no comparison, models with other outputs, axes that are none, or no matplotlib.
+    """
+    if not isinstance(compared, Mapping) or not compared:
+        raise ModelError("bars need at least one model; give comparisons by name, such as {'integer': a, 'free': b}")
+    for name, comparison in compared.items():
+        if not isinstance(comparison, Comparison):
+            raise ModelError(f"{name!r} is {type(comparison).__name__}; give a comparison, such as compare returns")
+    outputs = list(next(iter(compared.values())).output_error)
+    for name, comparison in compared.items():
+        if list(comparison.output_error) != outputs:
+            raise ModelError(
+                f"{name!r} has the outputs {', '.join(comparison.output_error)}, the first {', '.join(outputs)}"
+            )
+    figure, axes = axes_for(ax, 1, row=max(ROW, 0.4 * len(compared) * len(outputs)))
+    axis, height = axes[0, 0], 0.8 / len(outputs)
+    for i, output in enumerate(outputs):
+        places = np.arange(len(compared)) + (i - (len(outputs) - 1) / 2) * height
+        fits = [c.output_error[output].fit for c in compared.values()]
+        bars = axis.barh(
+            places,
+            np.clip(np.nan_to_num(fits, nan=0.0), 0.0, 100.0),
+            height,
+            color=LINES[1 + i % 5][0],
+            label=plain(symbol(output)),
+        )
+        axis.bar_label(bars, [f"{v:.4g}" for v in fits], fontsize="small", padding=3)
+    axis.set_yticks(range(len(compared)), [plain(n) for n in compared])
+    axis.invert_yaxis()
+    axis.set(xlabel="fit of the free run [%]", xlim=(0, 112))
+    if len(outputs) > 1:
+        axis.legend(loc="lower right", fontsize="small")
+    return figure
+
+
+def design(result: DesignedInput, *, ax: Any = None) -> Any:
+    """A designed input, the answer it is predicted to have beside that to the square, limits and spectrum.
+
+    Parameters
+    ----------
+    result
+        What :func:`ftlm.design_input` returns.
+    ax
+        Axes to draw into, as many as the figure would have; by default those of a new figure.
+
+    Returns
+    -------
+    matplotlib.figure.Figure
+        One axes for every input, one for every output, and one for the spectrum.
+
+    Raises
+    ------
+    ModelError
+        Something that is no designed input, axes that are none or too many or few, or no matplotlib.
+    """
+    if not isinstance(result, DesignedInput):
+        raise ModelError(f"result is {type(result).__name__}; give what design_input returns")
+    run, square = result.run, result.reference
+    figure, axes = axes_for(ax, len(run.inputs) + len(run.outputs) + 1, row=1.9)
+    limits = {r.name: r.limit for r in result.reached}
+    time = run.step * np.arange(run.length)
+    for axis, name in zip(axes[:, 0], (*run.inputs, *run.outputs), strict=False):
+        held = {"drawstyle": "steps-post"} if name in run.inputs else {}
+        axis.plot(time, square[name], color=LINES[1][0], linewidth=0.9, label=square.name, **held)
+        axis.plot(time, run[name], color=LINES[0][0], linewidth=1.1, label="designed", **held)
+        if math.isfinite(limits[name]):
+            for side in (-1, 1):
+                axis.axhline(
+                    side * limits[name], color="0.5", linewidth=0.8, linestyle=":", label="limit" if side > 0 else None
+                )
+        axis.set(xlabel="time [s]", ylabel=label_of(name, run.units))
+        axis.grid(visible=True, alpha=0.3)
+    axes[0, 0].legend(fontsize="small", ncols=3, loc="lower right", bbox_to_anchor=(1.0, 1.0), frameon=False)
+    _draw_spectrum(axes[-1, 0], result)
+    return figure
+
+
+def _draw_spectrum(axis: Any, result: DesignedInput) -> None:
+    """Share of the power below each frequency: sums tell spectra with few lines from one another."""
+    rows = result.run.length - 1
+    frequencies = np.fft.rfftfreq(rows, result.step)
+    for shown, color, label in (
+        (result.reference, LINES[1][0], result.reference.name),
+        (result.run, LINES[0][0], "designed"),
+    ):
+        power = np.sum([np.abs(np.fft.rfft(shown[n][:rows])) ** 2 for n in shown.inputs], axis=0)
+        axis.plot(frequencies[1:], np.cumsum(power[1:]) / np.sum(power[1:]), color=color, linewidth=1.1, label=label)
+    order = np.argsort(result.spectrum.lines.frequencies)
+    best = np.cumsum(result.spectrum.power[order])
+    if best[-1] > 0:
+        axis.plot(
+            result.spectrum.lines.frequencies[order],
+            best / best[-1],
+            color=LINES[2][0],
+            linewidth=0.9,
+            linestyle="--",
+            label="best periodic",
+        )
+    lines = result.spectrum.lines.frequencies
+    axis.set(
+        xscale="log",
+        xlim=(float(lines.min()), float(lines.max())),
+        ylim=(-0.02, 1.02),
+        xlabel="frequency [Hz]",
+        ylabel="power below",
+    )
+    axis.grid(visible=True, alpha=0.3)
+    axis.legend(fontsize="small", loc="lower right")
+
+
+def response(
+    result: FrequencyIdentification | Model, data: FrequencyData | FrequencyValidation | None = None, *, ax: Any = None
+) -> Any:
+    """Gain and phase of measured responses with the model's curve and its 95 % band.
+
+    Parameters
+    ----------
+    result
+        What :func:`ftlm.identify_frequency` found, or a model.
+    data
+        Responses to draw; by default those of the fit. A model needs some.
+    ax
+        Axes to draw into, as many as the figure would have; by default those of a new figure.
+
+    Returns
+    -------
+    matplotlib.figure.Figure
+        Gain on the left, phase on the right, a row for every record.
+
+    Raises
+    ------
+    ModelError
+        Something that is no result, a model without data, axes that are none or too many or few, or no matplotlib.
+    DataError
+        Data of signals that the model does not have.
+    """
+    model, records = _given(result, data)
+    figure, axes = axes_for(ax, len(records), 2)
+    for (left, right), record in zip(axes, records, strict=True):
+        omega, _ = grid_of(record)
+        ours, wide, turned = curve_of(model, record, omega)
+        phase = np.degrees(np.unwrap(np.angle(ours)))
+        order = np.argsort(record.frequency, kind="stable")
+        near = phase[np.searchsorted(omega, record.frequency[order])]
+        angles = record.phase[order]
+        angles = angles - 360.0 * np.round(np.median(angles - near) / 360.0)
+        gain = DECIBEL * np.log(np.abs(ours))
+        unit = f" of {record.unit}" if record.unit else ""
+        for axis, curve, dots, half, label in (
+            (left, gain, record.gain[order], wide, f"gain [dB{unit}]"),
+            (right, phase, angles, turned, "phase [degrees]"),
+        ):
+            axis.semilogx(
+                record.frequency[order], dots, "o", fillstyle="none", markersize=4, color=LINES[0][0], label="measured"
+            )
+            axis.semilogx(omega, curve, color=LINES[1][0], linewidth=1.2, label="model")
+            if half is not None:
+                axis.fill_between(omega, curve - half, curve + half, color=LINES[1][0], alpha=0.25, linewidth=0)
+            axis.set(xlabel="frequency [rad/s]", ylabel=label)
+            axis.set_title(plain(f"{symbol(record.output)} from {symbol(record.input)}"), fontsize="small")
+            axis.grid(visible=True, alpha=0.3)
+        left.legend(fontsize="small")
+    return figure
+
+
+def nyquist(
+    result: FrequencyIdentification | Model, data: FrequencyData | FrequencyValidation | None = None, *, ax: Any = None
+) -> Any:
+    """Measured responses in the complex plane with the model's curve, one unit in both directions.
+
+    Parameters
+    ----------
+    result, data, ax
+        See :func:`response`. An impedance has its negative imaginary part upwards.
+
+    Returns
+    -------
+    matplotlib.figure.Figure
+        One axes for every record.
+
+    Raises
+    ------
+    ModelError
+        See :func:`response`.
+    DataError
+        Data of signals that the model does not have.
+    """
+    model, records = _given(result, data)
+    figure, axes = axes_for(ax, len(records), row=3.4)
+    for axis, record in zip(axes[:, 0], records, strict=True):
+        curve, _, _ = curve_of(model, record, grid_of(record)[0])
+        impedance = record.unit.endswith("Ω")
+        upward = -1.0 if impedance else 1.0
+        axis.plot(
+            record.response.real,
+            upward * record.response.imag,
+            "o",
+            fillstyle="none",
+            markersize=4,
+            color=LINES[0][0],
+            label="measured",
+        )
+        axis.plot(curve.real, upward * curve.imag, color=LINES[1][0], linewidth=1.2, label="model")
+        unit = f" [{record.unit}]" if record.unit else ""
+        words = ("Re Z", "−Im Z") if impedance else ("real part", "imaginary part")
+        axis.set(xlabel=words[0] + unit, ylabel=words[1] + unit)
+        axis.set_aspect("equal", adjustable="datalim")
+        axis.set_title(plain(f"{symbol(record.output)} from {symbol(record.input)}"), fontsize="small")
+        axis.grid(visible=True, alpha=0.3)
+        axis.legend(fontsize="small")
+    return figure
+
+
+def _given(
+    result: FrequencyIdentification | Model, data: FrequencyData | FrequencyValidation | None
+) -> tuple[Model, list[FrequencyData]]:
+    """The model and the records that were meant."""
+    if not isinstance(result, (FrequencyIdentification, Model)):
+        raise ModelError(f"result is {type(result).__name__}; give what identify_frequency returns, or a model")
+    if isinstance(result, FrequencyIdentification):
+        model, records = result.model, list(result.data)
+    else:
+        model, records = result, []
+    if isinstance(data, FrequencyValidation):
+        records = list(data.data)
+    elif isinstance(data, FrequencyData):
+        records = [placed(model, data)]
+    elif data is not None:
+        raise ModelError(f"data is {type(data).__name__}; give frequency data, such as load_frequency returns")
+    if not records:
+        raise ModelError("a model alone has no measured points; give data, such as load_frequency returns")
+    return model, records

@@ -1,0 +1,285 @@
+"""A model in the frequency domain as charts."""
+
+from __future__ import annotations
+
+import math
+from collections.abc import Mapping, Sequence
+from dataclasses import dataclass, field
+
+import numpy as np
+from numpy.typing import ArrayLike
+
+from ftlm.analysis.frequency_response import frequency_response, response_deviation, response_inputs, transfer_functions
+from ftlm.analysis.poles import modes
+from ftlm.analysis.time_response import Response, response
+from ftlm.model.model import Solved, check_solved
+from ftlm.simulation.discretization import COULOMB
+from ftlm.svg.complex_plane import plane_chart
+from ftlm.svg.figure import SMALL, Figure
+from ftlm.svg.line_chart import line_chart
+from ftlm.utils.formatting import symbol
+from ftlm.utils.statistics import NORMAL_95
+from ftlm.utils.validation import Complex, Floats
+
+#: A natural logarithm of a gain in decibels.
+DECIBEL = 20.0 / math.log(10.0)
+
+
+def response_frequencies(model: Solved, step: float | None = None, duration: float | None = None) -> Floats:
+    """Frequencies at which a model is worth looking at: from one period in a record to half the sampling rate."""
+    if step is not None and duration is not None:
+        return np.geomspace(2 * math.pi / duration, math.pi / step, 240)
+    corner = []
+    for pairs in transfer_functions(model).denominator.values():
+        (top, high), (bottom, low) = pairs[0], pairs[-1]
+        corner.append(abs(bottom / top) ** (1 / (high - low)) if high > low else 1.0)
+    middle = float(np.exp(np.mean(np.log(corner))))
+    return np.geomspace(middle / 100, middle * 100, 240)
+
+
+def bode_charts(model: Solved, w: ArrayLike | None = None) -> list[Figure]:
+    """Gain and phase of every output from every input that is not modelled, with 95 % bands where they are known.
+
+    Parameters
+    ----------
+    model
+        The model.
+    w
+        Frequencies [rad/s]; by default around the model's own.
+    """
+    omega = response_frequencies(model) if w is None else np.asarray(w, dtype=np.float64)
+    return drawn_bode(omega, bode_curves(model, omega))
+
+
+def drawn_bode(omega: Floats, curves: Sequence[BodeCurve]) -> list[Figure]:
+    """Gain and phase of these curves."""
+    figures = []
+    for curve in curves:
+        title = f"{symbol(curve.output)} from {symbol(curve.input)}"
+        shade = "Shade: 95 % band, from the covariance of the fit." if curve.gain_spread is not None else ""
+        for kind, values, spread, label in (
+            ("gain", curve.gain, curve.gain_spread, "gain [dB]"),
+            ("phase", curve.phase, curve.phase_spread, "phase [degrees]"),
+        ):
+            bands = [] if spread is None else [(values - spread, values + spread)]
+            figures.append(
+                line_chart(
+                    omega,
+                    [("", values)],
+                    log_x=True,
+                    bands=bands,
+                    title=f"{title}: {kind}",
+                    width=SMALL,
+                    height=220,
+                    x_label="frequency [rad/s]",
+                    y_label=label,
+                    caption=shade,
+                )
+            )
+    return figures
+
+
+def pole_points(model: Solved) -> tuple[float, Complex]:
+    """Order q of the plane, and the poles in it with their conjugates; none of a model with friction."""
+    q = plane_order(model)
+    found = () if model.structure.has_friction else modes(model)
+    points = []
+    for m in found:
+        angle = math.acos(max(-1.0, min(1.0, -m.damping)))
+        # Beyond the negative axis of s a relaxation of fractional order stands on the one of s^q.
+        turn = math.pi if not m.swings and not m.grows else q * angle
+        value = m.frequency**q * complex(math.cos(turn), math.sin(turn))
+        points += [value, value.conjugate()] if m.swings else [complex(value.real)]
+    return q, np.array(points, dtype=np.complex128)
+
+
+def pole_charts(model: Solved) -> list[Figure]:
+    """Poles in the plane of s^q, q the highest order over the next whole number, with the sector that is not stable.
+
+    Empty for a model with friction, which has none, and for one without poles.
+
+    Parameters
+    ----------
+    model
+        Any.
+    """
+    q, points = pole_points(model)
+    if not points.size:
+        return []
+    found = modes(model)
+    plane = "s" if q == 1 else f"s^{q:.4g}"
+    inside = sum(m.grows for m in found)
+    words = "none is in it" if not inside else f"{inside} of {len(found)} modes in it: the model is not stable"
+    caption = f"Shade: |arg {plane}| < {90 * q:.4g} degrees, where poles make a free run grow; {words}."
+    if q != 1:
+        caption += f" A relaxation is drawn at −T^−{q:.4g}."
+    unit = "rad/s" if q == 1 else f"(rad/s)^{q:.4g}"
+    return [
+        plane_chart(
+            points.tolist(),
+            title=f"Poles in the plane of {plane}",
+            x_label=f"real part of {plane} [{unit}]",
+            y_label=f"imaginary part [{unit}]",
+            sector=q * math.pi / 2,
+            caption=caption,
+        )
+    ]
+
+
+def plane_order(model: Solved) -> float:
+    """Order q of the plane s^q in which the poles of a model are shown: 1 for whole orders, else between 0.5 and 1."""
+    orders = [e.order.constant for e in model.equations]
+    orders += [t.order.constant for e in model.equations for t in e.terms]
+    highest = max(orders)
+    whole = all(abs(o - round(o)) < 1e-9 for o in orders) or highest <= 0
+    return 1.0 if whole else round(highest / math.ceil(highest - 1e-9), 4)
+
+
+@dataclass(frozen=True)
+class BodeCurve:
+    """Gain [dB] and phase [degrees] of one output from one input, and half-widths of their 95 % bands or None."""
+
+    output: str
+    input: str
+    gain: Floats
+    phase: Floats
+    gain_spread: Floats | None
+    phase_spread: Floats | None
+
+
+def bode_curves(model: Solved, omega: Floats) -> list[BodeCurve]:
+    """Curves of all pairs in which the input reaches the output; Coulomb terms are not linear and have none."""
+    response = frequency_response(model, omega)
+    spread = None
+    if model.estimate is not None and model.estimate.covariance is not None:
+        spread = response_deviation(model, omega)
+    inputs = response_inputs(model, coupled=True)
+    curves = []
+    for i, output in enumerate(model.outputs):
+        for j, name in enumerate(inputs):
+            h = response[i, j]
+            if not np.any(h) or name.startswith(COULOMB):
+                continue
+            with np.errstate(divide="ignore", invalid="ignore"):
+                gain = 20 * np.log10(np.abs(h))
+            phase = np.degrees(np.unwrap(np.angle(np.where(np.isfinite(h), h, 1.0))))
+            widths: tuple[Floats | None, Floats | None] = (None, None)
+            if spread is not None:
+                widths = (DECIBEL * NORMAL_95 * spread[0][i, j], np.degrees(NORMAL_95 * spread[1][i, j]))
+            curves.append(BodeCurve(output, name, gain, phase, *widths))
+    return curves
+
+
+@dataclass(frozen=True)
+class Bode:
+    """A frequency response to look at; what :meth:`ftlm.Model.bode` returns.
+
+    Parameters
+    ----------
+    frequency
+        [rad/s], shape (W,).
+    curves
+        Gain [dB], phase [degrees] and half-widths of their 95 % bands, of every input that reaches an output.
+    """
+
+    frequency: Floats
+    curves: tuple[BodeCurve, ...]
+
+    def figures(self) -> list[Figure]:
+        """Its charts, as in a report."""
+        return drawn_bode(self.frequency, self.curves)
+
+    def __str__(self) -> str:
+        pairs = ", ".join(f"{c.output} from {c.input}" for c in self.curves) or "no input reaches an output"
+        return f"Bode: {pairs}; {self.frequency.size} frequencies from {self.frequency[0]:.4g} rad/s to " + (
+            f"{self.frequency[-1]:.4g} rad/s"
+        )
+
+    def _repr_html_(self) -> str:
+        return "".join(f._repr_html_() for f in self.figures())
+
+
+def bode(model: Solved, w: ArrayLike | None = None) -> Bode:
+    """Frequency response of a model to look at; see :meth:`ftlm.Model.bode`."""
+    check_solved(model)
+    omega = response_frequencies(model) if w is None else np.asarray(w, dtype=np.float64)
+    return Bode(omega, tuple(bode_curves(model, omega)))
+
+
+def response_charts(found: Response, *, units: Mapping[str, str] | None = None) -> list[Figure]:
+    """Answers to steps or impulses, a chart for every input that reaches an output, with 95 % bands.
+
+    Parameters
+    ----------
+    found
+        The answers, at which instants, and their deviations.
+    units
+        Of signals, by name.
+    """
+    figures = []
+    for i, output in enumerate(found.outputs):
+        for j, signal in enumerate(found.inputs):
+            values = found.values[i, j]
+            if signal.startswith(COULOMB) or not np.any(values):
+                continue
+            bands, shade = [], "No covariance, so there is no band."
+            if found.deviation is not None:
+                half = NORMAL_95 * found.deviation[i, j]
+                bands, shade = [(values - half, values + half)], "Shade: 95 % band, from the covariance of the fit."
+            unit = (units or {}).get(output, "")
+            figures.append(
+                line_chart(
+                    found.time,
+                    [("", values)],
+                    bands=bands,
+                    width=SMALL,
+                    height=220,
+                    x_label="time [s]",
+                    title=f"{symbol(output)} after a unit {found.kind} of {symbol(signal)}",
+                    caption=shade,
+                    y_label=f"{symbol(output)} [{unit}]" if unit else symbol(output),
+                )
+            )
+    return figures
+
+
+@dataclass(frozen=True)
+class Answer(Response):
+    """A step or impulse response that draws itself; what :meth:`ftlm.Model.step` returns.
+
+    Parameters
+    ----------
+    kind, outputs, inputs, time, values, deviation
+        ``"step"`` or ``"impulse"``; names; instants [s], shape (N,); values and their standard deviations (or None),
+        shape (outputs, inputs, N). An impulse has the mean of its answer over each interval, at the interval's middle.
+    units
+        Of the signals.
+    """
+
+    units: Mapping[str, str] = field(default_factory=dict)
+
+    def figures(self) -> list[Figure]:
+        """Its charts, as in a report."""
+        return response_charts(self, units=self.units)
+
+    def __str__(self) -> str:
+        lines = [f"{self.kind} response, {self.time.size} instants to {self.time[-1]:.4g} s"]
+        for i, output in enumerate(self.outputs):
+            for j, signal in enumerate(self.inputs):
+                values, last = self.values[i, j], self.values[i, j, -1]
+                at = int(np.argmax(np.abs(values)))
+                sure = "" if self.deviation is None else f" ± {self.deviation[i, j, -1]:.2g}"
+                lines.append(
+                    f"  {output} from {signal}: at the end {last:.5g}{sure}, farthest {values[at]:.5g} at "
+                    f"{self.time[at]:.4g} s"
+                )
+        return "\n".join(lines)
+
+    def _repr_html_(self) -> str:
+        return "".join(f._repr_html_() for f in self.figures())
+
+
+def answer(model: Solved, time: ArrayLike | None, kind: str) -> Answer:
+    """Response of a model to look at; see :meth:`ftlm.Model.step`."""
+    found = response(model, time, kind=kind)
+    return Answer(**vars(found), units=dict(model.units))

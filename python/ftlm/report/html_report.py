@@ -1,0 +1,552 @@
+"""The first things on a page: verdict, warnings in groups, equations, what the model does by itself."""
+
+from __future__ import annotations
+
+import contextlib
+import math
+import os
+import re
+from collections.abc import Mapping, Sequence
+from pathlib import Path
+
+import numpy as np
+from markupsafe import Markup
+
+from ftlm.analysis.poles import modes, steady_states
+from ftlm.data.run import Run, as_runs
+from ftlm.errors import FtlmError
+from ftlm.estimation.cost_surface import output_error_landscape
+from ftlm.estimation.linear import multi_innovation_trace, trace_chart
+from ftlm.estimation.model_checks import validate
+from ftlm.estimation.output_error import JointFit
+from ftlm.estimation.result import Judged, Task
+from ftlm.estimation.verdict import Verdict, saved_verdict, verdict, verdict_html
+from ftlm.model.model import Model
+from ftlm.order_search.options import COMPARED_LENGTHS
+from ftlm.order_search.result import SearchResult, search_summary, search_top
+from ftlm.order_search.search import landscape
+from ftlm.plot.comparison_charts import comparison_charts, input_charts, residual_charts, residual_series
+from ftlm.plot.model_charts import bode_charts, pole_charts, response_frequencies
+from ftlm.report.text_summary import order_in_words, settings_rows
+from ftlm.report.typesetting import equations_html, parameter_table
+from ftlm.structure.input_nonlinearity import WORDS
+from ftlm.svg.figure import POINTS, Figure
+from ftlm.svg.heat_map import correlation_map, heat_map
+from ftlm.svg.html_page import Section, Table, write_page
+from ftlm.utils.files import check_free
+from ftlm.utils.formatting import Cell, number, symbol, symbol_html, unbounded
+from ftlm.validation.comparison import Comparison, compare, errors_table, initial_terms_table, lost_fits, warned
+from ftlm.validation.findings import SHOWN, concerns
+from ftlm.validation.information_criteria import InformationCriteria, information_table
+from ftlm.validation.residual_tests import LAGS, Residuals, resid, residual_table
+
+#: Figures of what a model does by itself, on a page.
+MOST_FIGURES = 9
+_LOOKS = {"trust": "trust", "with care": "care", "do not use": "not"}
+
+
+def verdict_box(judged: Verdict, of: str = "") -> Markup:
+    """A verdict as the first box of a page, perhaps of one of several; its word says what its colour says."""
+    remedy = Markup(' <span class="todo">→ {}</span>').format(judged.remedy) if judged.remedy else ""
+    return Markup('<div class="first {}" role="note"><strong>{}</strong>{}{}</div>').format(
+        _LOOKS[judged.level],
+        f"{of}{judged.level}" if of else judged.level.capitalize(),
+        judged.reason[0].upper() + judged.reason[1:],
+        remedy,
+    )
+
+
+def first_warnings(warnings: Sequence[str]) -> tuple[list[str], list[str]]:
+    """At most three groups of warnings with what to do, the most serious first, and all warnings that are left."""
+    found = concerns(warnings)
+    shown: list[str] = []
+    left: list[str] = []
+    for k, concern in enumerate(found):
+        if k >= SHOWN:
+            left += concern.warnings
+            continue
+        remedy = concern.remedy if concern.remedy not in concern.warnings[0] else ""
+        todo = Markup(' <span class="todo">→ {}</span>').format(remedy) if remedy else Markup("")
+        shown.append(Markup("{}{}{}").format(concern.warnings[0], concern.count, todo))
+        left += concern.warnings[1:]
+    return shown, left
+
+
+def title_of(model: Model) -> str:
+    """What a page about a model is called."""
+    structure = model.structure
+    if structure.name != "equation":
+        return structure.name
+    inputs = [s for s in structure.signals if s not in structure.outputs]
+    driven = f" from {', '.join(map(symbol, inputs))}" if inputs else ""
+    return f"Model of {', '.join(map(symbol, structure.outputs))}{driven}"
+
+
+def behaviour_tables(model: Model) -> list[Table]:
+    """Steady state and modes with standard errors; nothing of what has none."""
+    if model.structure.has_friction:
+        return []
+    tables = []
+    try:
+        found = modes(model)
+        grows = any(mode.grows for mode in found)
+        states = () if grows or model.structure.limits else steady_states(model)
+    except FtlmError:
+        # Equations that cannot be solved for their outputs together have neither.
+        return []
+    if states:
+        rows: list[list[Cell]] = []
+        for state in states:
+            above, below = (model.units.get(n, "") for n in (state.output, state.input))
+            pair = Markup("{} from {}").format(symbol_html(state.output), symbol_html(state.input))
+            unit = f"{above}/{below}" if above and below else ""
+            sure = order_in_words(state)
+            if state.order > 0:
+                runs = f" t^{state.order:.4g}/Γ({state.order + 1:.4g})" if state.order != 1 else " per second"
+                rows.append([pair, state.rate, state.error, unit, f"none: it runs on, so much{runs}{sure}"])
+            else:
+                back = state.order < 0
+                what = "0: it dies away" if back else "gain"
+                rows.append([pair, state.gain, None if back else state.error, unit, f"{what}{sure}"])
+        tables.append(
+            Table("Steady state under a unit step", ("output", "value", "standard error", "unit", "what it is"), rows)
+        )
+    if found:
+        rows = [
+            [
+                f"{k + 1}",
+                f"{number(m.pole.real, 4)} ± {number(abs(m.pole.imag), 4)}j" if m.swings else number(m.pole.real, 4),
+                m.frequency,
+                m.frequency_error,
+                m.damping,
+                m.damping_error,
+                m.time_constant if math.isfinite(m.time_constant) else "∞",
+                m.time_constant_error,
+            ]
+            for k, m in enumerate(found)
+        ]
+        note = (
+            "A swing has the time constant 1/|Re s|, a relaxation 1/|s|; standard errors are to first order from the "
+            "covariance of the fit."
+        )
+        columns = ("mode", "pole s [rad/s]", "frequency [rad/s]", "±", "damping", "±", "time constant [s]", "±")
+        tables.append(Table("Modes", columns, rows, note=note))
+    return tables
+
+
+def behaviour_figures(model: Model) -> list[Figure]:
+    """Pole map and step responses; nothing of what has none, or leaves the range of numbers."""
+    figures: list[Figure] = []
+    if model.structure.has_friction or model.structure.limits:
+        return figures
+    with contextlib.suppress(FtlmError):
+        figures += pole_charts(model)
+        figures += model.step().figures()
+    return figures[:MOST_FIGURES]
+
+
+#: Charts of a page and points in all of them: at no more than 10 bytes a point the page stays below 2 MB.
+PAGE_CHARTS = 60
+PAGE_POINTS = 90_000
+#: Charts of residuals, and of the frequency response, on a page.
+SMALL_CHARTS = 24
+#: Points of a line in a notebook, which keeps what it shows.
+NOTEBOOK_POINTS = 600
+#: Points of a line of residuals in a small chart.
+SERIES_POINTS = 600
+#: Points of a convergence curve.
+TRACE_POINTS = 64
+#: Of a model with friction, where others have their stability.
+STICKS = "The body rests while friction holds it, so that no poles say how it comes to rest."
+
+
+def identification_page(
+    result: Judged, path: str | os.PathLike[str], *, validation: Run | Sequence[Run] | None = None, force: bool = False
+) -> Path:
+    """Write the report of one identification.
+
+    Parameters
+    ----------
+    result
+        From :func:`ftlm.identify`.
+    path
+        File to write.
+    validation
+        Runs that the model was not identified from.
+    force
+        Overwrite an existing file.
+
+    Returns
+    -------
+    Path
+        The file.
+
+    Raises
+    ------
+    DataError
+        A validation run that does not fit the model; the file exists and ``force`` is not set, or cannot be written.
+    """
+    check_free(path, force=force)
+    model = result.model
+    others = [] if validation is None else as_runs(validation)
+    validated = [validate(result, run) for run in others]
+    warnings = list(result.warnings)
+    undefined = [n for n, e in result.standard_errors.items() if math.isnan(e)]
+    if undefined:
+        warnings.append(
+            f"the standard errors of {', '.join(undefined)} are not defined: the fit's covariance is not finite; "
+            "nothing is known of how sure these numbers are"
+        )
+    for run, comparison in zip(others, validated, strict=True):
+        warnings += [f"validation run {run.name}: {w.removeprefix(run.name + ': ')}" for w in comparison.warnings]
+        warnings += [f"validation run {run.name}: {w}" for w in run.warnings]
+    compared = [("estimation", result.comparison), *(("validation", c) for c in validated)]
+    tests = [] if result.residuals is None else [("estimation", result.residuals)]
+    tests += tests_on(model, others)
+    pooled = validate(result, others) if len(others) > 1 else validated[0] if validated else None
+    judged = verdict(result, pooled)
+    task = result.task
+    runs = [*(() if task is None else task.runs), *others]
+    sections = first_sections(model, warnings, compared, bool(others), result.joint, runs)
+    sections.append(residual_section(tests, result.information, compared, model.units))
+    sections += correlation_sections(result.joint)
+    steps = [(r.step, r.duration) for r in ((() if task is None else task.runs) or others)]
+    sections.append(frequency_section(model, steps))
+    sections += _search_sections(result)
+    titled = ((f"Initial terms of the free runs, {label}", c) for label, c in compared)
+    initial = [t for title, c in titled if (t := initial_terms_table(c, title=title)) is not None]
+    starts = [starts_table(result.joint)] if result.joint is not None and result.joint.starts else []
+    sections.append(Section("Settings", tables=[settings_table(result), *starts, *initial]))
+    return write_page(
+        path, title=title_of(model), sections=sections, lead=lead_of(compared), force=force, verdict=verdict_box(judged)
+    )
+
+
+def first_sections(
+    model: Model,
+    warnings: Sequence[str],
+    compared: Sequence[tuple[str, Comparison]],
+    validated: bool,
+    joint: JointFit | None,
+    runs: Sequence[Run] = (),
+) -> list[Section]:
+    """Warnings, equations, what the model does by itself, errors, charts with the inputs below."""
+    units = model.units
+    words = [
+        "No check raised a warning. Checked: free run against equation error, orders close to one another or on the "
+        "edge of their interval, pull of the prior, coefficient law, residuals, stability of the discretisation, the "
+        "data."
+    ]
+    if not validated:
+        words.append("No validation run was given: how well the model predicts other data is not known.")
+    warned = list(dict.fromkeys(warnings))
+    shown, left = first_warnings(warned)
+    charts = sum(len(c.per_run) for _, c in compared) * len(model.outputs)
+    # Two lines a chart, drawn once wide and once narrow with half the points.
+    points = min(POINTS, PAGE_POINTS // (3 * max(min(charts, PAGE_CHARTS), 1)))
+    drawn = _with_inputs(model, compared, runs, points)
+    own = compared[0][1] if compared and compared[0][0] == "estimation" else None
+    equations = [
+        *equations_html(model, None if own is None else own.offsets),
+        STICKS if model.structure.has_friction else f"As a whole, the model is {model.stability()}.",
+    ]
+    sections = [
+        Section("Warnings", words[1:] if warned else words, shown, more=left),
+        Section("Equations", equations, tables=[parameter_table(model, joint)]),
+    ]
+    if figures := behaviour_figures(model):
+        sections.append(Section("Gain, modes and steps", tables=behaviour_tables(model), figures=figures, small=True))
+    if compared:
+        left_out = f"{charts - PAGE_CHARTS} further charts are left out; the table above has every run."
+        sections += [
+            Section("Errors", tables=[errors_table(compared, units=units)]),
+            Section(
+                "Measured and simulated", left_out if charts > PAGE_CHARTS else (), figures=drawn[: max(PAGE_CHARTS, 1)]
+            ),
+        ]
+    return sections
+
+
+def _with_inputs(
+    model: Model, compared: Sequence[tuple[str, Comparison]], runs: Sequence[Run], points: int
+) -> list[Figure]:
+    """Outputs of each run measured and simulated, and below them what drove them, where the runs are at hand."""
+    inputs = [s for s in model.structure.signals if s not in model.outputs]
+    left, drawn = list(runs), []
+    for label, comparison in compared:
+        figures = comparison_charts(comparison, units=model.units, label=label, points=points)
+        for k, (name, _, _) in enumerate(comparison.per_run):
+            here = len(comparison.output_error)
+            drawn += figures[k * here : (k + 1) * here]
+            if left and left[0].name == name:
+                drawn += input_charts([left.pop(0)], inputs, points=max(points // 2, 4))
+    return drawn
+
+
+def tests_on(model: Model, runs: Sequence[Run]) -> list[tuple[str, Residuals]]:
+    """Residual tests of each run that is long enough for them."""
+    return [("validation", resid(model, run)) for run in runs if run.length >= 2 * LAGS + 3]
+
+
+def correlation_sections(joint: JointFit | None) -> list[Section]:
+    """How the numbers of a joint fit go together; nothing for one number, or where there is no covariance."""
+    if joint is None or len(joint.names) < 2:
+        return []
+    words = (
+        "Two numbers whose correlation is near 1 or −1 can be moved together with little harm: the runs know what they "
+        "make together better than each. That matters where a standard error is large as well."
+    )
+    values = np.clip(joint.correlation, -1.0, 1.0)
+    figure = correlation_map(joint.names, values, title="Correlations of the estimates")
+    return [Section("How the numbers go together", words, figures=[figure], small=True)]
+
+
+def residual_section(
+    tests: Sequence[tuple[str, Residuals]],
+    information: InformationCriteria | None,
+    compared: Sequence[tuple[str, Comparison]] = (),
+    units: Mapping[str, str] | None = None,
+) -> Section:
+    """Residual tests, information criteria, residuals over time and how often, correlations as charts."""
+    tables = [residual_table(t, title=f"{label}: {', '.join(t.runs)}") for label, t in tests]
+    if information is not None:
+        tables.append(information_table(information))
+    figures = [f for label, c in compared for f in residual_series(c, units=units, label=label, points=SERIES_POINTS)]
+    figures = figures[: SMALL_CHARTS // 2]
+    figures += [f for label, t in tests for f in residual_charts(t, label=label)]
+    words = () if tests else "The runs are too short for residual tests."
+    return Section("Residuals", words, tables=tables, figures=figures[:SMALL_CHARTS], small=True)
+
+
+def frequency_section(model: Model, steps: Sequence[tuple[float, float]]) -> Section:
+    """Gain and phase as far as runs of these steps and durations show them."""
+    if model.structure.has_friction:
+        words = "A body that may stick has none: its answer is not in proportion to what drives it."
+        return Section("Frequency response", words)
+    if model.structure.limits:
+        words = "A model whose inputs saturate or have a dead zone has none: its answer is not in proportion to them."
+        return Section("Frequency response", words)
+    omega = response_frequencies(model, *min(steps)) if steps else response_frequencies(model)
+    words = "Exact, orders as they are; the equations together, from what is not modelled."
+    if model.estimate is None or model.estimate.covariance is None:
+        told = model.estimate is None or None not in model.estimate.standard_errors.values()
+        lacking = "This estimator gives no covariance" if told else "The runs leave directions unseen"
+        words += f" {lacking}, so there are no bands."
+    return Section("Frequency response", words, figures=bode_charts(model, omega)[:SMALL_CHARTS], small=True)
+
+
+def _search_sections(result: Judged) -> list[Section]:
+    """Convergence of the recursion, and the order search with its landscape."""
+    sections = []
+    traces = _traces(result)
+    if traces:
+        words = (
+            "Error (45) of the free run after every step of the recursion, at the orders found. p weighs the data "
+            "against the prior; all lines end where the closed form is."
+        )
+        sections.append(Section("Convergence of the recursion", words, figures=traces))
+    if result.searches:
+        tops = [search_top(name, search) for name, search in result.searches.items()]
+        maps = [] if result.task is None else _maps(result.task, result.searches)
+        sections.append(
+            Section("Order search", tables=[search_summary(result.searches), *tops], figures=maps, small=True)
+        )
+    around = output_error_landscape(result)
+    if around is not None:
+        first, second = map(symbol, around.names)
+        words = (
+            f"The two orders that these runs tell apart least are {first} and {second}: the correlation of their "
+            f"estimates is {number(around.correlation, 3)}. For white residuals the 95 % region of both ends at a "
+            "score of 7."
+        )
+        sections.append(Section("Order landscape", words, figures=[heat_map(around)], small=True))
+    return sections
+
+
+def _maps(task: Task, searches: Mapping[str, SearchResult]) -> list[Figure]:
+    """Landscapes of the searches over more than one order; of one alone its table says all."""
+    maps = []
+    for name, search in searches.items():
+        part = task.structure if name == "stage" else task.structure.equation(name)
+        own = task.lattice_of(part)
+        if sum(len(v) > 1 for v in own.values(part).values()) >= 2:
+            maps.append(heat_map(landscape(task.runs, part, search, own)))
+    return maps
+
+
+def _traces(result: Judged) -> list[Figure]:
+    """The recursion at the orders found, for the paper's p and the one used, where the first run starts at rest."""
+    if result.task is None or result.method != "multi-innovation" or result.settings["initial"] != "rest":
+        return []
+    if "offset" in result.settings:
+        return []
+    run, used = result.task.runs[0], result.settings
+    every = max(1, int(used["m"]) // TRACE_POINTS)
+    options = {n: used[n] for n in ("prior_covariance", "rows", "m")}
+    figures = []
+    for solved in result.model.equations:
+        single = result.task.structure.equation(solved.output)
+        free = (single.equations[0].order, *(t.order for t in single.equations[0].terms))
+        numbers = (solved.order, *(t.order for t in solved.terms))
+        orders = {o.names[0]: n.constant for o, n in zip(free, numbers, strict=True) if o.names}
+        at_orders = single.with_orders(orders)
+        if not at_orders.coefficient_names:
+            continue
+        traces = [
+            (f"p = {p}", multi_innovation_trace(run, at_orders, innovation_length=p, every=every, **options))
+            for p in sorted({*COMPARED_LENGTHS, int(used["innovation_length"])})
+        ]
+        figures.append(trace_chart(traces, title=f"Error (45) of {symbol(solved.output)}, run {run.name}"))
+    return figures
+
+
+def lead_of(compared: Sequence[tuple[str, Comparison]]) -> str:
+    """Return the fits of the free runs, in a sentence a data set."""
+    sentences = []
+    for label, comparison in compared:
+        fits = ", ".join(f"{symbol(name)} {number(fit, 4)}\u00a0%" for name, fit in comparison.fit_percent.items())
+        runs = ", ".join(name for name, _, _ in comparison.per_run)
+        sentences.append(f"Fit of the free run, {label} ({runs}): {fits}.")
+    return " ".join(sentences)
+
+
+def estimates_table(result: Judged | None, truth: Mapping[str, float] | None = None) -> Table:
+    """Orders and coefficients of a joint fit with intervals, beside their true values where those are known."""
+    rows: list[list[Cell]] = []
+    if result is not None and result.joint is not None:
+        for name, value in {**result.orders, **result.joint.coefficients}.items():
+            low, high = result.intervals[name]
+            known = [truth.get(name)] if truth else []
+            spread = [v if math.isfinite(v) else unbounded(v) for v in (result.standard_errors[name], low, high)]
+            rows.append([symbol_html(name), value, *spread, *known])
+    columns, groups = ["parameter", "value", "standard error", "from", "to"], [("", 3), ("95 % interval", 2)]
+    if truth:
+        columns, groups = [*columns, "true value"], [*groups, ("", 1)]
+    return Table("Output error: orders and coefficients, with intervals", columns, rows, groups=groups)
+
+
+def grouped_warnings(results: Mapping[str, Judged | None]) -> list[str]:
+    """Warnings of several results by label, those that differ in numbers alone together."""
+    groups: dict[str, tuple[str, list[str]]] = {}
+    for label, result in results.items():
+        for warning in () if result is None else result.warnings:
+            # Digits of names stay: theta11 is not theta12.
+            key = re.sub(r"(?<![A-Za-z\d.])[-+]?\d+(\.\d+)?(e[-+]?\d+)?", "#", warning)
+            groups.setdefault(key, (warning, []))[1].append(label)
+    return [
+        f"{', '.join(dict.fromkeys(labels))}: {warning}{'' if len(labels) == 1 else ' (numbers of the first)'}"
+        for warning, labels in groups.values()
+    ]
+
+
+def starts_table(joint: JointFit, *, rows: int = 10, title: str = "Automatic starts") -> Table:
+    """Return where the first fits began and how far each came on thinned samples, best first."""
+    kept = joint.starts[:rows]
+    cells: list[list[Cell]] = [[k + 1, origin, level] for k, (level, origin) in enumerate(kept)]
+    note = f"{joint.choice}. The best ones went on on all samples." if joint.starts else ""
+    return Table(title, ("rank", "start from", "cost per residual"), cells, note=note)
+
+
+def settings_table(result: Judged, *, title: str = "What the result depends on") -> Table:
+    """Return what the result depends on besides the data: estimator, criterion, M, p, K₀, initial terms, runs."""
+    structure, comparison = result.model.structure, result.comparison
+    rows: list[list[Cell]] = [
+        ["structure", structure.name],
+        ["coupling in free runs", structure.coupling],
+        ["estimator", result.method],
+        *settings_rows(result.settings, searched=bool(result.searches)),
+    ]
+    rows += [[f"delay of {symbol(name)}", f"{delay:g} s"] for name, delay in structure.delay.items()]
+    rows += [[f"{WORDS[limit.law]} of {symbol(limit.signal)}", f"{limit.value:g}"] for limit in structure.limits]
+    if structure.sensor_filter is not None:
+        filtered = ", ".join(symbol(o) for o in structure.sensor_filter.signals)
+        rows.append(["known sensor filter on", filtered])
+    rows += [
+        [Markup("run <q>{}</q>").format(name), f"{number(step * comparison.m)} s, pulses of {number(step * 1e3)} ms"]
+        for (name, _, _), step in zip(comparison.per_run, comparison.step, strict=True)
+    ]
+    return Table(title, ("setting", "used"), rows)
+
+
+#: A verdict in a sentence.
+_INDEPENDENCE = {"yes": "independent of", "no": "not independent of", "undecided": "perhaps independent of"}
+
+
+def identification_html(result: Judged) -> str:
+    """Return warnings, equations, parameters with intervals, both errors and the residual verdicts."""
+    model = result.model
+    parts = [verdict_html(verdict(result))]
+    parts += [Markup("<p>{}</p>").format(e) for e in equations_html(model, result.comparison.offsets)]
+    parts += [table.to_html() for table in behaviour_tables(model)]
+    parts.append(parameter_table(model, result.joint).to_html())
+    # One run is enough to see; a report has all.
+    figures = comparison_charts(result.comparison, units=model.units, points=NOTEBOOK_POINTS)
+    parts += [Markup(f._repr_html_()) for f in figures[: len(result.output_error)]]  # made of escaped parts
+    parts.append(errors_table([("estimation", result.comparison)], units=model.units).to_html())
+    if result.residuals is not None:
+        verdicts = [
+            Markup("{}: residuals {}, {} the inputs").format(
+                symbol_html(o),
+                "white" if white else "not white",
+                _INDEPENDENCE[result.residuals.independence[o]],
+            )
+            for o, white in result.residuals.white.items()
+        ]
+        parts.append(Markup("<p>{} (99 %).</p>").format(Markup("; ").join(verdicts)))
+    shown, left = first_warnings(result.warnings)
+    parts.append(warned(shown))
+    if left:
+        folded = Markup("<details><summary>{} more warning{}</summary>{}</details>")
+        parts.append(folded.format(len(left), "" if len(left) == 1 else "s", warned(left)))
+    return str(Markup("").join(parts))
+
+
+def model_page(
+    model: Model, path: str | os.PathLike[str], *, validation: Run | Sequence[Run] | None = None, force: bool = False
+) -> Path:
+    """Write the report of a saved model: what its file knows of its identification, and validation runs.
+
+    Parameters
+    ----------
+    model
+        From :func:`ftlm.load_model`.
+    path, validation, force
+        See :func:`identification_page`.
+
+    Returns
+    -------
+    Path
+        The file.
+
+    Raises
+    ------
+    DataError
+        See :func:`identification_page`.
+    """
+    check_free(path, force=force)
+    others = [] if validation is None else as_runs(validation)
+    known = model.estimate
+    warnings = [] if known is None else list(known.warnings)
+    validated = [compare(model, run) for run in others]
+    for run, comparison in zip(others, validated, strict=True):
+        words = [*comparison.warnings, *run.warnings]
+        if known is not None:
+            words += lost_fits({n: f for n, f in known.fit.items() if f is not None}, comparison)
+            words += ["it has the name of a run that the model was identified from"] * (run.name in known.runs)
+        warnings += [f"validation run {run.name}: {w.removeprefix(run.name + ': ')}" for w in words]
+    compared = [("validation", comparison) for comparison in validated]
+    sections = first_sections(model, warnings, compared, bool(others), None, others)
+    if tests := tests_on(model, others):
+        sections.append(residual_section(tests, None, compared, model.units))
+    sections.append(frequency_section(model, [(r.step, r.duration) for r in others]))
+    about: list[list[Cell]] = [["structure", model.structure.name], ["coupling in free runs", model.structure.coupling]]
+    if known is not None:
+        about += [["estimator", known.method], ["identified from", ", ".join(known.runs)]]
+        about += [[Markup("fit of {} there, %").format(symbol_html(n)), f] for n, f in known.fit.items()]
+        about += [[n.upper().replace("AICC", "AICc"), v] for n, v in known.information.items()]
+    initial = [t for _, c in compared if (t := initial_terms_table(c)) is not None]
+    sections.append(Section("Settings", tables=[Table("What the file says", ("setting", "value"), about), *initial]))
+    judged = saved_verdict(model, validated)
+    return write_page(
+        path, title=title_of(model), sections=sections, lead=lead_of(compared), force=force, verdict=verdict_box(judged)
+    )

@@ -1,0 +1,248 @@
+"""The first screen of a result: verdict, model, what it does, how well it fits, and what speaks against it."""
+
+from __future__ import annotations
+
+import contextlib
+import copy
+from collections.abc import Mapping, Sequence
+from dataclasses import replace
+from typing import Any
+
+from markupsafe import Markup
+
+from ftlm.analysis.poles import Mode, SteadyState, modes, steady_states
+from ftlm.errors import FtlmError
+from ftlm.estimation.result import Judged
+from ftlm.estimation.verdict import verdict
+from ftlm.model.model import Model
+from ftlm.report.typesetting import ORDER_DECIMALS, units_of
+from ftlm.structure.equation import Equation, numeric
+from ftlm.structure.order import Order
+from ftlm.utils.formatting import Cell, Exact, symbol, unbounded, with_error, wrapped
+from ftlm.utils.statistics import NORMAL_95
+from ftlm.validation.comparison import Comparison, offsets_in_words
+from ftlm.validation.findings import SHOWN, concerns, left_over
+
+#: Most modes that are listed.
+MOST_MODES = 6
+
+
+def summary(result: Judged, validation: Comparison | None = None) -> str:
+    """The first screen as text."""
+    judged = verdict(result, validation)
+    lines = [*wrapped(str(judged)), ""]
+    lines += equations_in_words(result.model, result.comparison)
+    lines += ["", *numbers_in_words(result), *behaviour_in_words(result.model), ""]
+    lines += [*fits_in_words(result, validation), *_residuals(result), *_starts(result)]
+    lines += concerns_in_words(result.warnings)
+    return "\n".join(lines)
+
+
+def equations_in_words(model: Model, comparison: Comparison | None = None) -> list[str]:
+    """Equations with delays, limits, friction, and offsets as they were estimated where there is one run."""
+    structure = model.structure
+    lines = []
+    for item in model.equations:
+        known = _offset(item.output, comparison)
+        tail = structure.offset_in_words if known is None else known
+        lines.append(numeric(_readable(item), structure.acting(".6g")) + tail)
+    return lines
+
+
+def _readable(item: Equation) -> Equation:
+    """The equation with orders of four decimals, and those within that of 0 at 0."""
+    new = copy.copy(item)
+    terms = tuple(replace(t, order=Order(round(t.order.constant, ORDER_DECIMALS) + 0.0)) for t in item.terms)
+    vars(new).update(order=Order(round(item.order.constant, ORDER_DECIMALS)), terms=terms)
+    return new
+
+
+def _offset(output: str, comparison: Comparison | None) -> str | None:
+    """The offset of one run as the last terms of an equation; None where there is none, or where runs differ."""
+    if comparison is None or len(comparison.offsets) != 1 or not comparison.offsets[0].get(output):
+        return None
+    parts = comparison.offsets[0][output]
+    written = [(parts["constant"], ""), *([(parts["ramp"], " t")] if "ramp" in parts else [])]
+    return "".join(f" {'-' if v < 0 else '+'} {abs(v):.4g}{what}" for v, what in written)
+
+
+def numbers_in_words(result: Judged) -> list[str]:
+    """Orders and coefficients with standard errors, units, and the values that a maker states."""
+    errors, units, stated = result.standard_errors, units_of(result.model), result.model.structure.reference
+    values = {**result.orders, **result.joint_values, **result.coefficients}
+    rows = []
+    for name, value in values.items():
+        spread = f"± {unbounded(errors[name])}" if name in errors else ""
+        tail = f"[{result.profiles[name]}]" if name in result.profiles else ""
+        if name in stated:
+            tail = f"{tail}  (stated {stated[name]:.6g})".strip()
+        rows.append((name, f"{value:.6g}", spread, units.get(name, ""), tail))
+    if not rows:
+        return []
+    a, b, c, d = (max(len(row[k]) for row in rows) for k in range(4))
+    lines = [f"  {n:<{a}}  {v:>{b}} {s:<{c}}  {f'{u:<{d}}  ' if d else ''}{tail}".rstrip() for n, v, s, u, tail in rows]
+    note = "± is one standard error; 95 % intervals are ± 1.96 of these"
+    note += ", in brackets by profile likelihood" if result.profiles else ""
+    return [*lines, f"  ({note})"] if errors else lines
+
+
+def behaviour_in_words(model: Model) -> list[str]:
+    """Steady-state gain and modes, as far as the model has them."""
+    if model.structure.has_friction:
+        return ["  no poles, no gain: a body that may stick answers out of proportion"]
+    lines: list[str] = []
+    # Equations that cannot be solved for their outputs together have neither; everything else can be told.
+    with contextlib.suppress(FtlmError):
+        found = modes(model)
+        grows = any(mode.grows for mode in found)
+        word = "mode" if len(found) == 1 else "modes"
+        lines += [f"  {word if k == 0 else '':<7}{mode_in_words(mode)}" for k, mode in enumerate(found[:MOST_MODES])]
+        if len(found) > MOST_MODES:
+            lines.append(f"         and {len(found) - MOST_MODES} faster ones: .model.modes()")
+        if not (grows or model.structure.limits):
+            lines = [f"  {'gain':<7}{gain_in_words(s, model)}" for s in steady_states(model)] + lines
+    return lines
+
+
+def mode_in_words(mode: Mode) -> str:
+    """A mode with its pole."""
+    s = mode.pole
+    where = f"{s.real:.4g} ± {abs(s.imag):.4g}j" if mode.swings else f"{s.real:.4g}"
+    return f"{mode}; pole {where}"
+
+
+def gain_in_words(state: SteadyState, model: Model) -> str:
+    """A steady state, or how it runs on."""
+    pair = f"{state.output} from {state.input}"
+    above, below = (model.units.get(n, "") for n in (state.output, state.input))
+    unit = f" {above}/{below}" if above and below else ""
+    rate, sure = with_error(state.rate, state.error), order_in_words(state)
+    if state.order > 0:
+        course = "per second" if state.order == 1 else f"t^{state.order:.4g}/Γ({state.order + 1:.4g})"
+        return f"{pair}: none, it integrates: {rate}{unit} {course}{sure}"
+    if state.order < 0:
+        return f"{pair}: 0, a step dies away{sure}"
+    return f"{pair}: {rate}{unit}{sure}"
+
+
+def order_in_words(state: SteadyState) -> str:
+    """How sure the order is with which an output runs on, where that was estimated; and whether it may be another."""
+    error = state.order_error
+    if not error:
+        return ""
+    whole = float(round(state.order))
+    told = abs(state.order - whole) > NORMAL_95 * error
+    meaning = {0.0: "a gain", 1.0: "an integrator"}.get(whole, f"order {whole:g}")
+    return f"; order {with_error(state.order, error)}" + ("" if told else f", which may be {whole:g}: {meaning}")
+
+
+def fits_in_words(result: Judged, validation: Comparison | None) -> list[str]:
+    """Fit of the free run on estimation and on validation, and what the equation error says."""
+    width = max(len(o) for o in result.output_error) + 2
+    lines = [f"{'fit of the free run, %':<24}{'estimation':>12}{'validation':>12}{'RMSE':>12}"]
+    for output, own in result.output_error.items():
+        unit = result.model.units.get(output, "")
+        other = "not tried" if validation is None else f"{validation.output_error[output].fit:.4g}"
+        lines.append(
+            f"  {output:<{max(width, 22)}}{own.fit:>12.4g}{other:>12}{own.rmse:>12.4g}{f' {unit}' if unit else ''}"
+        )
+    return lines
+
+
+def _residuals(result: Judged) -> list[str]:
+    if result.residuals is None:
+        return ["residuals: the runs are too short for tests"]
+    white = ", ".join(f"{o} {'yes' if w else 'no'}" for o, w in result.residuals.white.items())
+    free = ", ".join(f"{o} {w}" for o, w in result.residuals.independence.items())
+    return [f"residuals white: {white}; independent of the inputs: {free} (99 %)"]
+
+
+def _starts(result: Judged) -> list[str]:
+    """Offsets that are no number of the equations above, and runs that start in motion."""
+    comparison = result.comparison
+    shown = {o for o in result.output_error if _offset(o, comparison) is not None}
+    hidden = any(o not in shown for run in comparison.offsets for o in run)
+    lines = offsets_in_words(comparison) if hidden else []
+    moving = [
+        f"{name} ({sum(map(len, terms.values()))})"
+        for (name, _, _), terms in zip(comparison.per_run, comparison.initial, strict=True)
+        if sum(map(len, terms.values())) and not comparison.offsets
+    ]
+    if moving:
+        lines += wrapped(f"in motion at its start, initial terms estimated with it: {', '.join(moving)}")
+    return lines
+
+
+def concerns_in_words(warnings: Sequence[str], how: str = "print(result.details())") -> list[str]:
+    """At most three groups of warnings, the most serious first, with what to do; and where the others are."""
+    found = concerns(warnings)
+    lines = []
+    for concern in found[:SHOWN]:
+        lines += wrapped(f"{concern.warnings[0]}{concern.count}", "! ")
+        if concern.remedy and concern.remedy not in concern.warnings[0]:
+            lines += wrapped(concern.remedy, "  -> ")
+    more = left_over(found)
+    return [*lines, f"  ({more}: {how})"] if more else lines
+
+
+COORDINATES = {"haar": "Haar coordinates", "time": "order of time"}
+INITIAL = {"rest": "none, the records start at rest", "caputo": "Caputo's, estimated for each run"}
+NORMS = {"l1": "sum of absolute errors (45)", "l2": "RMSE (46)"}
+
+
+def settings_in_words(settings: Mapping[str, Any]) -> str:
+    """On one line."""
+    words = f"M = {settings['m']}"
+    if "refinement" in settings:
+        words = f"all samples, {settings['refinement']} pulses each, {settings['starts']} starts"
+    if "seeds" in settings:
+        seeds = ", ".join(map(str, settings["seeds"]))
+        words += f", seeds {seeds}, {sum(settings['evaluations'].values())} evaluations in all"
+    if "innovation_length" in settings:
+        words += f", p = {settings['innovation_length']}, K0 = {settings['prior_covariance']:g}"
+        words += f", {settings['rows']} rows"
+    if "loss" in settings:
+        words += f", loss: {settings['loss']} ({robust_in_words(settings)})"
+    words += f", initial terms: {settings['initial']}"
+    words += f", offset: {settings['offset']}, one a run" if "offset" in settings else ""
+    words += f", offset found by test: {settings['offset_test']}" if "offset_test" in settings else ""
+    return words + (
+        f", instrument: what of the inputs follows {settings['reference']}" if "reference" in settings else ""
+    )
+
+
+def robust_in_words(settings: Mapping[str, Any]) -> str:
+    """What a robust loss did."""
+    return (
+        f"{settings['lowered']} of {settings['samples']} residuals down-weighted, {settings['outliers']} of them "
+        "beyond five deviations"
+    )
+
+
+def settings_rows(settings: Mapping[str, Any], *, searched: bool) -> list[list[Cell]]:
+    """As rows of a table; what ranks orders only where they were searched."""
+    rows: list[list[Cell]] = [["block pulses a run, M", int(settings["m"])]]
+    if "innovation_length" in settings:
+        rows += [
+            ["innovation length, p", int(settings["innovation_length"])],
+            [Markup("prior covariance, K<sub>0</sub>"), Exact(settings["prior_covariance"])],
+            ["rows of the recursion", COORDINATES.get(settings["rows"], settings["rows"])],
+        ]
+    if "refinement" in settings:
+        rows += [
+            ["pulses a sample interval", int(settings["refinement"])],
+            ["automatic starts", int(settings["starts"])],
+        ]
+        rows += [[f"noise found on {symbol(name)}", float(level)] for name, level in settings["noise"].items()]
+    if "loss" in settings:
+        rows.append(["loss", f"{settings['loss']}: {robust_in_words(settings)}"])
+    rows.append(["initial terms", INITIAL.get(str(settings["initial"]), str(settings["initial"]))])
+    if "offset" in settings:
+        rows.append(["offset of each equation", f"{settings['offset']}, estimated for each run"])
+    if "offset_test" in settings:
+        rows.append(["offset found by test", settings["offset_test"]])
+    if "reference" in settings:
+        rows.append(["reference", f"{settings['reference']}; instrument: what of the inputs follows it"])
+    if searched:
+        rows.append(["orders ranked by", f"{settings['criterion']}, {NORMS.get(settings['norm'], settings['norm'])}"])
+    return rows

@@ -1,0 +1,272 @@
+"""A model typeset: equations as MathML, parameters as a table."""
+
+from __future__ import annotations
+
+import math
+import re
+from collections.abc import Mapping, Sequence
+
+from markupsafe import Markup
+from msgspec import UNSET
+
+from ftlm.data.units import coefficient_unit
+from ftlm.estimation.output_error import JointFit
+from ftlm.model.model import Solved
+from ftlm.structure.equation import Equation
+from ftlm.structure.input_nonlinearity import SHORT, WORDS, Limit, input_name
+from ftlm.structure.order import Order
+from ftlm.svg.html_page import Table
+from ftlm.utils.formatting import GREEK, SYMBOL, Cell, Exact, number, symbol, symbol_html, unbounded
+from ftlm.utils.statistics import NORMAL_95
+
+#: Decimals of an order in an equation; the model's file has them all.
+ORDER_DECIMALS = 4
+THIN = Markup('<mspace width="0.17em"></mspace>')  # our constant
+_LATE = Markup("<mrow><mo>(</mo><mi>t</mi><mo>−</mo>{}{}<mi>s</mi><mo>)</mo></mrow>")
+_LIMITED = Markup("<mrow><mi>{}</mi><mo>(</mo>{}<mo>,</mo>{}<mo>)</mo></mrow>")
+_FALL = Markup(
+    "<msup><mi>e</mi><mrow><mo>−</mo><msup><mrow><mo>(</mo>{}<mo>/</mo>{}<mo>)</mo></mrow><mn>2</mn></msup></mrow></msup>"
+)
+_PLAIN_DIGITS = str.maketrans("⁻⁰¹²³⁴⁵⁶⁷⁸⁹", "-0123456789")
+
+
+def equation_html(
+    item: Equation,
+    delay: Mapping[str, float] | None = None,
+    limits: Sequence[Limit] = (),
+    offset: Mapping[str, float] | str = "",
+) -> Markup:
+    """Return an identified equation typeset as MathML, a piece for each term so that it breaks between terms.
+
+    Parameters
+    ----------
+    item
+        The equation.
+    delay
+        Delays of inputs [s]; a delayed input is written u(t − 0.035 s).
+    limits
+        Known saturations and dead zones of inputs; one that saturates is written sat(u, 0.94).
+    offset
+        The unknown constant of the equation, ``"constant"`` and perhaps ``"ramp"``, as it was estimated on one run, or
+        words for it.
+    """
+    parts = [_math(_derivative_math(item.order, item.output) + Markup("<mo>=</mo>"))]
+    for k, term in enumerate(item.terms):
+        value = term.fixed or 0.0
+        sign = "−" if value < 0 else "" if k == 0 else "+"
+        # The first sign belongs to its number; the others stand between two terms.
+        lead = Markup('<mo form="{}">{}</mo>').format("infix" if k else "prefix", sign) if sign else Markup("")
+        parts.append(
+            _math(
+                lead
+                + _number_math(abs(value))
+                + THIN
+                + _derivative_math(term.order, term.signal, (delay or {}).get(term.signal, 0.0), limits),
+                "term",
+            )
+        )
+    if item.friction is not None:
+        fc, fs, vs = item.friction.law
+        speed = _derivative_math(Order(1.0), item.output)
+        minus, sign = Markup('<mo form="infix">−</mo>'), Markup("<mi>sgn</mi><mo>(</mo>{}<mo>)</mo>").format(speed)
+        parts.append(_math(minus + _number_math(fc) + THIN + sign, "term"))
+        if item.friction.stribeck is not None:
+            fall = _FALL.format(speed, _number_math(vs))
+            parts.append(_math(minus + _number_math(fs) + THIN + fall + THIN + sign, "term"))
+    if isinstance(offset, str):
+        words = offset.removeprefix(" + ")
+        parts += [_math(Markup('<mo form="infix">+</mo><mi>{}</mi>').format(words), "term")] if words else []
+    else:
+        for name, value in offset.items():
+            sign, time = Markup('<mo form="infix">{}</mo>').format("−" if value < 0 else "+"), _symbol_math("t")
+            tail = THIN + time if name == "ramp" else Markup("")
+            parts.append(_math(sign + _number_math(abs(value)) + tail, "term"))
+    return Markup('<span class="equation">{}</span>').format(Markup(" ").join(parts))
+
+
+def equations_html(model: Solved, offsets: Sequence[Mapping[str, Mapping[str, float]]] | None = None) -> list[Markup]:
+    """Equations of a model; an offset as a number where there is one run, since every run has its own."""
+    structure = model.structure
+    own = offsets[0] if offsets is not None and len(offsets) == 1 else {}
+    return [
+        equation_html(e, structure.delay, structure.limits, own.get(e.output) or structure.offset_in_words)
+        for e in model.equations
+    ]
+
+
+def units_of(model: Solved) -> dict[str, str]:
+    """Unit of every named coefficient, friction, delay and limit whose unit is known."""
+    out = {}
+    for item in model.equations:
+        alpha = item.order.constant
+        for term in item.terms:
+            if term.name is not None:
+                unit = coefficient_unit(model.units, item.output, alpha, term.signal, term.order.constant)
+                out[term.name] = unit
+        if item.friction is not None:
+            own = model.units.get(item.output, "")
+            force = f"s^{-alpha:g} {own}" if own else ""
+            near = item.friction.stribeck
+            named = [(item.friction.name, force)]
+            if near is not None:
+                named += [(near.name, force), (near.speed_name, f"{own}/s" if own else "")]
+            out |= {name: unit for name, unit in named if name is not None}
+    out |= {f"delay_{name}": "s" for name in model.structure.delay}
+    out |= {limit.name: model.units.get(limit.signal, "") for limit in model.structure.limits}
+    return {name: unit for name, unit in out.items() if unit}
+
+
+def _math(content: Markup, name: str = "") -> Markup:
+    kind = Markup(' class="{}"').format(name) if name else Markup("")
+    return Markup("<math{}><mrow>{}</mrow></math>").format(kind, content)
+
+
+def _number_math(value: float | Exact) -> Markup:
+    mantissa, times, power = number(value).partition("×10")
+    base = Markup("<mn>{}</mn>").format(mantissa)
+    if not times:
+        return base
+    exponent = power.translate(_PLAIN_DIGITS)
+    sign = Markup("<mo>−</mo>") if exponent.startswith("-") else Markup("")
+    raised = Markup("<mrow>{}<mn>{}</mn></mrow>").format(sign, exponent.lstrip("-"))
+    return Markup("{}<mo>×</mo><msup><mn>10</mn>{}</msup>").format(base, raised)
+
+
+def _short(value: float) -> Exact:
+    """A number of an input as equations in words have it: of one that was estimated no more digits than of others."""
+    return Exact(f"{value:.6g}")
+
+
+def _symbol_math(name: str) -> Markup:
+    parts = SYMBOL.fullmatch(name)
+    if not parts:
+        return Markup("<mi>{}</mi>").format(name)
+    stem = Markup("<mi>{}</mi>").format(GREEK.get(parts[1], parts[1]))
+    return Markup("<msub>{}<mn>{}</mn></msub>").format(stem, parts[2]) if parts[2] else stem
+
+
+def _derivative_math(order: Order, signal: str, delay: float = 0.0, limits: Sequence[Limit] = ()) -> Markup:
+    written = _symbol_math(signal)
+    if delay > 0:
+        written += _LATE.format(_number_math(_short(delay)), THIN)
+    for limit in limits:
+        if limit.signal == signal and not isinstance(limit.value, tuple):
+            written = _LIMITED.format(SHORT[limit.law], written, _number_math(_short(float(limit.value))))
+    if not order.names and round(order.constant, ORDER_DECIMALS) == 0:
+        return written
+    value = Markup("<mi>{}</mi>").format(str(order)) if order.names else _signed(order.constant)
+    return Markup("<msup><mi>D</mi>{}</msup>{}{}").format(value, THIN, written)
+
+
+def _signed(value: float) -> Markup:
+    value = round(value, ORDER_DECIMALS) + 0.0
+    text = number(Exact(abs(value)))
+    return Markup("<mrow><mo>−</mo><mn>{}</mn></mrow>" if value < 0 else "<mn>{}</mn>").format(text)
+
+
+def derivative_html(order: Order, signal: str) -> Markup:
+    """Return a derivative of a signal as a line of text."""
+    if not order.names and round(order.constant, ORDER_DECIMALS) == 0:
+        return symbol_html(signal)
+    text = str(order) if order.names else number(Exact(round(order.constant, ORDER_DECIMALS) + 0.0))
+    return Markup("D<sup>{}</sup> {}").format(text, symbol_html(signal))
+
+
+def parameter_table(model: Solved, joint: JointFit | None = None, *, title: str = "Orders and coefficients") -> Table:
+    """Return orders and coefficients with the place of each, beside standard errors and the values the maker states.
+
+    Parameters
+    ----------
+    model
+        The model. What its ``estimate`` knows is used where there is no fit.
+    joint
+        The fit that it came from, where there is one: it knows the standard errors.
+    title
+        Caption.
+    """
+    reference = model.structure.reference
+    units = units_of(model)
+    errors: Mapping[str, float | None] = {}
+    extra: Mapping[str, float] = {}
+    profiles: Mapping[str, tuple[float, float]] = {}
+    if joint is not None:
+        errors, extra = joint.standard_errors, joint.coefficients
+        profiles = {n: (p.low, p.high) for n, p in joint.profiles.items()}
+    elif model.estimate is not None:
+        errors, extra = model.estimate.standard_errors, model.estimate.values
+        saved = {} if model.estimate.intervals is UNSET else model.estimate.intervals
+        profiles = {
+            n: (-math.inf if low is None else low, math.inf if high is None else high)
+            for n, (low, high) in saved.items()
+        }
+    known = any(e is not None for e in errors.values())
+
+    def row(name: str, value: float, stated: float | None, place: str) -> list[Cell]:
+        error = errors.get(name)
+        half = None if error is None else NORMAL_95 * error
+        ends: list[Cell] = [None, None] if half is None else [value - half, value + half]
+        if name in profiles:
+            ends = [v if math.isfinite(v) else unbounded(v) for v in profiles[name]]
+        return [symbol_html(name), value, error, *ends, stated, unit_html(units.get(name, "")), place]
+
+    rows = [row(n, v if known else Exact(v), None, "free order") for n, v in model.orders.items()]
+    shown = set(model.orders)
+    for item in model.equations:
+        for term in item.terms:
+            if term.name is None:
+                continue
+            derivative = derivative_html(term.order, term.signal)
+            place = Markup("of {} in the equation of {}").format(derivative, symbol_html(item.output))
+            stated = reference.get(term.name)
+            shown.add(term.name)
+            # + 0.0 makes the negative zero of a product of signs a plain zero.
+            rows.append(row(term.name, float(term.coefficient), None if stated is None else stated + 0.0, place))
+        if item.friction is not None:
+            near = item.friction.stribeck
+            of = {item.friction.name: "Coulomb friction"}
+            if near is not None:
+                of |= {near.name: "Stribeck friction, beyond Coulomb's at rest,", near.speed_name: "Stribeck's speed"}
+            for name, value in item.friction.found.items():
+                shown.add(name)
+                place = Markup("{} in the equation of {}").format(of[name], symbol_html(item.output))
+                rows.append(row(name, value, reference.get(name), place))
+    inputs = {input_name("delay", n): (f"delay of {symbol(n)}", v) for n, v in model.structure.delay.items()}
+    for limit in model.structure.limits:
+        if not isinstance(limit.value, tuple):
+            inputs[limit.name] = (f"{WORDS[limit.law]} of {symbol(limit.signal)}", limit.value)
+    inputs = {n: known_of for n, known_of in inputs.items() if n in errors}
+    rows += [
+        row(n, v, None, "free in the coefficient law") for n, v in extra.items() if n not in shown and n not in inputs
+    ]
+    rows += [row(n, v, None, place) for n, (place, v) in inputs.items()]
+    columns = ["parameter", "value", "standard error", "from", "to", "stated", "unit", "what it is"]
+    if known:
+        note = "A coefficient without an interval follows from the law. Intervals hold as far as the model does."
+        if profiles:
+            note += f" Those of {', '.join(map(symbol, profiles))} are by profile likelihood, the others symmetric."
+    else:
+        note = "No standard errors are given here: this table does not say how many of the digits mean something."
+    left_out = ([] if known else [2, 3, 4]) + ([] if reference else [5]) + ([] if units else [6])
+    if reference:
+        note += " Stated values belong to the integer orders of the maker's model."
+    kept = [i for i in range(len(columns)) if i not in left_out]
+    groups = (("", 3), ("95 % interval", 2), ("", len(kept) - 5)) if known else ()
+    shown_rows = [[cells[i] for i in kept] for cells in rows]
+    return Table(title, tuple(columns[i] for i in kept), shown_rows, groups=groups, note=note)
+
+
+def unit_html(unit: str) -> Markup:
+    """A unit with raised powers."""
+    parts = re.split(r"\^(-?[\d.]+)", unit)
+    raised = (
+        Markup("<sup>{}</sup>").format(p.replace("-", "−")) if k % 2 else Markup("{}").format(p)
+        for k, p in enumerate(parts)
+    )
+    return Markup("").join(raised)
+
+
+def model_html(model: Solved) -> str:
+    """Return the equations of a model and its parameters."""
+    lines = Markup("").join(Markup("<p>{}</p>").format(e) for e in equations_html(model))
+    known = model.orders or model.coefficients
+    return str(lines + parameter_table(model).to_html() if known else lines)

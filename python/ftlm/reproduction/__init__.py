@@ -1,0 +1,39 @@
+"""Reproduction of the paper's section 5, and the demonstration that is a part of it."""
+
+from ftlm.reproduction.claims import Claim, printed_saturation, table_3_coefficients
+from ftlm.reproduction.cross_validation import Deflection, UnseenOrders, Verdict, orders_on_unseen_runs
+from ftlm.reproduction.demo import Demo, StageRow, run_demo
+from ftlm.reproduction.published_values import AsPrinted, as_printed, implied_spreads
+from ftlm.reproduction.report import unseen_page
+from ftlm.reproduction.reproduction import Reproduction, reproduce
+from ftlm.reproduction.simulated_arm import demo_plant, demo_run
+from ftlm.reproduction.stage_result import Candidate, Rival, Stage
+from ftlm.reproduction.tables import PaperRow, paper_row, paper_table, paper_table_text
+
+__all__ = [
+    "AsPrinted",
+    "Candidate",
+    "Claim",
+    "Deflection",
+    "Demo",
+    "PaperRow",
+    "Reproduction",
+    "Rival",
+    "Stage",
+    "StageRow",
+    "UnseenOrders",
+    "Verdict",
+    "as_printed",
+    "demo_plant",
+    "demo_run",
+    "implied_spreads",
+    "orders_on_unseen_runs",
+    "paper_row",
+    "paper_table",
+    "paper_table_text",
+    "printed_saturation",
+    "reproduce",
+    "run_demo",
+    "table_3_coefficients",
+    "unseen_page",
+]

@@ -1,0 +1,413 @@
+"""Whether fractional orders earn their place on runs that were not fitted to: the links of a measured arm."""
+
+from __future__ import annotations
+
+import math
+from collections.abc import Callable, Mapping, Sequence
+from dataclasses import dataclass, field, replace
+from statistics import median
+from typing import Any
+
+from ftlm.arm.flexible_link import flexible_link
+from ftlm.data.run import Run
+from ftlm.errors import DataError, FtlmError, ModelError
+from ftlm.estimation.identify import identify
+from ftlm.estimation.result import Identification
+from ftlm.progress import Progress
+from ftlm.reproduction.simulated_arm import STAGES, StageNumber, thinned
+from ftlm.structure.structure import Structure
+from ftlm.utils.formatting import symbol
+from ftlm.utils.resources import between, by_output_error, expected
+from ftlm.utils.validation import check_threads, listed
+from ftlm.validation.comparison import Comparison, finite
+
+#: What may be fractional, by the orders that are free then; whole is what they are otherwise.
+WHOLE = "whole orders"
+KINDS: dict[str, tuple[str, ...]] = {
+    WHOLE: (),
+    "fractional elasticity": ("beta",),
+    "fractional damping": ("mu",),
+    "both fractional": ("beta", "mu"),
+}
+WHOLE_ORDERS = {"beta": 0.0, "mu": 1.0}
+#: Rows that a fit takes at most of a run; the arm's modes are a decade below the rate that is left of 20 s.
+MOST_ROWS = 1250
+#: What the structures of ``Deflection.before`` are called.
+WITHOUT = "without the rate of the other deflection"
+#: Points of fit below which a difference on an unseen run is none.
+MARGIN = 0.5
+
+
+@dataclass(frozen=True)
+class Fitted:
+    """One structure fitted to one run.
+
+    Parameters
+    ----------
+    result
+        The identification.
+    compared
+        Free runs by the name of the run, that which it was fitted to among them.
+    """
+
+    result: Identification
+    compared: dict[str, Comparison]
+
+    def fit(self, run: str) -> float:
+        """Fit of the free run in percent; minus infinity where it leaves the range of numbers."""
+        value = next(iter(self.compared[run].fit_percent.values()))
+        return value if math.isfinite(value) else -math.inf
+
+    @property
+    def estimates(self) -> dict[str, tuple[float, float, float]]:
+        """Every free number with the ends of its 95 % interval; orders first.
+
+        Two terms of the deflection differ by their orders alone. The lower one is the elasticity's, whatever name it
+        went by in the fit.
+        """
+        joint = self.result.joint
+        values = {**self.result.orders, **({} if joint is None else joint.coefficients)}
+        letters = {n.rstrip("0123456789"): n for n in values}
+        names = {n: n for n in values}
+        if {"beta", "mu"} <= letters.keys() and values[letters["beta"]] > values[letters["mu"]]:
+            for one, other in (("beta", "mu"), ("a", "d")):
+                names |= {letters[one]: letters[other], letters[other]: letters[one]}
+        return {n: (values[names[n]], *self.result.intervals[names[n]]) for n in values}
+
+    @property
+    def numbers(self) -> int:
+        """How many orders and coefficients were free."""
+        return len(self.estimates)
+
+
+@dataclass(frozen=True)
+class Verdict:
+    """Whether a kind of order earns its place.
+
+    Parameters
+    ----------
+    kind
+        A key of ``KINDS``.
+    earns
+        None where it cannot be told.
+    words
+        The numbers that it follows from.
+    """
+
+    kind: str
+    earns: bool | None
+    words: str
+
+
+@dataclass(frozen=True)
+class Deflection:
+    """One deflection of the arm.
+
+    Parameters
+    ----------
+    output
+        Its name.
+    structure
+        With both orders free.
+    fits
+        By kind, then by the run that was fitted.
+    failed
+        Why there is no fit, by kind and run.
+    before
+        The same without the rate of the other deflection; None where the other stage was not measured.
+    """
+
+    output: str
+    structure: Structure
+    fits: dict[str, dict[str, Fitted]]
+    failed: dict[tuple[str, str], str] = field(default_factory=dict)
+    before: Deflection | None = None
+
+    def gains(self, kind: str) -> dict[tuple[str, str], float]:
+        """Points of fit over whole orders by (fitted, judged), on runs that were not fitted to."""
+        found = {}
+        for run, whole in self.fits[WHOLE].items():
+            other = self.fits[kind].get(run)
+            for judged in whole.compared:
+                if judged != run:
+                    alone, free = whole.fit(judged), -math.inf if other is None else other.fit(judged)
+                    found[run, judged] = 0.0 if alone == free else free - alone
+        return found
+
+    def worse(self, kind: str) -> list[str]:
+        """Runs on which a fit is worse than that of whole orders, which its structure contains."""
+        both = ((run, each, self.fits[WHOLE][run]) for run, each in self.fits[kind].items())
+        return [run for run, free, whole in both if not free.fit(run) > whole.fit(run) - MARGIN]
+
+    def intervals(self, kind: str) -> dict[str, dict[str, tuple[float, float]]]:
+        """95 % intervals of the free orders, by order, then by the run that was fitted."""
+        return {
+            name: {run: each.estimates[name][1:] for run, each in self.fits[kind].items()}
+            for name in self.structure.order_names
+            if name.rstrip("0123456789") in KINDS[kind]
+        }
+
+    @property
+    def verdicts(self) -> list[Verdict]:
+        """Of every kind that has a fractional order."""
+        return [self.verdict(kind) for kind in KINDS if kind != WHOLE]
+
+    def verdict(self, kind: str) -> Verdict:
+        """Of one kind, from its gains and intervals."""
+        told = self.intervals(kind)
+        whole = {name: WHOLE_ORDERS[name.rstrip("0123456789")] for name in told}
+        worse = self.worse(kind)
+        complete = not worse and not any(k in (kind, WHOLE) for k, _ in self.failed)
+        earns = judged(list(self.gains(kind).values()), told, whole) if complete else None
+        before, after = (
+            {
+                pair: "no fit" if pair[0] not in self.fits[k] else percent(self.fits[k][pair[0]].fit(pair[1]))
+                for pair in self.gains(kind)
+            }
+            for k in (WHOLE, kind)
+        )
+        fits = "; ".join(f"{run} → {other} {before[run, other]}, then {after[run, other]}" for run, other in before)
+        orders = "; ".join(
+            f"{symbol(name)} " + ", ".join(f"{_range(low, high)} on {run}" for run, (low, high) in each.items())
+            for name, each in told.items()
+        )
+        words = f"Fit of unseen runs, percent: {fits}. 95 % intervals: {orders}."
+        if not all(overlapping(each.values()) for each in told.values()):
+            words += " The runs contradict each other."
+        if worse:
+            words += f" On {', '.join(worse)} it fits worse than the whole orders that it contains: no optimum found."
+        return Verdict(kind, earns, words)
+
+
+def overlapping(intervals: Any) -> bool:
+    """Whether all of some intervals have a value in common."""
+    each = list(intervals)
+    return not each or max(low for low, _ in each) <= min(high for _, high in each)
+
+
+def judged(
+    gains: Sequence[float], intervals: Mapping[str, Mapping[str, tuple[float, float]]], whole: Mapping[str, float]
+) -> bool | None:
+    """Whether orders earn their place, from the points of fit that they gain on unseen runs and their intervals.
+
+    They do where every run that was fitted excludes a whole order, the runs do not contradict each other, no unseen run
+    loses and the middle gain counts. They do not where no gain counts, or no run excludes a whole order and the middle
+    gain does not count. The rest cannot be told.
+    """
+    runs = list(next(iter(intervals.values()), {}))
+    told = [any(not e[r][0] <= whole[n] <= e[r][1] for n, e in intervals.items()) for r in runs]
+    counts = median(gains) >= MARGIN
+    if all(told) and counts and min(gains) > -MARGIN and all(overlapping(e.values()) for e in intervals.values()):
+        return True
+    if max(gains) < MARGIN or (not any(told) and not counts):
+        return False
+    return None
+
+
+def _range(low: float, high: float) -> str:
+    """An interval in short; an end that the run does not bound is left out."""
+    ends = [f"{v:.2f}".replace("-", "−") if math.isfinite(v) else "" for v in (low, high)]
+    if all(ends):
+        return " to ".join(ends)
+    return f"up to {ends[1]}" if ends[1] else f"from {ends[0]} up" if ends[0] else "anything"
+
+
+def percent(value: float) -> str:
+    """A fit in percent."""
+    return f"{value:.1f}".replace("-", "−") if math.isfinite(value) else "−∞"
+
+
+@dataclass(frozen=True)
+class UnseenOrders:
+    """Integer against fractional orders on runs that were not fitted to.
+
+    Parameters
+    ----------
+    runs
+        As they were fitted and judged.
+    deflections
+        By output.
+    filtered
+        Whether the deflections stand behind the stock filter.
+    notes
+        What was done to the runs.
+    """
+
+    runs: tuple[Run, ...]
+    deflections: dict[str, Deflection]
+    filtered: bool
+    notes: tuple[str, ...] = ()
+
+    def to_dict(self) -> dict[str, Any]:
+        """For JSON."""
+        return {
+            "runs": [run.name for run in self.runs],
+            "filtered": self.filtered,
+            "margin": MARGIN,
+            "deflections": {
+                output: _told(d) | ({} if d.before is None else {"without_rate": _told(d.before)})
+                for output, d in self.deflections.items()
+            },
+            "notes": list(self.notes),
+        }
+
+
+def _told(deflection: Deflection) -> dict[str, Any]:
+    """One structure's fits and verdicts, for JSON."""
+    return {
+        "equation": str(deflection.structure),
+        "verdicts": {v.kind: {"earns": v.earns, "words": v.words} for v in deflection.verdicts},
+        "fits": {
+            kind: {
+                run: {
+                    "numbers": f.numbers,
+                    "fit": {other: finite(f.fit(other)) for other in f.compared},
+                    "estimates": {n: float(v) for n, (v, *_) in f.estimates.items()},
+                    "intervals": {n: list(map(finite, ends)) for n, (_, *ends) in f.estimates.items()},
+                    "warnings": list(f.result.warnings),
+                }
+                for run, f in each.items()
+            }
+            for kind, each in deflection.fits.items()
+        },
+        "failed": {f"{kind}, {run}": words for (kind, run), words in deflection.failed.items()},
+    }
+
+
+def link_structure(stage: StageNumber, *, both: bool, filtered: bool, rate: bool = True) -> Structure:
+    """A deflection as (15) has it, driven by the measured hub: elasticity and damping of any order, gauge and cable.
+
+    With the other stage's angles its accelerations besides, by the energies of the planar arm, and the rate of its
+    deflection, an observer's gain (``rate``). Initial terms are Caputo's: a history would give fractional orders more
+    numbers of the judged run than whole ones.
+    """
+    made = flexible_link(
+        stage=stage,
+        hub=False,
+        cross_stage="inertial" if both else False,
+        cross_sensitivity=True,
+        cross_damping=both and rate,
+        sensor_filter="stock" if filtered else None,
+        laws=("orders", "coefficients", "velocities"),
+        offset="constant",
+    )
+    return replace(made, initial="caputo")
+
+
+def orders_on_unseen_runs(
+    runs: Sequence[Run],
+    *,
+    filtered: bool = True,
+    threads: int | None = None,
+    say: Callable[[str], None] = lambda _: None,
+    progress: Callable[[int, int], None] | None = None,
+) -> UnseenOrders:
+    """Fit every deflection of the arm to each run, with whole and with fractional orders, and judge it on all others.
+
+    A link is (15) with the terms that a real arm needs: the hub's measured motion, the other stage's accelerations
+    and the rate of its deflection where both stages were measured, hub angles in the gauge, and the gauge's zero, one
+    a run. The same terms stand in every structure; what differs is whether the link's elasticity (order 0) and its
+    damping (order 1) may have other orders. Where both stages were measured all of that is done without the rate of
+    the other deflection besides (``Deflection.before``): an order that earns its place there alone stands in for it.
+
+    Parameters
+    ----------
+    runs
+        Two or more, with theta11 and theta12 and (or) theta21 and theta22 [rad]. Of runs with more than 1250 rows one
+        row of so many is taken. Initial terms, the filter's state and the gauge's zero are each run's own.
+    filtered
+        Whether both deflections passed the 2 Hz low-pass of the arm's stock model.
+    threads, progress
+        See :func:`ftlm.search_orders`.
+    say
+        Called with a line about what happens next.
+
+    Returns
+    -------
+    UnseenOrders
+        Fits, intervals and verdicts.
+
+    Raises
+    ------
+    DataError
+        Fewer than two runs, two of one name, or runs without both angles of a stage.
+    ModelError
+        No fit with whole orders.
+    """
+    runs = [run if run.name else replace(run, name=f"run {k}") for k, run in enumerate(runs, 1)]
+    if len(runs) < 2:
+        raise DataError(f"{len(runs)} run cannot be both fitted and unseen; give two or more")
+    if len({run.name for run in runs}) < len(runs):
+        raise DataError(f"runs {listed(r.name for r in runs)} do not all have names of their own; rename a file")
+    stages = stages_in(runs)
+    notes: list[str] = []
+    used = []
+    for run in runs:
+        every = -(-run.length // MOST_ROWS)
+        if every > 1:
+            notes.append(f"of run {run.name} one of {every} rows is used, {every * run.step:.4g} s apart")
+        used.append(thinned(run, every) if every > 1 else run)
+    deflections = {}
+    both = len(stages) == 2
+    if isinstance(progress, Progress):
+        structures = [link_structure(stage, both=both, filtered=filtered) for stage in stages]
+        each = sum(
+            by_output_error(run.length, len(s.order_names) + len(s.coefficient_names))
+            for s in structures
+            for run in used
+        )
+        fits = len(KINDS) * (2 if both else 1) * each
+        progress.expect("all of it", *between(expected(fits, check_threads(threads))))
+    for stage in stages:
+        found = _deflection(link_structure(stage, both=both, filtered=filtered), "", used, threads, say, progress)
+        if both:
+            less = link_structure(stage, both=True, filtered=filtered, rate=False)
+            found = replace(found, before=_deflection(less, f", {WITHOUT}", used, threads, say, progress))
+        deflections[found.output] = found
+    return UnseenOrders(tuple(used), deflections, filtered, tuple(notes))
+
+
+def stages_in(runs: Sequence[Run]) -> list[StageNumber]:
+    """Stages both of whose angles all runs have.
+
+    Raises
+    ------
+    DataError
+        There is none.
+    """
+    found = [n for n in STAGES if all(f"theta{n}{k}" in run.signals for run in runs for k in (1, 2))]
+    if not found:
+        have = "; ".join(f"{run.name}: {', '.join(run.signals)}" for run in runs)
+        raise DataError(
+            f"no stage of the arm has both of its angles in all runs ({have}); needed are theta11 and theta12, or "
+            "theta21 and theta22: name their columns with --columns, or -y theta11=COLUMN"
+        )
+    return found
+
+
+def _deflection(
+    structure: Structure,
+    told: str,
+    runs: Sequence[Run],
+    threads: int | None,
+    say: Callable[[str], None],
+    progress: Callable[[int, int], None] | None,
+) -> Deflection:
+    """Every kind fitted to every run."""
+    output = structure.outputs[0]
+    runs = [run.select(list(structure.signals)) for run in runs]
+    fits: dict[str, dict[str, Fitted]] = {kind: {} for kind in KINDS}
+    failed = {}
+    for kind, free in KINDS.items():
+        letters = {n: n.rstrip("0123456789") for n in structure.order_names}
+        held = {n: WHOLE_ORDERS[letter] for n, letter in letters.items() if letter not in free}
+        for run in runs:
+            say(f"{output}{told}: {kind}, fitted to {run.name}")
+            try:
+                result = identify(run, structure.with_orders(held), threads=threads, progress=progress)
+                fits[kind][run.name] = Fitted(result, {other.name: result.model.compare(other) for other in runs})
+            except FtlmError as error:
+                if kind == WHOLE:
+                    raise ModelError(f"{output}, whole orders, fitted to {run.name}: {error}") from error
+                failed[kind, run.name] = str(error)
+    return Deflection(output, structure, fits, failed)

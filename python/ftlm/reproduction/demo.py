@@ -1,0 +1,216 @@
+"""The main job from end to end on simulated runs of both stages: a short reproduction, on a coarse lattice."""
+
+from __future__ import annotations
+
+from collections.abc import Callable, Mapping
+from dataclasses import dataclass
+from functools import cached_property
+from pathlib import Path
+from typing import Any
+
+from ftlm.data.run import Run
+from ftlm.estimation.linear import Trace
+from ftlm.estimation.result import Identification
+from ftlm.estimation.verdict import Validation
+from ftlm.progress import Course
+from ftlm.reproduction.published_values import INNOVATION_LENGTHS, OUTPUTS
+from ftlm.reproduction.simulated_arm import STAGES, demo_run, truth_of
+from ftlm.reproduction.stage_models import Preset, StageWork
+from ftlm.reproduction.stage_result import Candidate, Derived
+from ftlm.reproduction.tables import letters_of
+from ftlm.structure.order_grid import Lattice
+from ftlm.utils.files import check_folder
+from ftlm.validation.comparison import Metrics, finite
+
+#: Rows of an order search that a result keeps.
+KEEP = 20
+#: Steps between two points of a convergence curve: 128 points are more than a page shows.
+TRACE_EVERY = 16
+#: Parts of a stage that tell their names: an order search for each p and for least squares, and the joint fit.
+PARTS_OF_A_STAGE = len(INNOVATION_LENGTHS) + 2
+#: Models that are saved, by the end of their file's name.
+SAVED = {"paper": f"p = {INNOVATION_LENGTHS[-1]}", "output-error": "output error"}
+
+
+@dataclass(frozen=True)
+class StageRow:
+    """One row of a table in the shape of the paper's Tables 4 and 5, for one output.
+
+    Parameters
+    ----------
+    label
+        Which model.
+    output
+        Which equation.
+    orders, coefficients
+        By name; an integer-order model without the term has none.
+    equation_error, output_error
+        On the run that the model was identified from.
+    validation
+        Output error on the other run.
+    """
+
+    label: str
+    output: str
+    orders: Mapping[str, float]
+    coefficients: Mapping[str, float]
+    equation_error: Metrics
+    output_error: Metrics
+    validation: Metrics
+
+
+@dataclass(frozen=True)
+class Demo:
+    """Everything the demonstration made.
+
+    Parameters
+    ----------
+    square, sine
+        The runs.
+    rows
+        Table rows by stage.
+    results
+        Identifications by stage and label.
+    traces
+        Convergence by output and p.
+    derived
+        By stage, what the published equations make of the numbers that were found.
+    files
+        What was written.
+    """
+
+    square: Run
+    sine: Run
+    rows: dict[int, list[StageRow]]
+    results: dict[int, dict[str, Identification]]
+    traces: dict[str, dict[int, Trace]]
+    derived: dict[int, Derived]
+    files: list[Path]
+
+    @cached_property
+    def checked(self) -> dict[int, Validation]:
+        """The models of output error on the sine run, by stage."""
+        return {stage: results["output error"].validate(self.sine) for stage, results in self.results.items()}
+
+    @property
+    def truth(self) -> dict[int, dict[str, float]]:
+        """Orders and free coefficients of the simulated arm, by stage."""
+        return {stage: truth_of(stage) for stage in STAGES}
+
+    def to_dict(self) -> dict[str, Any]:
+        """For JSON."""
+        return {
+            "rows": {
+                str(stage): [
+                    {
+                        "model": r.label,
+                        "output": r.output,
+                        "orders": dict(r.orders),
+                        "coefficients": dict(r.coefficients),
+                        "equation_error": r.equation_error.to_dict(),
+                        "output_error": r.output_error.to_dict(),
+                        "validation": r.validation.to_dict(),
+                    }
+                    for r in rows
+                ]
+                for stage, rows in self.rows.items()
+            },
+            "warnings": {
+                f"stage {stage}, {label}": list(result.warnings)
+                for stage, results in self.results.items()
+                for label, result in results.items()
+            },
+            "correlation with the current": {
+                d.output: {words: finite(v) for words, v in d.correlations.items()} for d in self.derived.values()
+            },
+            "files": [str(f) for f in self.files],
+        }
+
+
+def rows_of(candidate: Candidate) -> list[StageRow]:
+    """A row for every equation of a model that was compared with both runs."""
+    own, other = candidate.estimation, candidate.validation
+    rows: list[StageRow] = []
+    if other is None:
+        return rows
+    for item in candidate.model.equations:
+        output, index = item.output, 1 + OUTPUTS.index(item.output)
+        orders, coefficients = ({f"{n}{index}": v for n, v in part.items()} for part in letters_of(item))
+        errors = own.equation_error[output], own.output_error[output], other.output_error[output]
+        rows.append(StageRow(candidate.label, output, orders, coefficients, *errors))
+    return rows
+
+
+def run_demo(
+    folder: Path,
+    *,
+    step: float = 0.1,
+    noise: float = 1e-4,
+    seed: int = 1,
+    threads: int | None = None,
+    force: bool = False,
+    say: Callable[[str], None] = lambda _: None,
+    progress: Callable[[int, int], None] | None = None,
+) -> Demo:
+    """Simulate, identify every equation with p = 1, 3, 5, 7, by least squares and by output error, compare, save.
+
+    Output error has the arm as it is, (14)-(15); the others have the paper's (22)-(25), whose links bend the wrong way.
+
+    Parameters
+    ----------
+    folder
+        Where runs and models go; made if it is not there.
+    step
+        Step of the order lattice; the paper's is 0.05, which takes minutes.
+    noise, seed
+        See :func:`demo_run`.
+    threads, progress
+        See :func:`ftlm.search_orders`.
+    force
+        Whether to overwrite.
+    say
+        Called with a line about what happens next.
+
+    Returns
+    -------
+    Demo
+        Tables and files.
+
+    Raises
+    ------
+    DataError
+        A file is there already and ``force`` is not set, or the folder cannot be written.
+    """
+    names = [f"stage{n}-{stem}.json" for n in STAGES for stem in SAVED]
+    check_folder(folder, ["square.csv", "sine.csv", *names, "demo.html"], force=force)
+    say("recording both stages on the virtual rig, under a square and a sine current")
+    square, sine = (demo_run(shape, noise=noise, seed=seed) for shape in ("square", "sine"))
+    demo = Demo(square, sine, {}, {}, {}, {}, [])
+    for run in (square, sine):
+        demo.files.append(folder / f"{run.name}.csv")
+        run.to_csv(demo.files[-1], force=force)
+    course = Course(progress)
+    parts = len(STAGES) * PARTS_OF_A_STAGE
+    at = 0
+
+    def named(label: str) -> None:
+        nonlocal at
+        course.at(at / parts)
+        at += 1
+        work.progress = course.until(at / parts)
+        say(label)
+
+    preset = Preset(Lattice(step=step), KEEP, TRACE_EVERY, alike=False)
+    for stage in STAGES:
+        work = StageWork(stage, square, sine, preset, threads, named, None)
+        models = {"integer order": work.stepped("integer order", work.manual("integer order")), **work.searches()}
+        words = "all orders and coefficients together by output error, from the current alone"
+        models["output error"] = work.joint("output error", work.coupled, words)
+        demo.rows[stage] = [row for candidate in models.values() for row in rows_of(candidate)]
+        demo.results[stage] = {label: c.result for label, c in models.items() if c.result is not None}
+        demo.traces.update(work.traces(models))
+        demo.derived[stage] = work.derived(models["output error"].model)
+        for stem, label in SAVED.items():
+            demo.files.append(folder / f"stage{stage}-{stem}.json")
+            models[label].model.save(demo.files[-1], force=force)
+    return demo

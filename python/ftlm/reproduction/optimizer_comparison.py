@@ -1,0 +1,426 @@
+"""Multi-innovation and its two rivals like for like: one record, criterion and budget, bounds that know nothing."""
+
+from __future__ import annotations
+
+import math
+from collections.abc import Callable, Iterable, Sequence
+from dataclasses import dataclass, replace
+from typing import Any
+
+import numpy as np
+
+from ftlm import _core
+from ftlm.arm.flexible_link import flexible_link, link_model, whole_order
+from ftlm.data.run import Run
+from ftlm.estimation.genetic import Genetic, GeneticRun, differential_evolution_search, genetic_search
+from ftlm.estimation.identify import identify
+from ftlm.estimation.linear import Trace, multi_innovation_trace
+from ftlm.estimation.result import Identification
+from ftlm.order_search.result import SearchResult
+from ftlm.order_search.search import search_orders
+from ftlm.reproduction import published_values as printed
+from ftlm.reproduction.published_values import INNOVATION_LENGTHS
+from ftlm.reproduction.simulated_arm import ARMS, StageNumber, demo_run, thinned
+from ftlm.reproduction.stage_result import PAIR, PRIORS, RIVAL_ALPHA, TRACE_EVERY, Stage
+from ftlm.simulation.discretization import default_m, prepare
+from ftlm.simulation.simulate import explicit_euler
+from ftlm.structure.order_grid import Lattice
+from ftlm.structure.structure import Structure
+from ftlm.validation.comparison import Comparison, compare_means, finite, metrics
+
+#: Most seeds, fewest, and how many evaluations of one rival on one angle all seeds together may come to.
+MOST_SEEDS, FEWEST_SEEDS, EVALUATIONS = 10, 3, 40_000
+#: Smallest step of the rivals' lattice, on every arm, unless another is asked for: the paper's has 60 000 candidates an
+#: angle, as many evaluations a seed, and takes minutes.
+CONTEST_STEP = 0.1
+
+
+@dataclass(frozen=True)
+class LikeForLike:
+    """What the three came to on one equation: p = 7 by K0, and both rivals."""
+
+    settings: Genetic
+    candidates: int
+    lattice: dict[float, SearchResult]
+    genetic: GeneticRun
+    evolution: GeneticRun
+
+
+def rivals_lattice(step: float, smallest: float = CONTEST_STEP) -> Lattice:
+    """The lattice of the genetic comparison, where the orders' own has this step."""
+    return Lattice(step=max(step, smallest), alpha=RIVAL_ALPHA)
+
+
+def seeds_for(candidates: int) -> tuple[int, ...]:
+    """Ten seeds, or as many as the evaluations allow."""
+    return tuple(range(min(MOST_SEEDS, max(FEWEST_SEEDS, EVALUATIONS // max(candidates, 1)))))
+
+
+def like_for_like(
+    run: Run,
+    single: Structure,
+    lattice: Lattice,
+    asked: Genetic | None = None,
+    *,
+    seeds: Sequence[int] | None = None,
+    threads: int | None = None,
+    progress: Callable[[int, int], None] | None = None,
+) -> LikeForLike:
+    """Give the genetic algorithm and differential evolution as many evaluations a seed as the lattice has candidates.
+
+    Parameters
+    ----------
+    run
+        One record that starts at rest.
+    single
+        One equation.
+    lattice
+        Of multi-innovation; its ends bound the rivals' orders.
+    asked
+        Seeds and evaluations that are asked for.
+    seeds
+        Where none are asked for; default as many as the evaluations allow.
+    threads, progress
+        See :func:`ftlm.search_orders`.
+
+    Raises
+    ------
+    ModelError
+        PyGAD or SciPy is not installed, or the record does not start at rest.
+    """
+    # Where a structure states the maker's values, bounds would follow them.
+    blind = replace(single, reference={})
+    searches = {
+        prior: search_orders(
+            run,
+            blind,
+            lattice,
+            coefficients="multi-innovation",
+            innovation_length=INNOVATION_LENGTHS[-1],
+            prior_covariance=prior,
+            keep=1,
+            threads=threads,
+            progress=progress,
+        )
+        for prior in PRIORS
+    }
+    count = searches[PRIORS[0]].candidates
+    settings = asked or Genetic(seeds=tuple(seeds or seeds_for(count)))
+    settings = replace(settings, evaluations=settings.evaluations or max(count, 2 * settings.population))
+    records = prepare([run], blind, None, power_of_two=True)
+    rivals = [
+        search(records, blind, lattice, settings, threads=threads, progress=progress)
+        for search in (genetic_search, differential_evolution_search)
+    ]
+    return LikeForLike(settings, count, searches, *rivals)
+
+
+#: An error has arrived where it stays below the end of p = 1 and this share of it.
+ARRIVED = 0.02
+#: Joint fits of the panel take one of so many rows: 8 ms on the virtual rig, a fifteenth of the fastest link's period.
+EVERY = 4
+#: Step of the panel's order lattices.
+PANEL_STEP = 0.25
+
+
+@dataclass(frozen=True)
+class Trial:
+    """Multi-innovation with all p on one angle of one record, with one K0.
+
+    Parameters
+    ----------
+    arm, seed, output, prior
+        Which record, which angle, which K0.
+    errors
+        Error (45) of the free run by p, each at its own best orders.
+    arrived
+        Steps by p until the error stays within 2 % of the end of p = 1, all at the orders of p = 7; infinite for never.
+    nr, manual
+        NR of p = 7 and of the manual's integer-order model.
+    """
+
+    arm: str
+    seed: int
+    output: str
+    prior: float
+    errors: dict[int, float]
+    arrived: dict[int, float]
+    nr: float
+    manual: float
+
+    def to_dict(self) -> dict[str, Any]:
+        """For JSON."""
+        return {
+            "arm": self.arm,
+            "seed": self.seed,
+            "output": self.output,
+            "K0": self.prior,
+            "nr": finite(self.nr),
+            "manual nr": finite(self.manual),
+            "errors": {str(p): finite(v) for p, v in self.errors.items()},
+            "steps": {str(p): finite(v) for p, v in self.arrived.items()},
+        }
+
+
+@dataclass(frozen=True)
+class Contest:
+    """Multi-innovation, the genetic algorithm and differential evolution on one angle of one record, like for like.
+
+    Parameters
+    ----------
+    arm, output
+        Which record, which angle.
+    candidates
+        Of the lattice, and evaluations of every seed.
+    step
+        Of the lattice.
+    lattice
+        Error (45) of p = 7 by K0.
+    genetic, evolution
+        Error (45) by seed.
+    """
+
+    arm: str
+    output: str
+    candidates: int
+    step: float
+    lattice: dict[float, float]
+    genetic: dict[int, float]
+    evolution: dict[int, float]
+
+    def to_dict(self) -> dict[str, Any]:
+        """For JSON."""
+        return {
+            "arm": self.arm,
+            "output": self.output,
+            "candidates": self.candidates,
+            "step": self.step,
+            "multi-innovation": {f"{k:g}": finite(v) for k, v in self.lattice.items()},
+            "genetic": {str(s): finite(v) for s, v in self.genetic.items()},
+            "differential evolution": {str(s): finite(v) for s, v in self.evolution.items()},
+        }
+
+
+@dataclass(frozen=True)
+class Freed:
+    """Whole and free orders of (14)-(15), both by joint output error from the currents alone, on one record.
+
+    Parameters
+    ----------
+    arm, stage
+        Which record.
+    whole, free
+        NR of the free run by angle.
+    orders
+        Estimate and 95 % interval of every free order.
+    """
+
+    arm: str
+    stage: int
+    whole: dict[str, float]
+    free: dict[str, float]
+    orders: dict[str, tuple[float, float, float]]
+
+    @property
+    def away(self) -> list[str]:
+        """Orders whose interval excludes the whole one."""
+        return [n for n, (_, low, high) in self.orders.items() if not low <= whole_order(n) <= high]
+
+    def to_dict(self) -> dict[str, Any]:
+        """For JSON."""
+        return {
+            "arm": self.arm,
+            "stage": self.stage,
+            "whole nr": {n: finite(v) for n, v in self.whole.items()},
+            "free nr": {n: finite(v) for n, v in self.free.items()},
+            "orders": {n: list(map(finite, v)) for n, v in self.orders.items()},
+            "not whole": self.away,
+        }
+
+
+@dataclass(frozen=True)
+class Panel:
+    """Everything that verdicts are made of."""
+
+    trials: tuple[Trial, ...] = ()
+    contests: tuple[Contest, ...] = ()
+    freed: tuple[Freed, ...] = ()
+
+    def beside(self, other: Panel) -> Panel:
+        """Both together."""
+        return Panel(self.trials + other.trials, self.contests + other.contests, self.freed + other.freed)
+
+    def to_dict(self) -> dict[str, Any]:
+        """For JSON."""
+        parts: tuple[tuple[str, Iterable[Any]], ...] = (
+            ("trials", self.trials),
+            ("contests", self.contests),
+            ("whole and free orders", self.freed),
+        )
+        return {name: [item.to_dict() for item in items] for name, items in parts}
+
+
+def arrived_at(trace: Trace, end: float) -> float:
+    """First step from which an error stays within a share of another one's end; infinite for never."""
+    with np.errstate(invalid="ignore"):
+        away = np.flatnonzero(~(trace.error <= (1.0 + ARRIVED) * end))
+    if not away.size:
+        return float(trace.step[0])
+    return float(trace.step[away[-1] + 1]) if away[-1] + 1 < trace.step.size else math.inf
+
+
+def manual_nr(stage: StageNumber, run: Run) -> dict[str, float]:
+    """NR of the manual's integer-order model by explicit Euler, as the paper ran it."""
+    m = default_m([run], power_of_two=True)
+    found = {}
+    for name, samples in explicit_euler(link_model(stage=stage, form="published"), run).items():
+        with np.errstate(over="ignore", invalid="ignore"):
+            finite_run = bool(np.all(np.isfinite(samples)))
+        measured = _core.pulse_means(run[name], m, False)
+        found[name] = metrics(measured, _core.pulse_means(samples, m, False)).nr if finite_run else math.inf
+    return found
+
+
+def trials_of(stage: StageNumber, square: Run, arm: str, seed: int, threads: int | None) -> list[Trial]:
+    """Multi-innovation on both angles of a stage, with all p and both ends of K0."""
+    structure = flexible_link(stage=stage, form="published", coupling="measured", laws=())
+    run = square.select(list(structure.signals))
+    manual, found = manual_nr(stage, run), []
+    for output in structure.outputs:
+        single = structure.equation(output)
+        for prior in PRIORS:
+            best = {
+                p: search_orders(
+                    run,
+                    single,
+                    Lattice(step=PANEL_STEP),
+                    coefficients="multi-innovation",
+                    innovation_length=p,
+                    prior_covariance=prior,
+                    keep=1,
+                    threads=threads,
+                )
+                for p in printed.INNOVATION_LENGTHS
+            }
+            last = best[printed.INNOVATION_LENGTHS[-1]].model
+            known = single.with_orders({n: last.orders[n] for n in single.order_names})
+            traces = {
+                p: multi_innovation_trace(run, known, innovation_length=p, prior_covariance=prior, every=TRACE_EVERY)
+                for p in printed.INNOVATION_LENGTHS
+            }
+            end = float(traces[printed.INNOVATION_LENGTHS[0]].error[-1])
+            nr = compare_means(last, run).output_error[output].nr
+            found.append(
+                Trial(
+                    arm,
+                    seed,
+                    output,
+                    prior,
+                    {p: s.score for p, s in best.items()},
+                    {p: arrived_at(t, end) for p, t in traces.items()},
+                    nr,
+                    manual[output],
+                )
+            )
+    return found
+
+
+def contest(made: LikeForLike, output: str, arm: str, step: float) -> Contest:
+    """The errors of all three."""
+    lattice = {k: search.score for k, search in made.lattice.items()}
+    return Contest(arm, output, made.candidates, step, lattice, made.genetic.errors, made.evolution.errors)
+
+
+def freed_of(
+    stage: StageNumber,
+    square: Run,
+    arm: str,
+    threads: int | None,
+    progress: Callable[[int, int], None] | None = None,
+) -> Freed:
+    """Whole and free orders of one stage of a simulated arm, which starts at rest, on one of so many rows.
+
+    Raises
+    ------
+    ConvergenceError
+        No start of one of the fits converged.
+    """
+    structure = replace(flexible_link(stage=stage, coupling="simulated"), initial="rest")
+    own = square.select(list(structure.signals))
+    run = thinned(own, EVERY)
+    whole = structure.with_orders({n: whole_order(n) for n in structure.order_names})
+    # Whole orders on an arm that has none let coefficients go where their squares are no numbers.
+    with np.errstate(over="ignore", invalid="ignore", divide="ignore"):
+        fits = [identify(run, item, threads=threads, progress=progress) for item in (whole, structure)]
+    m = default_m([own], power_of_two=True)
+    coarse, fine = (compare_means(replace(fit.model, m=m), own) for fit in fits)
+    return _freed(arm, stage, coarse, fine, fits[1])
+
+
+def _freed(arm: str, stage: int, whole: Comparison, free: Comparison, fit: Identification) -> Freed:
+    nr, free_nr = ({o: f.nr for o, f in c.output_error.items()} for c in (whole, free))
+    return Freed(arm, stage, nr, free_nr, {n: (v, *fit.intervals[n]) for n, v in fit.orders.items()})
+
+
+def panel_of(stages: Sequence[Stage], square: Run, arm: str, seed: int, threads: int | None) -> Panel:
+    """What one run, and the stages that were made of it, add: no trials of a run that does not start at rest."""
+    trials: list[Trial] = []
+    contests = []
+    freed = []
+    for stage in stages:
+        if stage.traces:
+            trials += trials_of(stage.number, square, arm, seed, threads)
+        for output, rival in stage.rivals.items():
+            lattice = dict(zip(PRIORS, (rival.models[n] for n in PAIR), strict=True))
+            errors = {k: c.estimation.output_error[output].error for k, c in lattice.items()}
+            contests.append(
+                Contest(
+                    arm,
+                    output,
+                    rival.candidates,
+                    rival.step,
+                    errors,
+                    rival.genetic_run.errors,
+                    rival.evolution_run.errors,
+                )
+            )
+        whole, free = (stage.candidates[n] for n in ("integer, identified", "output error"))
+        if free.result is not None and free.result.joint is not None:
+            freed.append(_freed(arm, stage.number, whole.estimation, free.estimation, free.result))
+    return Panel(tuple(trials), tuple(contests), tuple(freed))
+
+
+def simulated_panel(
+    stage: StageNumber,
+    arm: str,
+    seeds: Sequence[int],
+    noise: float,
+    threads: int | None,
+    *,
+    genetic: Genetic | None = None,
+    lattice: Lattice | None = None,
+    begin: Callable[[str], None] = lambda _: None,
+    progress: Callable[[int, int], None] | None = None,
+) -> Panel:
+    """One stage on one simulated arm; with the rivals' lattice contests and joint fits as well, on the first record.
+
+    Before each step `begin` is called with what it is, a key of `ftlm.reproduction.stage_models.STEPS`.
+    """
+    trials: list[Trial] = []
+    contests: list[Contest] = []
+    freed: list[Freed] = []
+    for seed in seeds:
+        run = demo_run("square", noise=noise, seed=seed, parameters=ARMS[arm])
+        begin("trials")
+        trials += trials_of(stage, run, arm, seed, threads)
+        if lattice is None or seed != seeds[0]:
+            continue
+        structure = flexible_link(stage=stage, form="published", coupling="measured", laws=())
+        own = run.select(list(structure.signals))
+        for output in structure.outputs:
+            begin("rivals")
+            made = like_for_like(own, structure.equation(output), lattice, genetic, threads=threads, progress=progress)
+            contests.append(contest(made, output, arm, lattice.step))
+        begin("freed")
+        freed.append(freed_of(stage, run, arm, threads, progress))
+    return Panel(tuple(trials), tuple(contests), tuple(freed))

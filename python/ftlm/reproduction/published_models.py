@@ -1,0 +1,188 @@
+"""The paper's printed models run: whether they are stable, how far its current moves them, what they give back."""
+
+from __future__ import annotations
+
+from dataclasses import dataclass
+from typing import Any
+
+import numpy as np
+
+from ftlm import _core
+from ftlm.analysis.poles import Stability, stability
+from ftlm.arm.flexible_link import flexible_link
+from ftlm.data.run import Run
+from ftlm.errors import FtlmError
+from ftlm.model.model import Model
+from ftlm.order_search.search import search_orders
+from ftlm.plot.comparison_charts import pulse_times
+from ftlm.reproduction import published_values as printed
+from ftlm.reproduction.published_values import implied_spreads, papers_record
+from ftlm.reproduction.simulated_arm import StageNumber, demo_run
+from ftlm.reproduction.stage_result import PRIORS
+from ftlm.structure.equation import Equation, Term
+from ftlm.structure.order import Order
+from ftlm.structure.order_grid import Lattice
+from ftlm.structure.structure import Structure
+from ftlm.utils.validation import Floats
+from ftlm.validation.comparison import compare_means, finite
+
+#: Orders around the printed ones that a printed model's own response is searched on, in the paper's steps.
+STEP, AROUND = 0.05, 2
+
+
+@dataclass(frozen=True)
+class Ran:
+    """One printed model of one angle, run under the paper's current from rest.
+
+    Parameters
+    ----------
+    output, p
+        Which row of Tables 4 and 5.
+    stability
+        Of the stage's two printed equations together.
+    moved, alone
+        Standard deviation of the angle [rad], by both equations together and by (26) with one angle alone.
+    implied
+        Standard deviation that the paper's own RMSE / NR gives the measured angle [rad].
+    time, response
+        Middle of every pulse [s], and the angle by both equations [rad].
+    arm
+        The simulated arm's angle, scaled to the implied deviation [rad].
+    returned
+        Coefficients that multi-innovation returns from that response at the printed orders, by K0.
+    orders
+        Orders that it returns by K0, searched around the printed ones; empty unless p is the largest.
+    """
+
+    output: str
+    p: int
+    stability: Stability
+    moved: float
+    alone: float
+    implied: float
+    time: Floats
+    response: Floats
+    arm: Floats
+    returned: dict[float, dict[str, float]]
+    orders: dict[float, dict[str, float]]
+
+    @property
+    def too_small(self) -> float:
+        """How many times more the paper's own angle moves."""
+        return self.implied / self.moved if self.moved else np.inf
+
+    def to_dict(self) -> dict[str, Any]:
+        """For JSON."""
+        return {
+            "output": self.output,
+            "p": self.p,
+            "stability": str(self.stability),
+            "unstable poles": finite(self.stability.unstable_poles),
+            "moved": finite(self.moved),
+            "moved, one angle": finite(self.alone),
+            "implied": self.implied,
+            "implied / moved": finite(self.too_small),
+            "returned": {f"{k:g}": v for k, v in self.returned.items()},
+            "orders": {f"{k:g}": v for k, v in self.orders.items()},
+        }
+
+
+def printed_numbers(stage: StageNumber, p: int) -> tuple[dict[str, float], dict[str, float]]:
+    """Orders and coefficients of a stage's two printed equations, by the names of (22)-(25)."""
+    orders: dict[str, float] = {}
+    coefficients: dict[str, float] = {}
+    for k in (1, 2):
+        row, n = printed.FRACTIONAL[f"theta{stage}{k}"][p], 2 * stage - 2 + k
+        orders |= {f"{name}{n}": float(v) for name, v in row.orders.items()}
+        coefficients |= {f"{name}{n}": float(v) for name, v in row.coefficients.items()}
+    return orders, coefficients
+
+
+def printed_model(stage: StageNumber, p: int) -> Model:
+    """Both printed equations of a stage, driven by the current alone."""
+    orders, coefficients = printed_numbers(stage, p)
+    structure = flexible_link(stage=stage, form="published", coupling="simulated", laws=())
+    known = structure.with_orders(orders).with_coefficients(coefficients)
+    return Model(known, orders=orders, m=printed.POINTS)
+
+
+def one_angle(output: str, p: int) -> Model:
+    """The printed row as (26) reads: every term but the current's has the angle itself."""
+    row = printed.FRACTIONAL[output][p]
+    terms = [
+        Term(output, Order(float(row.orders[order])), float(row.coefficients[letter]))
+        for letter, order in zip("abd", ("beta", "gamma", "mu"), strict=True)
+    ]
+    terms.append(Term(f"I{output[-2]}", Order(), float(row.coefficients["g"])))
+    return Model(Structure((Equation(output, Order(float(row.orders["alpha"])), tuple(terms)),)), m=printed.POINTS)
+
+
+def papers_current(stage: StageNumber) -> Run:
+    """The paper's square current over one stage; nothing here uses the demonstration's angles beside it."""
+    return demo_run("square", noise=0.0).select([f"I{stage}", f"theta{stage}1", f"theta{stage}2"])
+
+
+def ran(stage: StageNumber, threads: int | None = None) -> list[Ran]:
+    """Run every printed fractional model of a stage, and identify each from its own response."""
+    drive, found = papers_current(stage), []
+    spreads = implied_spreads()
+    scaled, _ = papers_record()
+    for p in printed.INNOVATION_LENGTHS:
+        model = printed_model(stage, p)
+        free = compare_means(model, drive)
+        verdict = stability(model)
+        own = model.simulate(drive)
+        structure = flexible_link(stage=stage, form="published", coupling="measured", laws=())
+        for output in model.outputs:
+            response = free.simulated[output][0]
+            single = compare_means(one_angle(output, p), drive.select([f"I{stage}", output]))
+            found.append(
+                Ran(
+                    output,
+                    p,
+                    verdict,
+                    float(np.std(response)),
+                    float(np.std(single.simulated[output][0])),
+                    spreads[output][1],
+                    pulse_times(free),
+                    response,
+                    _core.pulse_means(scaled[output], printed.POINTS, False),
+                    *_returned(own, structure.equation(output), printed_numbers(stage, p)[0], p, threads),
+                )
+            )
+    return found
+
+
+def _returned(
+    run: Run, single: Structure, orders: dict[str, float], p: int, threads: int | None
+) -> tuple[dict[float, dict[str, float]], dict[float, dict[str, float]]]:
+    """Coefficients at the model's own orders, and for the largest p the orders around them, by K0."""
+    own = {n: orders[n] for n in single.order_names}
+    wide = {
+        n: [round(v + k * STEP, 9) for k in range(-AROUND, AROUND + 1) if v + k * STEP < 2.0 or n.startswith("alpha")]
+        for n, v in own.items()
+    }
+    wide |= {n: [v] for n, v in own.items() if n.startswith("alpha")}
+
+    def best(axes: dict[str, list[float]], prior: float) -> Model | None:
+        try:
+            return search_orders(
+                run,
+                single,
+                Lattice(step=STEP, orders=axes),
+                coefficients="multi-innovation",
+                innovation_length=p,
+                prior_covariance=prior,
+                m=printed.POINTS,
+                keep=1,
+                threads=threads,
+            ).model
+        except FtlmError:  # no candidate has a finite error
+            return None
+
+    coefficients = {k: best({n: [v] for n, v in own.items()}, k) for k in PRIORS}
+    searched = {k: best(wide, k) for k in PRIORS} if p == printed.INNOVATION_LENGTHS[-1] else {}
+    return (
+        {k: dict(m.coefficients) for k, m in coefficients.items() if m is not None},
+        {k: {n: m.orders[n] for n in own} for k, m in searched.items() if m is not None},
+    )

@@ -1,0 +1,410 @@
+"""What the paper prints in its Tables 3 to 7: numbers to set beside computed ones, never to compute with.
+
+Wang, Li, Li, Liang, Gao, Symmetry 2025, 17, 1072, doi:10.3390/sym17071072. Digits are the paper's.
+"""
+
+from __future__ import annotations
+
+import math
+from collections.abc import Mapping, Sequence
+from dataclasses import dataclass
+from itertools import product
+from typing import Any, Literal
+
+import numpy as np
+
+from ftlm import _core
+from ftlm.arm.flexible_link import flexible_link
+from ftlm.data.run import Run
+from ftlm.errors import InternalError
+from ftlm.fractional_calculus import haar_transform
+from ftlm.order_search.options import COMPARED_LENGTHS
+from ftlm.reproduction.simulated_arm import PAPERS_ARM, demo_run
+from ftlm.simulation.discretization import record, sensor_series
+from ftlm.utils.formatting import Exact
+from ftlm.utils.validation import Floats
+from ftlm.validation.comparison import Metrics, finite, metrics
+
+#: The paper's p, its number of pulses, and its four angles in the order n = 1 … 4.
+INNOVATION_LENGTHS = COMPARED_LENGTHS
+POINTS = 2048
+OUTPUTS = ("theta11", "theta12", "theta21", "theta22")
+#: Letters of the orders and of the coefficients, in the order of the tables' columns.
+ORDERS, COEFFICIENTS = ("gamma", "alpha", "beta", "mu"), ("a", "b", "d", "g")
+
+
+@dataclass(frozen=True)
+class Printed:
+    """One printed row: its numbers by letter, and criteria (45), (46), (47); None where the table has none."""
+
+    orders: Mapping[str, float]
+    coefficients: Mapping[str, float]
+    error: float | None = None
+    rmse: float | None = None
+    nr: float | None = None
+
+
+def _row(orders: tuple[float | None, ...], coefficients: tuple[float | None, ...], *criteria: float) -> Printed:
+    def present(letters: tuple[str, ...], values: tuple[float | None, ...]) -> dict[str, float]:
+        return {letter: Exact(v) for letter, v in zip(letters, values, strict=True) if v is not None}
+
+    return Printed(present(ORDERS, orders), present(COEFFICIENTS, coefficients), *map(Exact, criteria))
+
+
+_WHOLE = (1.0, 2.0, None, 1.0)
+_HUB, _LINK = (1.9, 2.0, 1.85, 1.8), (1.95, 2.0, 1.9, 1.85)
+#: Integer-order rows of Tables 4 and 5.
+INTEGER: dict[str, Printed] = {
+    "theta11": _row(_WHOLE, (628.89, -62.956, None, 140.47), 640.31, 0.3829, 4.2028),
+    "theta12": _row(_WHOLE, (-863.33, 62.956, None, -140.47), 23.764, 0.0205, 3.4665),
+    "theta21": _row(_WHOLE, (2271.12, -496.76, 28.35, 288.12), 242.16, 0.2312, 1.6330),
+    "theta22": _row(_WHOLE, (-3336.18, 496.76, -41.65, -288.12), 244.79, 0.1045, 29.967),
+}
+#: Fractional rows of Tables 4 and 5, by angle and innovation length.
+FRACTIONAL: dict[str, dict[int, Printed]] = {
+    "theta11": {
+        1: _row(_HUB, (-0.5002, 0.0253, 0.0186, 0.0345), 58.973, 0.0336, 0.3683),
+        3: _row(_HUB, (-0.7798, 0.0339, 0.0214, 0.0115), 37.764, 0.0212, 0.2323),
+        5: _row(_HUB, (-0.8789, 0.0321, 0.0155, 0.0029), 32.426, 0.0186, 0.2045),
+        7: _row(_HUB, (-0.9302, 0.0277, 0.0077, -0.0015), 30.561, 0.0180, 0.1974),
+    },
+    "theta12": {
+        1: _row(_LINK, (-0.7308, 0.0039, -0.4494, -0.0016), 1.5643, 0.00097, 0.1653),
+        3: _row(_LINK, (-0.9449, 0.0016, -0.2617, -0.0018), 1.4834, 0.00092, 0.1559),
+        5: _row(_LINK, (-1.1164, 0.0011, -0.0825, -0.0018), 1.3957, 0.00087, 0.1465),
+        7: _row(_LINK, (-1.2655, 0.0008, 0.0779, -0.0017), 1.3136, 0.00081, 0.1378),
+    },
+    "theta21": {
+        1: _row(_HUB, (-0.8114, 0.0108, 0.0067, 0.0228), 81.229, 0.0447, 0.3155),
+        3: _row(_HUB, (-1.0049, 0.0043, -0.0028, 0.0395), 57.369, 0.0329, 0.2322),
+        5: _row(_HUB, (-1.0556, 0.0048, -0.0146, 0.0439), 54.504, 0.0321, 0.2267),
+        7: _row(_HUB, (-1.0791, 0.0144, -0.0266, 0.0459), 53.989, 0.0320, 0.2266),
+    },
+    "theta22": {
+        1: _row(_LINK, (-0.5149, 0.0053, -0.4219, -0.0006), 1.1985, 0.00072, 0.2051),
+        3: _row(_LINK, (-0.6531, 0.0026, -0.4494, -0.0009), 1.0105, 0.00062, 0.1781),
+        5: _row(_LINK, (-0.7226, 0.0019, -0.4173, 0.0010), 0.9917, 0.00061, 0.1756),
+        7: _row(_LINK, (-0.7787, 0.0017, -0.3759, 0.0010), 0.9791, 0.00060, 0.1737),
+    },
+}
+#: Table 6: the genetic algorithm.
+GENETIC: dict[str, Printed] = {
+    "theta11": _row((1.9299, 1.9722, 1.8977, 1.8655), (-0.2832, 4.8206, -4.1504, 0.0112)),
+    "theta12": _row((1.9621, 1.9722, 1.9299, 1.8977), (-0.0159, 0.0238, 0.5145, 0.0172)),
+    "theta21": _row((1.9299, 1.9722, 1.8977, 1.8655), (-0.4537, -9.0544, 9.5132, 0.0006)),
+    "theta22": _row((1.9621, 1.9722, 1.9299, 1.8977), (-0.0231, -0.0009, 0.2365, 0.0012)),
+}
+#: Table 7: (error, RMSE, NR) of the genetic algorithm and of multi-innovation.
+RIVALS: dict[str, tuple[tuple[float, float, float], tuple[float, float, float]]] = {
+    "theta11": ((70.844, 0.0401, 0.3554), (30.561, 0.0180, 0.1974)),
+    "theta12": ((6.8453, 0.0042, 0.1812), (1.3136, 0.0008, 0.1378)),
+    "theta21": ((65.306, 0.0395, 0.2270), (53.989, 0.0320, 0.2266)),
+    "theta22": ((7.3449, 0.0042, 0.3058), (0.9791, 0.0006, 0.1737)),
+}
+#: Table 3: value and printed unit, with the paper's names.
+TABLE_3: dict[str, tuple[float, str]] = {
+    "L_1": (0.3493, "m"),
+    "L_2": (0.2975, "m"),
+    "J_11": (0.0635, "kg m²"),
+    "J_12": (0.1704, "kg m²"),
+    "B_11": (4.0, "Nm²"),
+    "B_12": (0.421, "Nm²"),
+    "J_21": (0.003, "kg m²"),
+    "J_22": (0.0064, "kg m²"),
+    "B_21": (1.5, "Nm²"),
+    "B_22": (0.856, "Nm²"),
+    "K_s1": (2.69, "Nm²"),
+    "K_s2": (0.463, "Nm²"),
+    "K_τ1": (0.119, "Nm²"),
+    "K_τ2": (0.0234, "Nm²"),
+}
+
+
+def last_orders(output: str) -> dict[str, float]:
+    """Orders of an angle's row of p = 7 by name, such as alpha1."""
+    index = 1 + OUTPUTS.index(output)
+    return {f"{n}{index}": v for n, v in FRACTIONAL[output][INNOVATION_LENGTHS[-1]].orders.items()}
+
+
+#: What may stand in the terms a, b and d of an angle: the angle itself (own) or the other one of its stage.
+READINGS = {
+    "(22)–(25)": "as printed there",
+    "(26), one angle": "every term has the angle itself",
+    "own angle in a": "the angle itself in a, the other one in b and d",
+    "a and b exchanged": "the orders of (22)–(25), the columns a and b of the table exchanged",
+}
+#: K0 that are tried: eight a decade.
+SCAN = tuple(float(v) for v in np.logspace(-3, 5, 65))
+#: Orders around the printed ones, in the paper's steps, among which the printed ones have their place.
+LOW, HIGH, STEP = 1.6, 1.95, 0.05
+#: A column agrees with the printed one where its signs do and no entry is further than this factor.
+NEAR = 1.25
+
+
+@dataclass(frozen=True)
+class Reading:
+    """One way to read what the paper did.
+
+    Parameters
+    ----------
+    terms
+        A key of `READINGS`.
+    filtered
+        Whether the deflections passed the stock 2 Hz filter.
+    reversed
+        Whether terms of the angle itself stand on the left-hand side, as in a transfer function: their sign turns.
+    prior
+        K0.
+    """
+
+    terms: str
+    filtered: bool
+    reversed: bool
+    prior: float
+
+    def __str__(self) -> str:
+        parts = [self.terms, "stock filter" if self.filtered else "no filter"]
+        return ", ".join([*parts, *["own terms on the left"] * self.reversed, f"K0 = {self.prior:.3g}"])
+
+
+@dataclass(frozen=True)
+class Row:
+    """What one reading gives with one p, at the printed orders."""
+
+    coefficients: dict[str, float]
+    equation: Metrics
+
+
+@dataclass(frozen=True)
+class AsPrinted:
+    """One angle's part of Tables 4 and 5 by the reading that comes nearest.
+
+    Parameters
+    ----------
+    output
+        The angle.
+    reading
+        The nearest of all.
+    rows
+        By p, with the signs of that reading.
+    away
+        Factor by which a and NR of the four rows are away from the printed ones, in the geometric mean.
+    away_at_one
+        The same with K0 = 1 and the nearest of the other choices.
+    rank, among
+        Place of the printed orders by the error (45) of the equation among neighbouring ones, at p = 7.
+    best
+        Orders of the first place.
+    scale
+        What the simulated angle was multiplied by.
+    """
+
+    output: str
+    reading: Reading
+    rows: dict[int, Row]
+    away: float
+    away_at_one: float
+    rank: int
+    among: int
+    best: dict[str, float]
+    scale: float
+
+    @property
+    def alike(self) -> list[str]:
+        """Coefficients that rise and fall with p as the printed ones do."""
+        table = FRACTIONAL[self.output]
+
+        def course(rows: Mapping[int, Any], letter: str) -> list[float]:
+            return np.sign(np.diff([rows[p].coefficients[letter] for p in INNOVATION_LENGTHS])).tolist()  # type: ignore[no-any-return]
+
+        return [c for c in COEFFICIENTS if course(self.rows, c) == course(table, c)]
+
+    @property
+    def ratios(self) -> dict[str, list[float]]:
+        """Ours over printed by p, of every column and of NR."""
+        table = FRACTIONAL[self.output]
+        columns = {
+            c: [r.coefficients[c] / table[p].coefficients[c] for p, r in self.rows.items()] for c in COEFFICIENTS
+        }
+        return columns | {"NR": [r.equation.nr / float(table[p].nr or 1.0) for p, r in self.rows.items()]}
+
+    @property
+    def near(self) -> bool:
+        """Whether every coefficient has the printed sign and is, as NR is, within a quarter of the printed value."""
+        return all(1.0 / NEAR <= q <= NEAR for column in self.ratios.values() for q in column)
+
+    def to_dict(self) -> dict[str, Any]:
+        """For JSON."""
+        return {
+            "reading": str(self.reading),
+            "K0": self.reading.prior,
+            "terms": self.reading.terms,
+            "filtered": self.reading.filtered,
+            "sign reversed": self.reading.reversed,
+            "away": finite(self.away),
+            "away at K0 = 1": finite(self.away_at_one),
+            "rank of the printed orders": self.rank,
+            "among": self.among,
+            "best orders": self.best,
+            "scale": self.scale,
+            "columns of the printed course": self.alike,
+            "ours / printed": self.ratios,
+            "rows": {
+                str(p): {"coefficients": r.coefficients, "equation_error": r.equation.to_dict()}
+                for p, r in self.rows.items()
+            },
+        }
+
+
+class _Angle:
+    """Regressors of one angle at any order, in Haar coordinates, and the closed form of the recursion (44)."""
+
+    def __init__(self, angles: Mapping[str, Floats], current: Floats, output: str, step: float) -> None:
+        other = output[:-1] + ("2" if output.endswith("1") else "1")
+        self.output, self.step, self.signals = (
+            output,
+            step,
+            {"own": angles[output], "other": angles[other], "u": current},
+        )
+        self.y = angles[output]
+        self.m = self.y.size
+        self.haar_y = haar_transform(self.y)
+        self._kept: dict[tuple[str, float], tuple[Floats, Floats]] = {}
+
+    def integral(self, signal: str, order: float) -> tuple[Floats, Floats]:
+        """I^order of a signal, in time and in Haar coordinates."""
+        key = signal, round(order, 6)
+        if key not in self._kept:
+            kernel = _core.block_pulse_kernel(order, self.m, self.step)
+            series = _core.series_multiply(kernel, self.signals[signal], self.m)
+            self._kept[key] = series, haar_transform(series)
+        return self._kept[key]
+
+    def places(self, terms: str) -> tuple[str, str, str, str]:
+        """Which signal the terms a, b, d, g have."""
+        hub = self.output.endswith("1")
+        return {
+            "(22)–(25)": ("other", "own", "other", "u") if hub else ("own", "other", "own", "u"),
+            "(26), one angle": ("own", "own", "own", "u"),
+            "own angle in a": ("own", "other", "other", "u"),
+            "a and b exchanged": ("own", "other", "other", "u") if hub else ("other", "own", "own", "u"),
+        }[terms]
+
+    def regressors(self, terms: str, orders: Mapping[str, float]) -> tuple[Floats, Floats]:
+        """Columns a, b, d, g of (42)."""
+        names = ("gamma", "beta", "mu") if terms == "a and b exchanged" else ("beta", "gamma", "mu")
+        etas = [*(orders["alpha"] - orders[n] for n in names), orders["alpha"]]
+        parts = [self.integral(s, eta) for s, eta in zip(self.places(terms), etas, strict=True)]
+        time, haar = zip(*parts, strict=True)
+        return np.stack(time, axis=1), np.stack(haar, axis=1)
+
+    def solved(self, haar: Floats, priors: Sequence[float], p: int) -> list[Floats]:
+        """Closed form of (44): row i counts min(p, M - i + 1) times, against the prior."""
+        weights = np.minimum(p, self.m - np.arange(self.m)).astype(np.float64)
+        weighted = haar * weights[:, None]
+        gram, right = weighted.T @ haar, weighted.T @ self.haar_y
+        grams = gram + np.eye(haar.shape[1]) / np.asarray(priors)[:, None, None]
+        solutions: Floats = np.linalg.solve(grams, right[None, :, None])[:, :, 0]
+        return list(solutions)
+
+
+def implied_spreads() -> dict[str, tuple[float, float]]:
+    """Standard deviations that Table 7 implies by RMSE / NR, of the genetic algorithm's record and of the other."""
+    return {o: (g[1] / g[2], m[1] / m[2]) for o, (g, m) in RIVALS.items()}
+
+
+def papers_record() -> tuple[Run, dict[str, float]]:
+    """The arm under the paper's square current, every angle scaled to the deviation that the paper implies."""
+    run = demo_run("square", parameters=PAPERS_ARM)
+    scales = {o: implied[1] / float(np.std(run[o])) for o, implied in implied_spreads().items()}
+    outputs = {o: run[o] * scales[o] for o in scales}
+    inputs = {n: run[n] for n in ("I1", "I2")}
+    return Run.from_arrays(step=run.step, inputs=inputs, outputs=outputs, units=dict(run.units), name="scaled"), scales
+
+
+def as_printed(outputs: Sequence[str] = OUTPUTS) -> dict[str, AsPrinted]:
+    """Tables 4 and 5 by the reading that comes nearest to them, angle by angle.
+
+    Parameters
+    ----------
+    outputs
+        Angles; by default all four.
+    """
+    run, scales = papers_record()
+    found = {}
+    for output in outputs:
+        stage: Literal[1, 2] = 1 if output[-2] == "1" else 2
+        structure = flexible_link(stage=stage, form="published", coupling="measured", laws=(), sensor_filter="stock")
+        own = record(run, structure, POINTS, filtered=False)
+        plain = {o: own.of(o) for o in structure.outputs}
+        hub, deflection = structure.outputs
+        filter_series = sensor_series(structure, POINTS, own.step)
+        behind = plain[deflection]
+        if filter_series is not None:
+            behind = _core.series_multiply(filter_series, behind, POINTS)
+        # The implied deviation is that of the angle as it was logged.
+        behind = behind * float(np.std(plain[deflection])) / float(np.std(behind))
+        seen = {False: plain, True: {hub: plain[hub], deflection: behind}}
+        current = own.of(f"I{stage}")
+        angles = {filtered: _Angle(series, current, output, own.step) for filtered, series in seen.items()}
+        found[output] = _nearest(output, angles, scales[output])
+    return found
+
+
+def _nearest(output: str, angles: Mapping[bool, _Angle], scale: float) -> AsPrinted:
+    table, orders = FRACTIONAL[output], FRACTIONAL[output][1].orders
+    best: tuple[float, Reading, dict[int, Row]] | None = None
+    at_one = math.inf
+    deflection = output.endswith("2")
+    for filtered, terms in product((False, True) if deflection else (False,), READINGS):
+        angle = angles[filtered]
+        time, haar = angle.regressors(terms, orders)
+        priors = (*SCAN, 1.0)
+        solved = {p: angle.solved(haar, priors, p) for p in INNOVATION_LENGTHS}
+        for k, prior in enumerate(priors):
+            x = {p: solved[p][k] for p in INNOVATION_LENGTHS}
+            figures = {p: metrics(angle.y, time @ x[p]) for p in INNOVATION_LENGTHS}
+            for flipped in (False, True):
+                signs = np.array([-1.0 if flipped and place == "own" else 1.0 for place in angle.places(terms)])
+                rows = {
+                    p: Row(dict(zip(COEFFICIENTS, (signs * x[p]).tolist(), strict=True)), figures[p])
+                    for p in INNOVATION_LENGTHS
+                }
+                away = _away(rows, table)
+                if prior == 1.0:
+                    at_one = min(at_one, away)
+                if best is None or away < best[0]:
+                    best = away, Reading(terms, filtered, flipped, prior), rows
+    if best is None:
+        raise InternalError(f"no reading of {output} was tried; please report it")
+    away, reading, rows = best
+    rank, among, first = _ranked(angles[reading.filtered], reading, orders)
+    return AsPrinted(output, reading, rows, math.exp(away), math.exp(at_one), rank, among, first, scale)
+
+
+def _away(rows: Mapping[int, Row], table: Mapping[int, Printed]) -> float:
+    """Mean absolute logarithm of ours over the printed, of a and NR; an a of the other sign counts as a decade."""
+    logs = []
+    for p, row in rows.items():
+        ratio = row.coefficients["a"] / table[p].coefficients["a"]
+        logs.append(abs(math.log(ratio)) if ratio > 0 else math.log(10.0) + abs(math.log(abs(ratio) or 1e-12)))
+        logs.append(abs(math.log(row.equation.nr / float(table[p].nr or 1.0))))
+    return sum(logs) / len(logs)
+
+
+def _ranked(angle: _Angle, reading: Reading, orders: Mapping[str, float]) -> tuple[int, int, dict[str, float]]:
+    """Place of the printed orders among all neighbouring ones, at the largest p."""
+    values = [round(LOW + k * STEP, 9) for k in range(round((HIGH - LOW) / STEP) + 1)]
+    errors: dict[tuple[float, ...], float] = {}
+    for beta, gamma, mu in product(values, values, values):
+        at = {"alpha": float(orders["alpha"]), "beta": beta, "gamma": gamma, "mu": mu}
+        time, haar = angle.regressors(reading.terms, at)
+        (x,) = angle.solved(haar, (reading.prior,), INNOVATION_LENGTHS[-1])
+        errors[beta, gamma, mu] = float(np.sum(np.abs(angle.y - time @ x)))
+    own = errors[tuple(round(float(orders[n]), 9) for n in ("beta", "gamma", "mu"))]
+    first = min(errors, key=lambda k: errors[k])
+    return (
+        1 + sum(e < own for e in errors.values()),
+        len(errors),
+        {"alpha": float(orders["alpha"])} | dict(zip(("beta", "gamma", "mu"), first, strict=True)),
+    )

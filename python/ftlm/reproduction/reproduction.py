@@ -1,0 +1,359 @@
+"""Section 5 of the paper from end to end: its tables and figures recomputed, beside the printed ones, and judged."""
+
+from __future__ import annotations
+
+import json
+import os
+import threading
+from collections.abc import Callable, Sequence
+from concurrent.futures import FIRST_EXCEPTION, Future, ThreadPoolExecutor, wait
+from dataclasses import dataclass
+from pathlib import Path
+from typing import Any
+
+from ftlm.arm.flexible_link import flexible_link
+from ftlm.data.run import Run
+from ftlm.errors import DataError, ModelError
+from ftlm.estimation.genetic import Genetic
+from ftlm.model.model import Model
+from ftlm.progress import left_in_words
+from ftlm.reproduction.claims import Claim, Recomputed, claims
+from ftlm.reproduction.optimizer_comparison import CONTEST_STEP, Panel, panel_of, rivals_lattice, simulated_panel
+from ftlm.reproduction.published_models import Ran, ran
+from ftlm.reproduction.published_values import AsPrinted, as_printed
+from ftlm.reproduction.report import reproduction_page
+from ftlm.reproduction.simulated_arm import ARMS, MAIN, STAGES, StageNumber, demo_run
+from ftlm.reproduction.stage_models import Preset, StageWork, Steps, Whole, seconds_of, seconds_of_all
+from ftlm.reproduction.stage_result import TRACE_EVERY, Stage
+from ftlm.structure.order_grid import Lattice
+from ftlm.utils.files import check_folder, write_atomically
+from ftlm.utils.resources import expected
+from ftlm.utils.validation import check_threads, listed, nearest, real_number, whole_number
+
+#: Rows that an order search keeps; the tables need the best alone.
+KEEP = 1
+#: What is saved whatever the stages hold.
+TABLES = "tables.json"
+#: What verdicts call the runs that were given.
+MEASURED = "as measured"
+ALWAYS_SAVED = ("square.csv", "sine.csv", TABLES)
+#: Seconds between two looks for Ctrl-C.
+LOOK = 0.1
+
+
+class Reproduction(Recomputed):
+    """Section 5 of the paper, recomputed.
+
+    Parameters
+    ----------
+    square, sine
+        The run that everything is identified from, and the other one (None where it is not given).
+    simulated
+        Whether they come from the virtual rig, whose truth is known.
+    stages
+        By number.
+    lattice
+        Of the order searches.
+    notes
+        What was left out and why.
+    panel
+        What verdicts are made of: all arms, records and both ends of K0.
+    ran
+        The paper's printed models run under its own current.
+    as_printed
+        Tables 4 and 5 as the paper computed them, by angle.
+    """
+
+    @property
+    def claims(self) -> list[Claim]:
+        """What holds and what does not."""
+        return claims(self)
+
+    def page(self, path: str | os.PathLike[str], *, force: bool = False) -> Path:
+        """Write everything as one HTML file that opens offline.
+
+        Parameters
+        ----------
+        path
+            File to write.
+        force
+            Overwrite an existing file.
+
+        Raises
+        ------
+        DataError
+            The file exists and ``force`` is not set, or cannot be written.
+        """
+        return reproduction_page(self, path, force=force)
+
+    def save(self, folder: str | os.PathLike[str], *, force: bool = False) -> list[Path]:
+        """Write runs, models and all tables' numbers, from which each table can be computed again.
+
+        Parameters
+        ----------
+        folder
+            Made if it is not there: ``square.csv``, ``sine.csv``, a model file for every row, ``tables.json``.
+        force
+            Overwrite.
+
+        Returns
+        -------
+        list of pathlib.Path
+            The files.
+
+        Raises
+        ------
+        DataError
+            A file is there already, or the folder cannot be written.
+        """
+        where = Path(folder)
+        models: dict[str, Model] = {}
+        for number, stage in self.stages.items():
+            models |= {f"stage{number}-{slug(label)}.json": c.model for label, c in stage.candidates.items()}
+            for output, rival in stage.rivals.items():
+                models |= {f"{output}-{slug(label)}.json": c.model for label, c in rival.models.items()}
+        check_folder(where, [*ALWAYS_SAVED, *models], force=force)
+        runs = dict(zip(ALWAYS_SAVED, self.runs, strict=False))
+        for name, run in runs.items():
+            run.to_csv(where / name, force=force)
+        for name, model in models.items():
+            model.save(where / name, force=force)
+        text = json.dumps(self.to_dict(), indent=1, ensure_ascii=False, allow_nan=False)
+        write_atomically(where / TABLES, text.encode(), force=force)
+        return [where / name for name in (*runs, *models, TABLES)]
+
+    def to_dict(self) -> dict[str, Any]:
+        """For JSON: every number of every table, and the verdicts."""
+        return {
+            "runs": [run.name for run in self.runs],
+            "simulated": self.simulated,
+            "lattice": {"step": self.lattice.step, "alpha": list(self.lattice.alpha)},
+            "claims": [c.to_dict() for c in self.claims],
+            "as printed": {o: a.to_dict() for o, a in self.as_printed.items()},
+            "printed models run": [r.to_dict() for r in self.ran],
+            "as it should be": {str(n): s.to_dict() for n, s in self.stages.items()},
+            "verdicts": self.panel.to_dict(),
+            "notes": list(self.notes),
+        }
+
+
+def slug(label: str) -> str:
+    """A label as part of a file's name."""
+    return "-".join("".join(c if c.isalnum() else " " for c in label).split())
+
+
+def reproduce(
+    square: Run | None = None,
+    sine: Run | None = None,
+    *,
+    step: float = 0.05,
+    noise: float = 1e-4,
+    seed: int = 1,
+    genetic: Genetic | None = None,
+    rivals_step: float = CONTEST_STEP,
+    arms: Sequence[str] | None = None,
+    records: int = 3,
+    threads: int | None = None,
+    say: Callable[[str], None] = lambda _: None,
+    progress: Callable[[int, int], None] | None = None,
+) -> Reproduction:
+    """Recompute section 5 of the paper, on the virtual rig or on runs of one's own.
+
+    Parameters
+    ----------
+    square
+        Run that everything is identified from: I1, theta11, theta12 and (or) I2, theta21, theta22, in A and rad. By
+        default both stages of the virtual rig under a square current of 0.3 A, period 2 s, for 10 s.
+    sine
+        Run that nothing is identified from. By default, with the default ``square`` only, 0.6 A at 6.3 rad/s.
+    step
+        Step of the order lattice; the paper's is 0.05.
+    noise, seed
+        Of the virtual rig's angles, see :func:`ftlm.reproduction.demo_run`.
+    genetic
+        Seeds and evaluations of the genetic algorithm and of differential evolution; by default ten seeds, or as many
+        as 20 000 evaluations an angle allow, each with as many evaluations as the lattice that they are compared with
+        has candidates.
+    rivals_step
+        Smallest step of that lattice, on every arm; the paper's 0.05 takes sixteen times as long.
+    arms
+        Simulated arms that verdicts are computed on besides the first: keys of `ARMS`, by default all. Of a measured
+        run nothing is simulated.
+    records
+        Records of each of them, whose noise differs.
+    threads
+        Threads of each stage; two stages or arms are computed at the same time unless this is 1.
+    say
+        Called with a line about what happens next, from the thread of a stage.
+    progress
+        Called with (parts done, parts in all) of the whole, from the thread of a stage; the parts are of equal time.
+
+    Returns
+    -------
+    Reproduction
+        With ``page`` and ``save``. Equal arguments give equal results.
+
+    Raises
+    ------
+    DataError
+        Runs without the signals of any stage, or a sine run that lacks some.
+    ModelError
+        A sine run without a square run, arms that are not known, a step or records that are none.
+    """
+    simulated = square is None
+    others, lattice = _others(arms, records), Lattice(step=step)
+    for each in (step, real_number("rivals_step", rivals_step)):
+        Lattice(step=each).values(flexible_link(stage=1, form="published", coupling="measured", laws=()))
+    if square is None:
+        if sine is not None:
+            raise ModelError("a sine run is given without a square run; give both, or neither")
+        say("recording both stages on the virtual rig, under a square and a sine current")
+        square, sine = (demo_run(shape, noise=noise, seed=seed) for shape in ("square", "sine"))
+    numbers = stages_of(square, sine)
+    more = (len(others), records) if simulated else ()
+    seconds = seconds_of_all(step, len(numbers), *more, rivals_step=rivals_step)
+    about = left_in_words(expected(seconds, min(check_threads(threads), len(STAGES)))).removesuffix(" left")
+    say(f"this takes {about}")
+    preset = Preset(lattice, KEEP, TRACE_EVERY, alike=True, rivals_step=rivals_step)
+    own = MAIN if simulated else MEASURED
+    seeds = [seed + k for k in range(records)]
+    run, other = square, sine
+
+    def stage_of(number: StageNumber) -> Job:
+        def job(steps: Steps) -> Made:
+            work = StageWork(number, run, other, preset, threads, say, steps, simulated=simulated)
+            stage = work.reproduced(genetic)
+            work.begin(f"stage {number}: the paper's printed models under its own current", "printed")
+            rows = ran(number, threads)
+            work.begin(f"stage {number}: verdicts, both ends of K0", "trials")
+            panel = panel_of([stage], run, own, seed, threads)
+            return Made(stage, rows, as_printed(stage.outputs), panel, work.notes)
+
+        return job
+
+    def panel_on(arm: str, number: StageNumber) -> Job:
+        def job(steps: Steps) -> Panel:
+            say(f"verdicts: the arm “{arm}”, stage {number}")
+            of_more = seeds[1:] if arm == MAIN else seeds
+
+            def begin(name: str) -> None:
+                steps.begin(seconds_of(name, step, rivals_step))
+
+            return simulated_panel(
+                number,
+                arm,
+                of_more,
+                noise,
+                threads,
+                genetic=genetic,
+                begin=begin,
+                progress=steps,
+                lattice=None if arm == MAIN else rivals_lattice(step, rivals_step),
+            )
+
+        return job
+
+    pairs = [(arm, n) for arm in ([MAIN, *others] if simulated else []) for n in numbers]
+    jobs: list[Job] = [*(stage_of(n) for n in numbers), *(panel_on(*pair) for pair in pairs)]
+    ended = side_by_side(jobs, 1 if threads == 1 else len(STAGES), seconds, progress)
+    made: list[Made] = [m for m in ended if isinstance(m, Made)]
+    panel = Panel()
+    for part in (*(m.panel for m in made), *(p for p in ended if isinstance(p, Panel))):
+        panel = panel.beside(part)
+    return Reproduction(
+        square,
+        sine,
+        simulated,
+        {m.stage.number: m.stage for m in made},
+        lattice,
+        tuple(dict.fromkeys(note for m in made for note in m.notes)),
+        panel,
+        tuple(row for m in made for row in m.rows),
+        {output: part for m in made for output, part in m.printed.items()},
+    )
+
+
+@dataclass(frozen=True)
+class Made:
+    """What was made of one stage of the run that everything is identified from."""
+
+    stage: Stage
+    rows: list[Ran]
+    printed: dict[str, AsPrinted]
+    panel: Panel
+    notes: list[str]
+
+
+#: What a worker does, told where to say how far it is.
+Job = Callable[[Steps], Made | Panel]
+
+
+def _others(arms: Sequence[str] | None, records: int) -> list[str]:
+    """Arms besides the first."""
+    if isinstance(arms, str):
+        raise ModelError(f"arms = {arms!r} is a text; give a list of names, such as [{arms!r}]")
+    for name in arms or ():
+        if name not in ARMS:
+            raise ModelError(f"arm {name!r} is not known{nearest(name, ARMS)}; use {listed(ARMS)}")
+    if (whole_number(records) or 0) < 1:
+        raise ModelError(f"records = {records!r} is no whole number from 1")
+    return [name for name in (ARMS if arms is None else dict.fromkeys(arms)) if name != MAIN]
+
+
+def side_by_side(
+    jobs: Sequence[Job], workers: int, seconds: float, progress: Callable[[int, int], None] | None
+) -> list[Made | Panel]:
+    """What all jobs come to, so many of them at the same time: while one fits on one core, another uses the rest."""
+    stop, whole = threading.Event(), Whole(seconds, progress)
+
+    def done_by(job: Job) -> Made | Panel:
+        steps = Steps(whole, stop)
+        result = job(steps)
+        steps.begin(0.0)
+        return result
+
+    if workers == 1:
+        found = [done_by(job) for job in jobs]
+        whole.end()
+        return found
+    with ThreadPoolExecutor(workers, thread_name_prefix="ftlm-stage") as pool:
+        under_way = [pool.submit(done_by, job) for job in jobs]
+        try:
+            done: set[Future[Made | Panel]] = set()
+            # A wait without an end would not be interrupted by Ctrl-C everywhere.
+            while len(done) < len(jobs) and not any(f.exception() for f in done):
+                done, _ = wait(under_way, timeout=LOOK, return_when=FIRST_EXCEPTION)
+        finally:
+            stop.set()
+            for future in under_way:
+                future.cancel()
+        # Where one has failed the others end in KeyboardInterrupt, which says nothing.
+        ended = [f.result() for f in under_way if f in done]
+    whole.end()
+    return ended
+
+
+def stages_of(square: Run, sine: Run | None) -> list[StageNumber]:
+    """Stages whose signals a run has.
+
+    Raises
+    ------
+    DataError
+        No stage is whole, or the sine run lacks a signal of one.
+    """
+    wanted = {n: (f"I{n}", f"theta{n}1", f"theta{n}2") for n in STAGES}
+    found = [n for n, names in wanted.items() if all(s in square.signals for s in names)]
+    if not found:
+        listed = ", ".join(square.signals)
+        raise DataError(
+            f"run {square.name!r} has signals {listed}; a stage of the arm needs I1, theta11 and theta12, or I2, "
+            "theta21 and theta22: name its columns with --columns, or -u I1=COLUMN -y theta11=COLUMN"
+        )
+    if sine is not None:
+        lacking = [s for n in found for s in wanted[n] if s not in sine.signals]
+        if lacking:
+            raise DataError(
+                f"the sine run, {sine.name!r}, lacks {', '.join(lacking)}, which the square run, {square.name!r}, has; "
+                "both runs need the same names"
+            )
+    return found

@@ -1,0 +1,578 @@
+"""How far the reproduction is: what each of its steps takes, said beforehand, and the share that is behind."""
+
+from __future__ import annotations
+
+import threading
+from collections.abc import Callable, Mapping
+from dataclasses import dataclass, field, replace
+from typing import Any
+
+import numpy as np
+
+from ftlm import _core
+from ftlm.arm.flexible_link import flexible_link, link_model, order_law, whole_order
+from ftlm.data.run import Run
+from ftlm.errors import ConvergenceError, ModelError
+from ftlm.estimation.cost_surface import output_error_landscape
+from ftlm.estimation.estimators import by_output_error
+from ftlm.estimation.free_parameters import FreeProblem
+from ftlm.estimation.genetic import Genetic, GeneticRun
+from ftlm.estimation.identify import identify, judged
+from ftlm.estimation.linear import Trace, multi_innovation_trace
+from ftlm.estimation.result import Identification, Task
+from ftlm.model.model import Model
+from ftlm.order_search.result import SearchResult
+from ftlm.order_search.search import search_orders
+from ftlm.plot.comparison_charts import pulse_times
+from ftlm.progress import Course, Stoppable
+from ftlm.reproduction import published_values as printed
+from ftlm.reproduction.optimizer_comparison import CONTEST_STEP, like_for_like, rivals_lattice, seeds_for
+from ftlm.reproduction.simulated_arm import StageNumber, thinned
+from ftlm.reproduction.stage_result import PAIR, WEAK_PRIOR, Candidate, Derived, Rival, Stage
+from ftlm.simulation.discretization import default_m, prepare
+from ftlm.simulation.initial_conditions import starts_at_rest
+from ftlm.simulation.simulate import explicit_euler
+from ftlm.structure.order_grid import Lattice
+from ftlm.structure.structure import Structure
+from ftlm.svg.heat_map import Landscape
+from ftlm.utils.validation import check_threads
+from ftlm.validation.comparison import Comparison, compare_means, metrics
+
+#: What each step of a stage takes one core of the machine that base/pace.py knows [s]: searches at the step of the
+#: paper's lattice, rivals at that of theirs, fits on the virtual rig's 5000 rows. Three quarters of what they took
+#: beside other work.
+STEPS: Mapping[str, float] = {
+    "whole orders": 1.5,
+    "search": 1.4,
+    "instrumental": 2.0,
+    "output error": 5.8,
+    "published": 1.5,
+    "traces": 0.8,
+    "rivals": 5.2,
+    "equation": 0.1,
+    "landscape": 2.4,
+    "printed": 0.4,
+    "trials": 2.0,
+    "freed": 4.0,
+}
+
+
+#: Of the rivals' lattice at its usual step.
+CANDIDATES = 3800
+#: What a stage of the run that is identified from takes, once each unless said, and one of another arm.
+OF_STAGE = {
+    "whole orders": 1,
+    "search": 5,
+    "instrumental": 1,
+    "output error": 1,
+    "published": 1,
+    "traces": 1,
+    "rivals": 2,
+    "equation": 1,
+    "landscape": 1,
+    "printed": 1,
+    "trials": 1,
+}
+OF_ARM = {"trials": 0, "rivals": 2, "freed": 1}
+
+
+def seconds_of(step: str, lattice_step: float, rivals_step: float = CONTEST_STEP) -> float:
+    """Processor time of a step [s]; what searches lattices grows with the fourth power of their fineness."""
+    if step == "rivals":
+        candidates = round(CANDIDATES * (CONTEST_STEP / max(lattice_step, rivals_step)) ** 4)
+        evaluations = candidates * len(seeds_for(candidates))
+        return STEPS[step] * evaluations / (CANDIDATES * len(seeds_for(CANDIDATES)))
+    return STEPS[step] * float((0.05 / lattice_step) ** 4 if step == "search" else 1.0)
+
+
+def seconds_of_all(
+    lattice_step: float, stages: int, arms: int = 0, records: int = 1, *, rivals_step: float = CONTEST_STEP
+) -> float:
+    """Processor time of all of it [s]: stages of one run, so many arms besides, records of each and of the first."""
+    counts = dict(OF_STAGE)
+    for step, count in OF_ARM.items():
+        counts[step] = counts.get(step, 0) + arms * count
+    counts["trials"] += (arms + 1) * records - 1
+    return stages * sum(count * seconds_of(step, lattice_step, rivals_step) for step, count in counts.items())
+
+
+class Whole:
+    """The share of all work that is done, told to one listener by workers at the same time.
+
+    Parameters
+    ----------
+    seconds
+        Of all work together.
+    told
+        See :class:`ftlm.progress.Course`.
+    """
+
+    def __init__(self, seconds: float, told: Callable[[int, int], None] | None) -> None:
+        self._seconds, self._course, self._lock = max(seconds, 1e-9), Course(told), threading.Lock()
+        self._done = 0.0
+        self._under_way: dict[object, float] = {}
+
+    def at(self, worker: object, seconds: float) -> None:
+        """A worker is so far with its step."""
+        with self._lock:
+            self._under_way[worker] = seconds
+            self._course.at((self._done + sum(self._under_way.values())) / self._seconds)
+
+    def ended(self, worker: object, seconds: float) -> None:
+        """A worker has ended a step."""
+        with self._lock:
+            self._under_way.pop(worker, None)
+            self._done += seconds
+            self._course.at((self._done + sum(self._under_way.values())) / self._seconds)
+
+    def end(self) -> None:
+        """All is done, whatever was left out on the way."""
+        self._course.at(1.0)
+
+
+class Steps(Stoppable):
+    """One worker's steps, one after the other: what searches and fits are to call with (done, total).
+
+    Parameters
+    ----------
+    whole
+        All work.
+    stop
+        Set to end the work with KeyboardInterrupt at its next report.
+    """
+
+    def __init__(self, whole: Whole, stop: threading.Event) -> None:
+        super().__init__(None, stop)
+        self._whole, self._step, self._within = whole, 0.0, 0.0
+
+    def begin(self, seconds: float) -> None:
+        """The step before has ended; the next one takes so long."""
+        super().__call__(0, 0)
+        self._whole.ended(self, self._step)
+        self._step, self._within = seconds, 0.0
+
+    def __call__(self, done: int, total: int, pruned: int | None = None) -> None:
+        """A part of the step is so far; where it counts anew, it has gone half of the way that was left."""
+        super().__call__(done, total, pruned)
+        share = done / max(total, 1)
+        if share < self._within:
+            self._step, passed = 0.5 * self._step, 0.5 * self._step
+            self._whole.ended(self, passed)
+        self._within = share
+        self._whole.at(self, self._step * share)
+
+
+#: Instrumental variables are searched so many steps of the lattice around the orders of least squares: every candidate
+#: costs several free runs.
+AROUND = 2
+#: Runs with more rows than the first are thinned to at most the second for joint fits, whose cost and whose grid's
+#: refinement grow with the rows; the arm's modes are two decades below the rate that is left.
+MOST_ROWS, JOINT_ROWS = 6000, 2500
+#: On finer lattices than this those orders of multi-innovation that no bound excludes are searched in steps of this
+#: first, then in the lattice's own steps around so many of the best.
+COARSE, BEST = 0.1, 10
+#: Whole orders that are none leave residuals that no row more makes smaller.
+WHOLE_ROWS = 1250
+
+
+@dataclass(frozen=True)
+class Preset:
+    """What the reproduction and the demonstration do differently."""
+
+    lattice: Lattice
+    keep: int  # rows of an order search
+    trace_every: int  # steps between two points of a convergence curve
+    # Whether all models are judged alike, on the paper's pulses (a sum over other pulses is another number) and from
+    # the currents alone as well, or each as its method worked.
+    alike: bool
+    rivals_step: float = CONTEST_STEP  # of the lattice that the rivals are held against
+
+
+@dataclass
+class StageWork:
+    """One stage under way: runs, settings, whom to tell, and notes of what was left out and why."""
+
+    number: StageNumber
+    square: Run
+    sine: Run | None
+    preset: Preset
+    threads: int | None
+    say: Callable[[str], None]
+    progress: Callable[[int, int], None] | None
+    notes: list[str] = field(default_factory=list)
+    # Whether the runs are simulated, from rest: nobody need find out what was before.
+    simulated: bool = False
+
+    def __post_init__(self) -> None:
+        # The paper's own structure, for what its tables are set beside, and the arm as it is.
+        self.measured = flexible_link(stage=self.number, form="published", coupling="measured", laws=())
+        self.published = flexible_link(stage=self.number, form="published")
+        self.coupled = flexible_link(stage=self.number, coupling="simulated")
+        own = list(self.measured.signals)
+        self.on = self.square.select(own)
+        self.off = None if self.sine is None else self.sine.select(own)
+        if self.simulated:
+            self.published, self.coupled = (replace(s, initial="rest") for s in (self.published, self.coupled))
+        elif not starts_at_rest(self.on, self.measured):
+            # The paper's equation errors have few terms; ten powers of t more would be combinations of them.
+            self.measured, self.published, self.coupled = (
+                replace(s, initial="caputo") for s in (self.measured, self.published, self.coupled)
+            )
+
+    def begin(self, words: str, step: str) -> None:
+        """Say what comes next, and how much of the whole it is."""
+        self.say(words)
+        if isinstance(self.progress, Steps):
+            self.progress.begin(seconds_of(step, self.preset.lattice.step, self.preset.rivals_step))
+
+    def reproduced(self, genetic: Genetic | None) -> Stage:
+        """Everything that section 5 says of a stage."""
+        exact = self.manual("integer, exact")
+        candidates = {"integer, Euler": self.stepped("integer, Euler", exact), "integer, exact": exact}
+        candidates["integer, identified"] = self.best(
+            "integer, identified",
+            self.coupled.with_orders({n: whole_order(n) for n in self.coupled.order_names}),
+            "whole orders",
+            WHOLE_ROWS,
+        )
+        candidates |= self.searches()
+        candidates["instrumental variables"] = self.instrumental(candidates["least squares"])
+        candidates["output error"] = self.best("output error", self.coupled)
+        candidates["published, output error"] = self.best(
+            "published, output error", self.published, near=candidates["output error"].model
+        )
+        self.begin(f"stage {self.number}: convergence", "traces")
+        traces: dict[str, dict[int, Trace]] = {}
+        weak: dict[str, dict[int, Trace]] = {}
+        if prepare([self.on], self.measured, None, power_of_two=True)[0].initial == "rest":
+            traces = self.traces(candidates)
+            # All p at the orders of the largest.
+            last = candidates[f"p = {printed.INNOVATION_LENGTHS[-1]}"]
+            weak = self.traces(dict.fromkeys(candidates, last), WEAK_PRIOR)
+        else:
+            self.notes.append(
+                f"run {self.on.name} does not start at rest: every model is fitted and compared with initial terms; "
+                "explicit Euler, which steps from rest as in the paper, is not, and its errors hold that; convergence "
+                "of the recursion, and with it Figures 4(b) to 8(b), and the weak prior are left out"
+            )
+        ends = {
+            o: {p: {n: float(c[-1]) for n, c in trace.coefficients.items()} for p, trace in each.items()}
+            for o, each in weak.items()
+        }
+        return Stage(
+            self.number,
+            candidates,
+            traces,
+            weak,
+            ends,
+            self.rivals(genetic),
+            self.near(),
+            self.by_equation(),
+            self.derived(candidates["output error"].model),
+            self.landscape(candidates["output error"].result),
+        )
+
+    def landscape(self, result: Identification | None) -> Landscape | None:
+        """Around the joint fit, along the two orders that the run tells apart least."""
+        self.begin(f"stage {self.number}: the landscape of its orders", "landscape")
+        return None if result is None or result.joint is None else output_error_landscape(result)
+
+    def candidate(self, label: str, model: Model, result: Identification | None = None) -> Candidate:
+        """Both errors of a model on both runs, and its free run from the currents alone."""
+        alike = self.preset.alike
+        m = default_m([self.on], power_of_two=True) if alike else model.m
+        model = model if model.m == m else replace(model, m=m)
+        estimation = compare_means(model, self.on)
+        validation = None if self.off is None else compare_means(model, self.off)
+        alone = {}
+        if alike and len(model.equations) > 1:
+            coupled = replace(model, structure=replace(model.structure, coupling="simulated"))
+            runs = [run for run in (self.on, self.off) if run is not None]
+            alone = {run.name: compare_means(coupled, run).output_error for run in runs}
+        return Candidate(label, model, estimation, validation, alone, result)
+
+    def identified(self, label: str, run: Run, structure: Structure, **options: Any) -> Candidate:
+        """A candidate by one of the methods."""
+        result = identify(run, structure, threads=self.threads, progress=self.progress, **options)
+        return self.candidate(label, result.model, result)
+
+    def manual(self, label: str) -> Candidate:
+        """The maker's integer-order model."""
+        return self.candidate(label, link_model(stage=self.number, form="published"))
+
+    def stepped(self, label: str, exact: Candidate) -> Candidate:
+        """The same model stepped by explicit Euler, as the paper ran it."""
+        on = self._by_euler(exact.model, self.on, exact.estimation)
+        alone = {self.on.name: on.output_error}
+        off = None
+        if self.off is not None and exact.validation is not None:
+            off = self._by_euler(exact.model, self.off, exact.validation)
+            alone[self.off.name] = off.output_error
+        return replace(exact, label=label, estimation=on, validation=off, alone=alone)
+
+    def _by_euler(self, model: Model, run: Run, exact: Comparison) -> Comparison:
+        """The comparison with Euler's response in place of the exact one."""
+        responses = explicit_euler(model, run)
+        means = {}
+        for name, samples in responses.items():
+            with np.errstate(over="ignore", invalid="ignore"):
+                finite = bool(np.all(np.isfinite(samples)))
+            means[name] = _core.pulse_means(samples, exact.m, False) if finite else np.full(exact.m, np.inf)
+        if self.preset.alike:
+            errors = {n: metrics(exact.measured[n][0], mean) for n, mean in means.items()}
+        else:
+            errors = {n: metrics(run[n], samples) for n, samples in responses.items()}
+        return replace(
+            exact,
+            simulated={n: [mean] for n, mean in means.items()},
+            output_error=errors,
+            per_run=[(run.name, exact.equation_error, errors)],
+            warnings=(),
+        )
+
+    def searches(self) -> dict[str, Candidate]:
+        """Multi-innovation with the paper's p, and least squares, on the whole lattice."""
+        kinds: dict[str, dict[str, Any]] = {
+            f"p = {p}": {"coefficients": "multi-innovation", "innovation_length": p} for p in printed.INNOVATION_LENGTHS
+        }
+        kinds["least squares"] = {"coefficients": "least-squares"}
+        found = {}
+        for label, options in kinds.items():
+            self.begin(f"stage {self.number}: orders on the lattice, {label}", "search")
+            if self.preset.alike:
+                found[label] = self.searched(label, self.preset.lattice, **options)
+                continue
+            method = {"method": options["coefficients"], **{n: v for n, v in options.items() if n != "coefficients"}}
+            found[label] = self.identified(
+                label, self.on, self.measured, lattice=self.preset.lattice, keep=self.preset.keep, **method
+            )
+        return found
+
+    def searched(self, label: str, lattice: Lattice, **options: Any) -> Candidate:
+        """The best orders of both equations, each by itself, without all that a whole identification says of them."""
+        orders: dict[str, float] = {}
+        coefficients: dict[str, float] = {}
+        for output in self.measured.outputs:
+            single = self.measured.equation(output)
+            own = replace(lattice, orders={n: v for n, v in lattice.orders.items() if n in single.order_names})
+            best = self._best_orders(single, own, options)
+            orders |= best.orders
+            coefficients |= best.coefficients
+        known = self.measured.with_orders(orders).with_coefficients(coefficients)
+        units = {n: u for n, u in self.on.units.items() if n in known.signals}
+        about = {"origin": label, "run": self.on.name}
+        return self.candidate(label, Model(known, orders=orders, units=units, about=about))
+
+    def _best_orders(self, single: Structure, own: Lattice, options: Mapping[str, Any]) -> SearchResult:
+        """The best candidate of a lattice.
+
+        With K0 = 1 a deflection hardly moves: all candidates' errors are close to that of no motion, no bound excludes
+        one, and each would have to be run to its end.
+        """
+
+        def searched(lattice: Lattice, keep: int) -> SearchResult:
+            return search_orders(
+                self.on, single, lattice, keep=keep, threads=self.threads, progress=self.progress, **options
+            )
+
+        own_terms = sum(t.signal == single.outputs[0] for t in single.equations[0].terms)
+        heavy = own_terms > 1 and options.get("coefficients") == "multi-innovation"
+        if not (heavy and own.step < COARSE and not own.orders):
+            return searched(own, 1)
+        ends = [
+            searched(replace(own, orders=around(row.orders, own, single)), 1)
+            for row in searched(replace(own, step=COARSE), BEST).table
+        ]
+        return min(ends, key=lambda end: end.score)
+
+    def instrumental(self, start: Candidate) -> Candidate:
+        """Instrumental variables on the part of the lattice around the orders of another model."""
+        self.begin(f"stage {self.number}: orders by instrumental variables", "instrumental")
+        step, top = self.preset.lattice.step, self.preset.lattice.alpha[1]
+        axes = {}
+        for name, value in start.model.orders.items():
+            steps = 1 if name.startswith("alpha") else AROUND
+            near = [round(value + k * step, 9) for k in range(-steps, steps + 1)]
+            axes[name] = [v for v in near if 0 <= v <= top]
+        return self.identified(
+            "instrumental variables",
+            self.on,
+            self.measured,
+            method="instrumental-variables",
+            lattice=Lattice(step=step, orders=axes),
+            keep=self.preset.keep,
+        )
+
+    def joint(
+        self, label: str, structure: Structure, words: str, rows: int | None = None, near: Model | None = None
+    ) -> Candidate:
+        """Joint output error on the run as it is, or on every so many rows of it."""
+        step = "published" if structure is self.published else "output error" if rows is None else "whole orders"
+        self.begin(f"stage {self.number}: {words}", step)
+        run = self.on
+        if rows is not None and run.length >= 2 * rows:
+            run = thinned(run, run.length // rows)
+        elif run.length > MOST_ROWS:
+            every = -(-run.length // JOINT_ROWS)
+            self.notes.append(
+                f"run {run.name} has {run.length} rows: joint fits by output error take one of {every} rows, "
+                f"{every * run.step:.6g} s apart, with the means of held currents in between; all models are compared "
+                "on the same block pulses of the whole run"
+            )
+            run = thinned(run, every)
+        if near is None:
+            return self.identified(label, run, structure)
+        # Of the published form standard errors alone are looked at. Its automatic starts end in optima of their own,
+        # which rounding chooses between; the numbers of (14)-(15) lead to the one that leaves the noise.
+        begin = self.published_values(near)
+        if not self.simulated:
+            try:
+                return self.identified(label, run, structure, intervals="quadratic", start=begin)
+            except ModelError:
+                # Out of the bounds that (22)-(25) have.
+                return self.identified(label, run, structure, intervals="quadratic")
+        fit = by_output_error(
+            Task((run,), structure),
+            None,
+            check_threads(self.threads),
+            self.progress,
+            intervals="quadratic",
+            begin=begin,
+            alone=True,
+        )
+        result = judged(fit)
+        return self.candidate(label, result.model, result)
+
+    def best(
+        self,
+        label: str,
+        structure: Structure,
+        what: str = "free orders",
+        rows: int | None = None,
+        near: Model | None = None,
+    ) -> Candidate:
+        """Joint output error from the current alone, or driven by the measured other angle where that has no start."""
+        words = f"{what}{', (22)–(25)' * (structure is self.published)}, "
+        try:
+            return self.joint(label, structure, f"{words}by output error", rows, near)
+        except ConvergenceError as error:
+            self.notes.append(
+                f"stage {self.number}, {label}: from the current alone, {error}; that row is driven by the measured "
+                "other angle instead"
+            )
+        return self.joint(label, replace(structure, coupling="measured"), f"{words}by output error", rows, near)
+
+    def traces(self, candidates: Mapping[str, Candidate], prior: float = 1.0) -> dict[str, dict[int, Trace]]:
+        """Convergence of every equation with every p, at the orders of the model of that p."""
+        return {
+            output: {p: self._trace(output, candidates[f"p = {p}"], p, prior) for p in printed.INNOVATION_LENGTHS}
+            for output in self.measured.outputs
+        }
+
+    def _trace(self, output: str, at: Candidate, p: int, prior: float) -> Trace:
+        single = self.measured.equation(output)
+        single = single.with_orders({n: at.model.orders[n] for n in single.order_names})
+        return multi_innovation_trace(
+            self.on, single, innovation_length=p, prior_covariance=prior, every=self.preset.trace_every
+        )
+
+    def rivals(self, genetic: Genetic | None) -> dict[str, Rival]:
+        """Genetic algorithm, differential evolution and lattice on one equation each, like for like."""
+        lattice = rivals_lattice(self.preset.lattice.step, self.preset.rivals_step)
+        found = {}
+        for output in self.measured.outputs:
+            single = self.measured.equation(output)
+            self.begin(f"stage {self.number}: the rivals on {output}", "rivals")
+            try:
+                made = like_for_like(self.on, single, lattice, genetic, threads=self.threads, progress=self.progress)
+            except ModelError as error:
+                self.notes.append(f"Tables 6 and 7 and Figure 11 are left out: {error}")
+                return {}
+
+            def model(
+                orders: Mapping[str, float], coefficients: Mapping[str, float], item: Structure = single
+            ) -> Model:
+                return Model(item.with_orders(orders).with_coefficients(coefficients), orders=dict(orders))
+
+            ends: dict[str, GeneticRun | SearchResult] = {
+                "genetic": made.genetic,
+                "differential evolution": made.evolution,
+                **dict(zip(PAIR, made.lattice.values(), strict=True)),
+            }
+            candidates = {n: self.candidate(n, _known(single, end.orders, end.coefficients)) for n, end in ends.items()}
+            found[output] = Rival(
+                made.candidates, lattice.step, made.settings.population, made.genetic, made.evolution, candidates
+            )
+        return found
+
+    def near(self) -> Candidate:
+        """The orders that the paper prints, with the best coefficients that this run gives them."""
+        orders: dict[str, float] = {}
+        for output in self.measured.outputs:
+            orders |= printed.last_orders(output)
+        axes = Lattice(step=self.preset.lattice.step, orders={n: [v] for n, v in orders.items()})
+        return self.searched("printed orders", axes, coefficients="least-squares")
+
+    def by_equation(self) -> Candidate:
+        """Least squares at the orders whose equation error is smallest."""
+        self.begin(f"stage {self.number}: orders by the equation error", "equation")
+        return self.searched(
+            "smallest equation error",
+            self.preset.lattice,
+            coefficients="least-squares",
+            criterion="equation-error",
+            norm="l2",
+        )
+
+    def in_published_form(self, model: Model) -> Model:
+        """The numbers of (14)-(15) in the equations (22)-(25), which drop a derivative of the current."""
+        h, d = self.number * 2 - 1, self.number * 2
+        output = self.measured.outputs[1]
+        known = {n: model.coefficients[n] for n in (f"{c}{k}" for c in "ad" for k in (h, d))}
+        known |= {n: model.coefficients[n] for n in (f"b{h}", f"g{h}")}
+        known |= {f"{c}{d}": -known[f"{c}{h}"] for c in "bg"}
+        known |= {f"{c}{d}": known[f"{c}{d}"] - known[f"{c}{h}"] for c in "ad"}
+        orders = {**model.orders, f"alpha{d}": next(e.order.constant for e in model.equations if e.output == output)}
+        other = link_model(
+            stage=self.number,
+            form="published",
+            orders=orders,
+            coefficients=known,
+            coupling=model.structure.coupling,
+        )
+        return replace(other, m=model.m, structure=replace(other.structure, initial=model.structure.initial))
+
+    def published_values(self, model: Model) -> dict[str, float]:
+        """The numbers of (14)-(15) as those that are free in (22)-(25) under their laws."""
+        other = self.in_published_form(model)
+        known = {**other.orders, **other.coefficients}
+        h, d = f"a{self.number * 2 - 1}", f"a{self.number * 2}"
+        free = FreeProblem.of(replace(self.published, initial="rest")).names
+        return {n: v for n, v in known.items() if n in free} | {f"r{self.number}": -known[d] / known[h]}
+
+    def derived(self, model: Model) -> Derived:
+        """The deflection by (14)-(15), and with the same numbers by (22)-(25) as published."""
+        output, other = self.measured.outputs[1], self.in_published_form(model)
+        whole, published = (compare_means(m, self.on) for m in (model, other))
+        drive = f"I{self.number}"
+        current = _core.pulse_means(self.on[drive], whole.m, self.on.intersample[drive] == "zoh")
+        return Derived(
+            output,
+            order_law(self.number, "derived")["input"].at(other.orders),
+            pulse_times(whole),
+            current,
+            whole.measured[output][0],
+            published.simulated[output][0],
+            whole.simulated[output][0],
+        )
+
+
+def around(orders: Mapping[str, float], lattice: Lattice, single: Structure) -> dict[str, list[float]]:
+    """Values of a lattice less than two of its coarse steps away from these orders."""
+    values = lattice.values(single)
+    return {n: [v for v in values[n] if abs(v - at) < 2 * COARSE - 1e-9] for n, at in orders.items()}
+
+
+def _known(item: Structure, orders: Mapping[str, float], coefficients: Mapping[str, float]) -> Model:
+    """A model of one equation whose numbers are known."""
+    return Model(item.with_orders(orders).with_coefficients(coefficients), orders=dict(orders))

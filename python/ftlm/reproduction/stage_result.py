@@ -1,0 +1,205 @@
+"""What a recomputed section 5 says of one stage: models on both runs, rivals, traces."""
+
+from __future__ import annotations
+
+from dataclasses import dataclass
+from typing import Any
+
+import numpy as np
+
+from ftlm.estimation.genetic import GeneticRun
+from ftlm.estimation.linear import Trace
+from ftlm.estimation.result import Identification
+from ftlm.model.model import Model
+from ftlm.reproduction.simulated_arm import StageNumber
+from ftlm.svg.heat_map import Landscape
+from ftlm.utils.validation import Floats
+from ftlm.validation.comparison import Comparison, Metrics, finite
+
+#: Steps between two points of a convergence curve: what p does, it does in the first steps.
+TRACE_EVERY = 2
+#: A prior so weak that the data alone decide.
+WEAK_PRIOR = 1e10
+#: Both ends of K0: the paper's recursion with the identity, and the data alone.
+PRIORS = (1.0, WEAK_PRIOR)
+#: Labels of multi-innovation beside its rivals, by K0.
+PAIR = ("p = 7", "p = 7, weak prior")
+#: Lattice of the genetic comparison: both algorithms' printed highest orders lie in it, and all of it can be evaluated.
+RIVAL_ALPHA = (1.95, 2.0)
+
+
+@dataclass(frozen=True)
+class Candidate:
+    """One model of a stage on both runs.
+
+    Parameters
+    ----------
+    label
+        Such as "p = 7".
+    model
+        The model.
+    estimation
+        Both errors on the run that it was identified from, driven as the method drives it.
+    validation
+        The same on the other run; None without one.
+    alone
+        Output error from the currents alone, on both runs, by run and output.
+    result
+        The identification; None for a model that was not identified.
+    """
+
+    label: str
+    model: Model
+    estimation: Comparison
+    validation: Comparison | None
+    alone: dict[str, dict[str, Metrics]]
+    result: Identification | None = None
+
+    def to_dict(self) -> dict[str, Any]:
+        """For JSON."""
+        result = self.result
+        return {
+            "orders": {n: float(v) for n, v in self.model.orders.items()},
+            "coefficients": {n: float(v) for n, v in self.model.coefficients.items()},
+            "intervals": {} if result is None else {n: list(map(finite, i)) for n, i in result.intervals.items()},
+            "estimation": self.estimation.to_dict(),
+            "validation": None if self.validation is None else self.validation.to_dict(),
+            "alone": {run: {o: f.to_dict() for o, f in figures.items()} for run, figures in self.alone.items()},
+            "settings": {} if result is None else result.settings,
+            "warnings": [] if result is None else list(result.warnings),
+        }
+
+
+@dataclass(frozen=True)
+class Rival:
+    """Multi-innovation and its two rivals on one equation, like for like.
+
+    Parameters
+    ----------
+    candidates
+        Of the lattice, and evaluations of every seed unless others were asked for.
+    step
+        Of the lattice.
+    population
+        Of the genetic algorithm.
+    genetic_run, evolution_run
+        What the genetic algorithm and differential evolution came to, seed by seed, and within which bounds.
+    models
+        The best of each by label: genetic, differential evolution, p = 7 with K0 = 1 and with a weak prior.
+    """
+
+    candidates: int
+    step: float
+    population: int
+    genetic_run: GeneticRun
+    evolution_run: GeneticRun
+    models: dict[str, Candidate]
+
+    @property
+    def genetic(self) -> Candidate:
+        """The genetic algorithm's best seed."""
+        return self.models["genetic"]
+
+    @property
+    def lattice(self) -> Candidate:
+        """Multi-innovation with p = 7 and K0 = 1."""
+        return self.models["p = 7"]
+
+    def to_dict(self) -> dict[str, Any]:
+        """For JSON."""
+        runs = {"genetic": self.genetic_run, "differential evolution": self.evolution_run}
+        return {
+            "candidates": self.candidates,
+            "step": self.step,
+            "population": self.population,
+            "models": {n: c.to_dict() for n, c in self.models.items()},
+            "errors": {n: {str(s): finite(e) for s, e in r.errors.items()} for n, r in runs.items()},
+            "evaluations": {n: {str(s): e for s, e in r.evaluations.items()} for n, r in runs.items()},
+            "bounds": {n: list(b) for n, b in self.genetic_run.bounds.items()},
+        }
+
+
+@dataclass(frozen=True)
+class Derived:
+    """What the derivative of the current that (19) drops does to the deflection's free run, all numbers alike."""
+
+    output: str
+    order: float  # that the current would have; 0 as published
+    time: Floats  # middle of every pulse [s]
+    current: Floats  # pulse means
+    measured: Floats
+    published: Floats  # by (22)-(25)
+    derived: Floats  # by (14)-(15), nothing dropped
+
+    @property
+    def correlations(self) -> dict[str, float]:
+        """Of the deflection with the current: as measured, with nothing dropped, as published; nan for one at rest."""
+        found = {}
+        for words, series in (("measured", self.measured), ("derived", self.derived), ("published", self.published)):
+            parts = [v - np.mean(v) for v in (series, self.current)]
+            with np.errstate(over="ignore", invalid="ignore", divide="ignore"):
+                found[words] = float(np.dot(*parts) / np.sqrt(np.dot(parts[0], parts[0]) * np.dot(parts[1], parts[1])))
+        return found
+
+
+@dataclass(frozen=True)
+class Stage:
+    """Everything about one stage.
+
+    Parameters
+    ----------
+    number
+        1 or 2.
+    candidates
+        Models by label, in the order of the tables.
+    traces, weak_traces
+        Convergence by output and p: each p at its own orders and K0 = 1; with a weak prior, at the orders of p = 7.
+    weak
+        Coefficients by output and p with a weak prior, at the orders of p = 7.
+    rivals
+        By output; empty without PyGAD or where a run does not start at rest.
+    near
+        The model with the orders that the paper prints, least-squares coefficients on this run.
+    by_equation
+        The model whose orders have the smallest equation error on the lattice.
+    derived
+        What the dropped derivative of the current changes.
+    landscape
+        Cost around the joint fit along the two orders that the run tells apart least; None where there are none.
+    """
+
+    number: StageNumber
+    candidates: dict[str, Candidate]
+    traces: dict[str, dict[int, Trace]]
+    weak_traces: dict[str, dict[int, Trace]]
+    weak: dict[str, dict[int, dict[str, float]]]
+    rivals: dict[str, Rival]
+    near: Candidate
+    by_equation: Candidate
+    derived: Derived
+    landscape: Landscape | None
+
+    @property
+    def outputs(self) -> tuple[str, str]:
+        """Hub angle and deflection."""
+        return f"theta{self.number}1", f"theta{self.number}2"
+
+    @property
+    def manual(self) -> str:
+        """Label of the manual's model as the paper ran it; Euler's steps start at rest, so not on any other run."""
+        return "integer, Euler" if self.traces else "integer, exact"
+
+    def to_dict(self) -> dict[str, Any]:
+        """For JSON."""
+        return {
+            "models": {label: c.to_dict() for label, c in self.candidates.items()},
+            "printed orders": self.near.to_dict(),
+            "weak prior": {o: {str(p): c for p, c in each.items()} for o, each in self.weak.items()},
+            "genetic": {o: r.to_dict() for o, r in self.rivals.items()},
+            "smallest equation error": self.by_equation.to_dict(),
+            "derived input order": {
+                "output": self.derived.output,
+                "order": self.derived.order,
+                "correlations": {n: finite(v) for n, v in self.derived.correlations.items()},
+            },
+        }

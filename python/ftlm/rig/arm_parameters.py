@@ -1,0 +1,332 @@
+"""Parameters of the simulated arm: named sets, and files that change some of their numbers."""
+
+from __future__ import annotations
+
+import math
+import os
+import tomllib
+from collections.abc import Mapping
+from dataclasses import asdict, dataclass, fields, replace
+from pathlib import Path
+from typing import Any
+
+from ftlm import _core
+from ftlm.arm.flexible_link import Form, flexible_link
+from ftlm.errors import DataError, ModelError
+from ftlm.model.model import Model
+from ftlm.rig.rig import COMMAND_SCALE, CURRENT_LIMIT, ENCODER_SCALE, SENSE_SCALE, STRAIN_SCALE
+from ftlm.simulation.discretization import equation_tuple
+from ftlm.utils.validation import listed, nearest, shown
+
+#: Of the arm, in the order that the core numbers them.
+SIGNALS = ("theta11", "theta12", "theta21", "theta22", "I1", "I2")
+#: The maker's file: link 1 is 0.202 m long and turns 0.170434 kg m^2 with all that it carries; on link 2, which turns
+#: 0.0064387 kg m^2, 0.157 kg sit 0.20185 m out; of hub 2's 0.00301955 kg m^2 a rotor of 1.03e-6 behind a gear of
+#: 50 is 0.002575 and leans on link 1 with a fiftieth of that alone.
+INERTIA_RATIO = 0.00301955 / 0.170434
+REACH = 0.157 * 0.202 * 0.20185 / 0.0064387
+TURNED = (0.00301955 - 0.002575 + 0.002575 / 50.0) / 0.00301955
+#: Longest step of the simulation inside a sample [s]: deflections are then within 2e-4 of their deviation, of stage 1
+#: within 1e-5.
+SUBSTEP = 1e-4
+
+
+@dataclass(frozen=True)
+class StageParameters:
+    """One stage of the simulated arm: the free orders and coefficients of the law, and the hub's Coulomb friction.
+
+    Parameters
+    ----------
+    a, b, d, g, r
+        Coefficients of the hub's equation and the inertia ratio r = (J_1 + J_2)/J_2, which give the deflection's.
+    gamma, beta, mu
+        Free orders, such that every order of the law lies in [0, 3); both highest orders are 2.
+    coulomb
+        Friction as a motor current [A], 0 for none.
+    """
+
+    a: float
+    b: float
+    d: float
+    g: float
+    r: float
+    gamma: float
+    beta: float
+    mu: float
+    coulomb: float = 0.0
+
+    def orders(self, stage: int) -> dict[str, float]:
+        """The five free orders, by the law's names."""
+        h, k = 2 * stage - 1, 2 * stage
+        return {f"alpha{h}": 2.0, f"alpha{k}": 2.0, f"gamma{h}": self.gamma, f"beta{k}": self.beta, f"mu{k}": self.mu}
+
+    def coefficients(self, stage: int, form: Form = "lagrange") -> dict[str, float]:
+        """The coefficients of both equations, by the law's names."""
+        h, k = 2 * stage - 1, 2 * stage
+        hub = {f"a{h}": self.a, f"b{h}": self.b, f"d{h}": self.d, f"g{h}": self.g}
+        if form == "lagrange":
+            # J_1/J_2 is r - 1.
+            return hub | {f"a{k}": -self.a * (self.r - 1.0), f"d{k}": -self.d * (self.r - 1.0)}
+        return hub | {f"a{k}": -self.a * self.r, f"b{k}": -self.b, f"d{k}": -self.d * self.r, f"g{k}": -self.g}
+
+
+@dataclass(frozen=True)
+class ArmParameters:
+    """The simulated arm and its sensors.
+
+    Parameters
+    ----------
+    stage1, stage2
+        The stages.
+    coupling
+        0: stages apart; 1: stage 2 rides on link 1, as :func:`ftlm.flexible_link` has it under
+        ``cross_stage="inertial"``. In between the rates that link 1 hands on to stage 2 are so much smaller, in one and
+        the same kinetic energy.
+    inertia_ratio
+        J_21/J_12, J_12 with all that link 1 carries.
+    reach
+        H/J_22, H the length of link 1 times the moment of mass of link 2: 1 where both links are equally long and the
+        mass is at the tip.
+    turned
+        Share of J_21 that turns with link 1. A rotor behind a gear does not, but for one part in its ratio.
+    current_offset
+        What drives each motor besides its command while the amplifiers are enabled [A]: of a run, not of the arm.
+    strain_noise, current_noise
+        Standard deviation of the noise on the gauges and on the current sense [V].
+    strain_bias, current_bias
+        Their offsets [V].
+    bits
+        Of the converters over ±10 V; 0 for none, which leaves the gauges exact.
+    encoder_scale
+        Hub angle per count [rad].
+    travel
+        Hub angle at which a limit switch opens [rad].
+    form
+        ``"lagrange"``: links hang on their hubs, the Euler-Lagrange equations (14)-(15); ``"published"``: (22)-(25) as
+        printed, whose links bend the wrong way, for what is set beside the paper's own numbers. These know the stages
+        apart alone.
+    name
+        What files call them.
+    """
+
+    stage1: StageParameters
+    stage2: StageParameters
+    coupling: float = 1.0
+    inertia_ratio: float = INERTIA_RATIO
+    reach: float = REACH
+    turned: float = TURNED
+    current_offset: tuple[float, float] = (0.0, 0.0)
+    strain_noise: tuple[float, float] = (0.015, 0.0134)
+    current_noise: tuple[float, float] = (0.0012, 0.0012)
+    strain_bias: tuple[float, float] = (0.12, -0.2)
+    current_bias: tuple[float, float] = (0.006, 0.0105)
+    bits: int = 16
+    encoder_scale: tuple[float, float] = ENCODER_SCALE
+    travel: tuple[float, float] = (math.pi / 2, math.pi / 2)
+    form: Form = "lagrange"
+    name: str = "effective"
+
+    @classmethod
+    def of(cls, given: str | os.PathLike[str] | ArmParameters) -> ArmParameters:
+        """A named set, a TOML file's, or what it is given.
+
+        Raises
+        ------
+        ModelError
+            A name that is not known, a key or a number in the file that cannot be used.
+        DataError
+            A file that cannot be read.
+        """
+        if isinstance(given, ArmParameters):
+            return given
+        if isinstance(given, str) and given in SETS:
+            return SETS[given]
+        if not isinstance(given, (str, os.PathLike)):
+            raise ModelError(f"parameters is a {type(given).__name__}; use {listed(SETS)}, or a TOML file's path")
+        if not os.fspath(given).endswith(".toml"):
+            raise ModelError(
+                f"parameters = {shown(os.fspath(given))} is not known{nearest(given, SETS)}; use {listed(SETS)}, or a "
+                "file whose name ends with .toml"
+            )
+        return cls._from_toml(Path(given))
+
+    @classmethod
+    def _from_toml(cls, path: Path) -> ArmParameters:
+        try:
+            told = tomllib.loads(path.read_text(encoding="utf-8-sig"))
+        except (OSError, UnicodeDecodeError, tomllib.TOMLDecodeError, RecursionError) as error:
+            raise DataError(f"{str(path)!r} is not a TOML file that can be read ({error}); correct it") from None
+        base = told.pop("base", "effective")
+        if base not in SETS:
+            raise ModelError(f"{path.name}: base = {base!r} is not known{nearest(base, SETS)}; use {listed(SETS)}")
+        start = SETS[base]
+        stages = {}
+        for name in ("stage1", "stage2"):
+            table = told.pop(name, {})
+            if not isinstance(table, dict):
+                raise ModelError(f"{path.name}: {name} is not a table; write [{name}] and its numbers below it")
+            stages[name] = replace(getattr(start, name), **_numbers(path, name, table, StageParameters))
+        rest = _numbers(path, "the file", told, ArmParameters)
+        return replace(start, **{**rest, **stages, "name": path.name[:100]})
+
+    def to_dict(self) -> dict[str, Any]:
+        """For JSON."""
+        return {k: list(v) if isinstance(v, tuple) else v for k, v in asdict(self).items()}
+
+    def pushes(self) -> dict[str, float]:
+        """What the stages do to each other: coefficients of D^2 of the other stage's angles by the law's names.
+
+        Raises
+        ------
+        ModelError
+            Numbers out of range, or inertias with which the arm's kinetic energy is not positive.
+        """
+        for name, highest in (("coupling", 1.0), ("turned", 1.0), ("inertia_ratio", math.inf), ("reach", math.inf)):
+            value = getattr(self, name)
+            if not (0.0 <= value <= highest and math.isfinite(value)):
+                raise ModelError(f"{name} = {value!r} is outside [0, {highest:g}]; correct the arm's parameters")
+        if not self.stage2.r > 1.0:
+            raise ModelError(f"r = {self.stage2.r!r} of stage 2 is not above 1, as (J_1 + J_2)/J_2 is")
+        hub = self.coupling * self.turned * self.inertia_ratio
+        arm = self.coupling * self.inertia_ratio / (self.stage2.r - 1.0) * (1.0 + self.reach)
+        base, carried = -self.coupling * self.turned, -self.coupling * (1.0 + self.reach)
+        # The determinant of the inertias over that of the stages apart.
+        if not 1.0 + hub * base + arm * carried > 0.0:
+            raise ModelError(
+                f"inertia_ratio = {self.inertia_ratio:g} and reach = {self.reach:g} give stage 2 more inertia than "
+                "link 1 carries, and the arm a kinetic energy that is not positive: its leading matrix is singular or "
+                "worse; make them smaller"
+            )
+        return {"p2": -hub - arm, "q2": -arm, "p3": base, "q3": base, "p4": carried, "q4": carried}
+
+    def model(self, *, friction: bool = False) -> Model:
+        """The arm as a model, both stages from their currents; with friction it is what :meth:`arm` integrates.
+
+        Parameters
+        ----------
+        friction
+            Whether hubs stick; of the Lagrange form.
+
+        Raises
+        ------
+        ModelError
+            Orders or coefficients that make no model, the published form with a coupling or with friction.
+        """
+        if self.form == "published" and self.coupling != 0.0:
+            raise ModelError(
+                "form = 'published' knows the stages apart alone: set coupling = 0, or use form = 'lagrange'"
+            )
+        coupled = self.coupling != 0.0
+        structure = flexible_link(
+            stage="both",
+            form=self.form,
+            coupling="simulated",
+            cross_stage="inertial" if coupled else False,
+            friction=friction,
+        )
+        orders: dict[str, float] = {}
+        coefficients: dict[str, float] = self.pushes() if coupled else {}
+        for j, stage in ((1, self.stage1), (2, self.stage2)):
+            orders |= stage.orders(j)
+            coefficients |= stage.coefficients(j, self.form)
+            if friction:
+                coefficients[f"fc{j}"] = stage.g * stage.coulomb
+        known = {n: v for n, v in orders.items() if n in structure.order_names}
+        return Model(structure.with_orders(known).with_coefficients(coefficients), orders=known)
+
+    def arm(self, step: float, horizon: float) -> _core.VirtualArm:
+        """The simulated arm at rest, for runs of at most `horizon` s in samples of `step` s."""
+        model = self.model()
+        links = {
+            "equations": [equation_tuple(item, SIGNALS) for item in model.equations],
+            "coulomb": [self.stage1.coulomb, self.stage2.coulomb],
+        }
+        sensors = {
+            "strain_scale": STRAIN_SCALE,
+            "strain_bias": self.strain_bias,
+            "noise": [*self.strain_noise, *self.current_noise],
+            "sense_bias": self.current_bias,
+            "sense_scale": SENSE_SCALE,
+            "command_scale": COMMAND_SCALE,
+            "encoder_scale": self.encoder_scale,
+            "range": 10.0,
+            "bits": self.bits,
+            "current_limit": CURRENT_LIMIT,
+            "offset": self.current_offset,
+            "travel": self.travel,
+        }
+        return _core.VirtualArm(links, sensors, step, SUBSTEP, horizon)
+
+
+def _numbers(path: Path, where: str, table: Mapping[str, Any], kind: type[Any]) -> dict[str, Any]:
+    known = {f.name: f.type for f in fields(kind) if f.name not in ("stage1", "stage2", "name")}
+    found: dict[str, Any] = {}
+    for key, value in table.items():
+        if key not in known:
+            raise ModelError(
+                f"{path.name}: {key!r} in {where} is not known{nearest(key, known)}; known are {listed(known)}"
+            )
+        if key == "form":
+            if value not in ("lagrange", "published"):
+                raise ModelError(f"{path.name}: form = {value!r} is not known; use 'lagrange' or 'published'")
+            found[key] = value
+            continue
+        pair = "tuple" in str(known[key])
+        values = value if isinstance(value, list) else [value]
+        good = all(isinstance(v, (int, float)) and not isinstance(v, bool) and math.isfinite(v) for v in values)
+        if not good or len(values) != (2 if pair else 1) or isinstance(value, list) != pair:
+            what = "a pair of numbers such as [0.1, 0.2]" if pair else "a number"
+            raise ModelError(f"{path.name}: {key} = {value!r} in {where} is not {what}")
+        if key == "bits" and not (isinstance(value, int) and 0 <= value <= 24):
+            raise ModelError(f"{path.name}: bits = {value!r} is not a whole number from 0 to 24")
+        if (key.endswith("noise") and min(values) < 0) or (key in ("travel", "encoder_scale") and min(values) <= 0):
+            raise ModelError(f"{path.name}: {key} = {value!r} in {where} must not be negative")
+        found[key] = tuple(map(float, values)) if pair else value if key == "bits" else float(value)
+    return found
+
+
+_STAGE1 = StageParameters(
+    a=628.89, b=-62.956, d=6.63, g=140.47, r=(0.0635 + 0.1704) / 0.1704, gamma=0.95, beta=0.1, mu=0.85, coulomb=0.08
+)
+_STAGE2 = StageParameters(
+    a=2271.117,
+    b=-496.763,
+    d=28.351,
+    g=288.122,
+    r=(0.00301955 + 0.0064387) / 0.0064387,
+    gamma=0.9,
+    beta=0.2,
+    mu=0.8,
+    coulomb=0.1,
+)
+#: Both units of the real arm have these links, fitted on one run of each with whole orders: -K_s/J_2 = -164 and -418,
+#: -B_2/J_2 = -0.365 and -2.09, -0.170 from stage 2 to link 1 and -2.36 back; J_1/J_2 is the maker's. The order of the
+#: first link's stiffness, left free, goes to 0 within 0.01. benches/virtual_arm.py measures all of it again.
+_SOFT1 = StageParameters(a=439.9, b=-17.4, d=0.979, g=112.6, r=_STAGE1.r, gamma=1.0, beta=0.0, mu=1.0, coulomb=0.179)
+_SOFT2 = StageParameters(a=891.0, b=-142.0, d=4.46, g=288.0, r=_STAGE2.r, gamma=1.0, beta=0.0, mu=1.0, coulomb=0.228)
+_MEASURED = ArmParameters(_SOFT1, _SOFT2, inertia_ratio=0.0327, reach=1.36, name="measured")
+#: "effective": the maker's effective parameters with fractional damping, friction, coupling and noise. "linear": the
+#: same two stages apart, without friction, noise and quantisation of the gauges. "measured": the unit of the real arm
+#: that ran under partial-state feedback, "measured-lqr" the one that ran under LQR. Torque, viscous and Coulomb
+#: friction of each hub are fitted on its own run; the former's tells those of hub 2 apart at the maker's torque alone.
+SETS: dict[str, ArmParameters] = {
+    "effective": ArmParameters(_STAGE1, _STAGE2),
+    "linear": ArmParameters(
+        replace(_STAGE1, coulomb=0.0),
+        replace(_STAGE2, coulomb=0.0),
+        coupling=0.0,
+        strain_noise=(0.0, 0.0),
+        current_noise=(0.0, 0.0),
+        strain_bias=(0.0, 0.0),
+        current_bias=(0.0, 0.0),
+        bits=0,
+        name="linear",
+    ),
+    "measured": _MEASURED,
+    "measured-lqr": replace(
+        _MEASURED,
+        stage1=replace(_SOFT1, b=-25.6, g=120.0, coulomb=0.254),
+        stage2=replace(_SOFT2, b=-18.7, g=196.5, coulomb=0.148),
+        name="measured-lqr",
+    ),
+}

@@ -1,0 +1,307 @@
+"""A controller in the loop of a run: asked once a sample, and believed only where it answers with two currents."""
+
+from __future__ import annotations
+
+import contextlib
+import json
+import math
+import os
+import time
+from collections.abc import Callable, Sequence
+from typing import Any, Literal, TypeAlias
+
+import numpy as np
+from numpy.typing import ArrayLike
+
+from ftlm.data.run import Run
+from ftlm.errors import DataError, ModelError
+from ftlm.estimation.linear import Streaming
+from ftlm.rig.arm_parameters import ArmParameters
+from ftlm.rig.recording import Experiment, check_times
+from ftlm.rig.rig import LONGEST, Board, Rig
+from ftlm.utils.validation import Floats, check_seed, words_of
+
+#: What is called once a sample: time [s], measured angles [rad] and reference [rad] in, two currents [A] out.
+Controller: TypeAlias = Callable[[float, Floats, Floats], Sequence[float] | Floats]
+#: Names of the reference in a run, of hub 1 and hub 2.
+REFERENCES = ("reference1", "reference2")
+#: Most characters, as JSON, of what a controller says of itself.
+SAID = 100_000
+#: Hub angle at which a limit switch opens, where the board does not say its own [rad].
+TRAVEL = (math.pi / 2, math.pi / 2)
+
+
+def control(
+    controller: Controller,
+    reference: ArrayLike,
+    rig: str | Board = "virtual",
+    *,
+    duration: float | None = None,
+    limit: float = 30.0,
+    rate: float = 500.0,
+    seed: int = 0,
+    parameters: str | os.PathLike[str] | ArmParameters = "effective",
+    offset: tuple[float, float] | None = None,
+    paced: bool = False,
+    sensor_filter: Literal["stock"] | None = None,
+    watchdog: float = 0.1,
+    arm: bool = False,
+    card: str = "0",
+    name: str = "control",
+    out: str | os.PathLike[str] | None = None,
+    force: bool = False,
+    live: Streaming | None = None,
+    progress: Callable[[int, int], None] | None = None,
+) -> Run:
+    """Close a loop on a rig: ask a controller once a sample, and record the run.
+
+    The loop, its limits, its watchdog and its way out are those of :func:`ftlm.rig.record`. What a controller answers
+    to the sample at t acts from the next sample on: one sample of delay, always the same however long it takes within
+    its sample. The first command and the last are 0 A.
+
+    Parameters
+    ----------
+    controller : callable
+        ``controller(time, angles, reference)`` with the time [s], an array of theta11, theta12, theta21, theta22 [rad]
+        as they are recorded, and an array of the reference of both hubs [rad] at that time; it returns both currents
+        [A], within 0.94 and 1.2. What has a ``reset()`` is reset before the run, what has a ``to_dict()`` is told in
+        the run's `about`.
+    reference : array_like
+        Hub angles [rad]: shape (rows, 2), one row a sample; or a pair that is held for `duration`.
+    rig : {"virtual", "q8"} or Board, default "virtual"
+        The simulated arm, the arm on a Q8-USB board, or a board of your own.
+    duration : float, optional
+        [s]; by default as long as the rows of the reference last.
+    limit, rate, seed, parameters, offset, paced, sensor_filter, watchdog, arm, card, out, force, live, progress
+        See :func:`ftlm.rig.record`.
+    name : str
+        Of the run.
+
+    Returns
+    -------
+    Run
+        As of :func:`ftlm.rig.record`, with the inputs reference1 and reference2 [rad].
+
+    Raises
+    ------
+    ModelError
+        An argument that is out of range, a reference beyond the arm's travel, real hardware without ``arm=True``;
+        nothing has moved.
+    DataError
+        A reference that is no such array, a file that is there already; nothing has moved.
+    RigFault
+        The rig stopped the run, or the controller failed, or answered with anything but two finite currents within the
+        limits, or too late. 0 V was put out at once, or by the watchdog where it did not answer at all; the cause is in
+        words, what the controller raised is the fault's ``__cause__``, what was recorded is in `run` and in the file.
+
+    Notes
+    -----
+    In real time an answer that takes longer than a sample is a missed deadline: 21 in a row, or one that makes a write
+    50 ms late, stop the run. As fast as possible nothing is late but for the watchdog, which then waits 2 s.
+    """
+    if not callable(controller):
+        raise ModelError(
+            f"controller is a {type(controller).__name__}; pass what is called as controller(time, angles, reference) "
+            "and returns two currents [A]"
+        )
+    given = _numbers(reference)
+    if duration is None:
+        if given.ndim == 1:
+            raise ModelError("a reference that is held needs duration= [s]; or give it as rows, one a sample")
+        _, _, rate = check_times(LONGEST, LONGEST, rate)
+        duration = (len(given) - 1) / rate
+    duration, limit, rate = check_times(duration, limit, rate)
+    seed = check_seed(seed)
+    told: dict[str, Any] = {"controller": _told(controller)}
+
+    def loop(board: Board) -> Loop:
+        own = getattr(board, "parameters", None)
+        travel = own.travel if isinstance(own, ArmParameters) else TRAVEL
+        rows = _rows(given, round(duration * rate) + 1, rate, travel)
+        reset = getattr(controller, "reset", None)
+        if callable(reset):
+            reset()
+        return Loop(controller, rows, rate, getattr(board, "clock", time.perf_counter))
+
+    asked = Experiment(
+        rig,
+        duration,
+        limit,
+        rate,
+        seed,
+        parameters,
+        offset,
+        paced,
+        sensor_filter,
+        watchdog,
+        arm,
+        card,
+        name,
+        out,
+        force,
+        live,
+        progress,
+    )
+    return asked.recorded(loop, {"control": told})
+
+
+class Loop:
+    """A controller as the source of a run's commands, one sample at a time.
+
+    Parameters
+    ----------
+    controller
+        What is asked.
+    reference
+        Of both hubs, shape (rows, 2) [rad].
+    rate
+        Samples per second.
+    clock
+        Seconds, to say how long an answer took.
+    """
+
+    def __init__(self, controller: Controller, reference: Floats, rate: float, clock: Callable[[], float]) -> None:
+        self.controller, self.reference = controller, reference
+        self.rows, self.rate, self.clock = len(reference), rate, clock
+        self.told = {name: reference[:, j] for j, name in enumerate(REFERENCES)}
+        self._rig: Rig | None = None
+        self._at = -1
+        self._since: float | None = None
+        self._took = 0.0
+
+    def first(self, rig: Rig, block: int) -> Floats:
+        """Nothing was measured yet: 0 A."""
+        self._rig, self._at = rig, -1
+        return np.zeros((1, 2))
+
+    def after(self, rows: Floats) -> Floats:
+        """The answer to what was measured last; 0 A at the run's end."""
+        if self._rig is None or not len(rows):
+            raise ModelError("the board ran a sample and handed over no row of it; correct its take()")
+        self._at += 1
+        if self._at + 2 >= self.rows:
+            return np.zeros((1 if self._at + 2 == self.rows else 0, 2))
+        t = self._at / self.rate
+        self._since = self.clock()
+        try:
+            answer = self.controller(t, rows[-1, 2:6].copy(), self.reference[self._at].copy())
+        except Exception as error:
+            self._rig.fail(f"at {t:.6g} s the controller failed ({type(error).__name__}: {words_of(error)})", error)
+        except BaseException:
+            with contextlib.suppress(Exception):
+                self._rig.board.write((0.0, 0.0))
+            raise
+        self._took = self.clock() - self._since
+        self._since = None
+        try:
+            currents, wrong = _currents(answer, self._rig.limits.current)
+        except Exception as error:
+            # Lists and numbers of its own may do anything when they are read.
+            words = f"at {t:.6g} s what the controller returned cannot be read ({type(error).__name__}: "
+            self._rig.fail(f"{words}{words_of(error)})", error)
+        if wrong:
+            self._rig.fail(f"at {t:.6g} s the controller {wrong}")
+        return currents
+
+    def blamed(self, fault: str) -> str:
+        """A fault with how long the controller took, where that was longer than a sample."""
+        where = f"the sample at {max(self._at, 0) / self.rate:.6g} s"
+        if self._since is not None and fault.startswith("stopped by"):
+            return f"{fault}: the controller had not answered to {where} for {self.clock() - self._since:.3g} s"
+        if self._took * self.rate > 1.0:
+            return f"{fault}; the controller took {self._took:.3g} s to answer to {where}"
+        return fault
+
+
+def _currents(answer: object, limits: tuple[float, float]) -> tuple[Floats, str]:
+    """The two currents of an answer, shape (1, 2), or what is wrong with it."""
+    nothing = np.zeros((1, 2))
+    if answer is None:
+        return nothing, "returned nothing; return both currents [A], such as (0.1, 0.0)"
+    if isinstance(answer, (str, bytes, bytearray)):
+        return nothing, f"returned text ({bytes(answer[:20]) if not isinstance(answer, str) else answer[:20]!r})"
+    if not isinstance(answer, (tuple, list, np.ndarray)):
+        return nothing, f"returned a {type(answer).__name__}, not both currents [A]"
+    if isinstance(answer, np.ndarray) and answer.shape != (2,):
+        return nothing, f"returned an array of shape {answer.shape}, not both currents [A]"
+    if len(answer) != 2:
+        return nothing, f"returned {len(answer)} values, not both currents [A]"
+    values = []
+    for motor, (given, most) in enumerate(zip(answer, limits, strict=True), start=1):
+        if isinstance(given, (bool, np.bool_)) or not isinstance(given, (int, float, np.integer, np.floating)):
+            return nothing, f"returned a {type(given).__name__} for motor {motor}, not a current [A]"
+        try:
+            value = float(given)
+        except OverflowError:
+            value = math.inf
+        if not math.isfinite(value):
+            return nothing, f"returned {value} for motor {motor}, not a finite current"
+        if abs(value) > most * (1 + 1e-12):
+            return nothing, (
+                f"asked motor {motor} for {value:.4g} A, over the limit of {most:g} A; clip what it returns, and let "
+                "no integral grow meanwhile"
+            )
+        values.append(value)
+    return np.array([values]), ""
+
+
+def _numbers(reference: ArrayLike) -> Floats:
+    """A reference as numbers, shape (rows, 2) or (2,)."""
+    try:
+        raw = np.asarray(reference)
+        good = raw.dtype.kind in "fiu" and raw.ndim in (1, 2) and raw.shape[-1] == 2
+    except (TypeError, ValueError, MemoryError):
+        good = False
+    if not good:
+        raise DataError(
+            "reference is no array of numbers of shape (rows, 2), hub angles [rad] of one row a sample, and no pair of "
+            "angles to hold"
+        )
+    return np.array(raw, dtype=np.float64)
+
+
+def _rows(given: Floats, rows: int, rate: float, travel: tuple[float, float]) -> Floats:
+    """One row a sample, all of them within the arm's travel."""
+    reference = np.tile(given, (rows, 1)) if given.ndim == 1 else given
+    if len(reference) != rows:
+        raise DataError(
+            f"reference has {len(reference)} rows, and a run of {(rows - 1) / rate:g} s at {rate:g} Hz has {rows}; "
+            "give as many, or leave duration= out"
+        )
+    for hub, most in enumerate(travel):
+        angles = reference[:, hub]
+        bad = np.flatnonzero(~np.isfinite(angles))
+        if bad.size:
+            raise DataError(
+                f"reference of hub {hub + 1} is {angles[bad[0]]} at row {bad[0]} ({bad.size} such rows in all); give "
+                "finite angles [rad]"
+            )
+        over = np.flatnonzero(np.abs(angles) > most)
+        if over.size:
+            raise ModelError(
+                f"reference of hub {hub + 1} is {math.degrees(angles[over[0]]):.4g} degrees at {over[0] / rate:.4g} s "
+                f"({over.size} samples in all), beyond its travel of {math.degrees(most):.4g} degrees; it is in rad: "
+                "give a smaller one"
+            )
+    return reference
+
+
+def _told(controller: Controller) -> dict[str, Any]:
+    """What a run says of its controller."""
+    name = getattr(controller, "__name__", type(controller).__name__)
+    told: dict[str, Any] = {"name": str(name)[:100]}
+    describe = getattr(controller, "to_dict", None)
+    if callable(describe):
+        told |= {"settings": describe()}
+    try:
+        size = len(json.dumps(told, allow_nan=False))
+    except (TypeError, ValueError, RecursionError) as error:
+        raise ModelError(
+            f"what to_dict() of the controller returns is no JSON ({words_of(error, 200)}); correct it"
+        ) from None
+    if size > SAID:
+        raise ModelError(
+            f"what to_dict() of the controller returns is {size} characters long, more than the {SAID} that a run says "
+            "of its controller; leave out what no reader needs"
+        )
+    return told

@@ -1,0 +1,487 @@
+"""The limit for step 0 of samples on ever finer grids, each of half the step of the one before (Romberg's triangle)."""
+
+from __future__ import annotations
+
+from collections.abc import Callable, Mapping, Sequence
+from dataclasses import dataclass, field, replace
+
+import numpy as np
+from msgspec import UNSET
+from numpy.typing import NDArray
+
+from ftlm import _core
+from ftlm.data.run import Run
+from ftlm.data.sampling import HELD, bridged
+from ftlm.errors import ModelError
+from ftlm.model.model import Solved
+from ftlm.simulation.discretization import MAX_M, acting, has_own_times, record
+from ftlm.simulation.initial_conditions import decided
+from ftlm.simulation.output_samples import (
+    FIRST_REFINEMENT,
+    FRICTION_REFINEMENT,
+    GRAIN,
+    Sampled,
+    Terms,
+    begun,
+    begun_terms,
+    fitted,
+    initial_names,
+    measured_samples,
+    own_times,
+    sampled,
+    started,
+    unit_samples,
+)
+from ftlm.utils.validation import Floats
+
+#: Powers of the step that the error of a sample has: the second is the pulse scheme's; the third comes with reading an
+#: instant from the pulses before it; then the next of both. A kink t^eta leaves powers in between, which these columns
+#: do not take away, but none makes the error larger by more than a small factor.
+POWERS = (2, 3, 4)
+#: A column is taken for the power that it still has where halving the step divided what it moves by this share of that
+#: power's factor at least.
+SEEN = 0.5
+#: Where no power is known, halving the step divided what moves by this factor at least (by the root of two, and a
+#: little less), in as many samples as if so many alone moved: one number is told by theirs.
+LEAST_RATIO, FEW = 1.4, 8.0
+#: Grids that tell such a factor, and whether it is one.
+GRIDS = 4
+
+
+def _moved(new: Floats, old: Floats) -> Floats:
+    moved, size = np.max(np.abs(new - old), axis=1), np.max(np.abs(new), axis=1)
+    return np.asarray(np.where(moved == 0.0, 0.0, moved / size))
+
+
+@dataclass(frozen=True)
+class Told:
+    """What grids tell of the limit.
+
+    Parameters
+    ----------
+    samples
+        The samples there.
+    change
+        By which share of its largest value another halving would move each output; infinite before there were three
+        grids.
+    beside
+        The numbers beside the samples there.
+    """
+
+    samples: Floats
+    change: Floats
+    beside: Floats
+
+
+@dataclass
+class Limit:
+    """What grids of 1, 1/2, 1/4, … of a step say together; samples have the shape (outputs, N).
+
+    Parameters
+    ----------
+    rows
+        Of the last grids, finest last: the samples, and those with one power of the step after another taken away.
+    beside
+        The same of numbers beside them, such as initial terms that were fitted on each grid.
+    moved
+        By which share of its largest value halving the step moved each output in each of these columns, for the last
+        two halvings; infinite for the samples themselves.
+    measure
+        That share, of samples on a grid and on the one before.
+    """
+
+    rows: list[list[Floats]] = field(default_factory=list)
+    beside: list[list[Floats]] = field(default_factory=list)
+    moved: list[list[Floats]] = field(default_factory=list)
+    measure: Callable[[Floats, Floats], Floats] = _moved
+
+    def add(self, samples: Floats, beside: Floats | None = None) -> None:
+        """The samples on the next grid; a grid without finite numbers tells nothing, and everything begins anew."""
+        before = self.rows[-1] if self.rows else []
+        both = bool(before) and bool(np.all(np.isfinite(before[0])) and np.all(np.isfinite(samples)))
+        row = extrapolated(samples, before if both else [])
+        with np.errstate(invalid="ignore", over="ignore", divide="ignore"):
+            # Nobody asks for the samples themselves: what was taken away moves less.
+            moved = [unknown(samples.shape[0])] * min(len(row), len(before))
+            moved[1:] = [self.measure(new, old) for new, old in zip(row[1:], before[1:], strict=False)]
+        numbers = np.zeros(0) if beside is None else beside
+        self.beside = [*self.beside, extrapolated(numbers, self.beside[-1] if both else [])][-GRIDS:]
+        self.rows = [*self.rows, row][-GRIDS:]
+        self.moved = [*self.moved, moved][-2:]
+
+    def told(self, owners: Sequence[int] = (), *, enough: float = 0.0) -> Told:
+        """What another halving would move least; the numbers beside belong to these outputs.
+
+        Where it moves a column by no more than what is enough, no other is looked for.
+        """
+        column, change = self.best
+        found = Told(self.rows[-1][column], change, self.beside[-1][column])
+        if len(self.rows) < GRIDS or np.all(change <= enough):
+            return found
+        known = min(map(len, self.rows))
+        every = [found, *(self._by_ratio(k, np.array(owners, dtype=int)) for k in range(known))]
+        return min((one for one in every if one is not None), key=lambda one: float(np.max(_known(one.change))))
+
+    def _by_ratio(self, column: int, owners: NDArray[np.intp]) -> Told | None:
+        """The limit of a column whose error shrinks by a factor of its own, if the grid before told one as well.
+
+        Kinks t^eta leave powers in between, and orders that meet logarithms, which no power of the triangle takes away.
+        """
+        oldest, older, old, new = (row[column] for row in self.rows)
+        second, third = (row[column] for row in self.beside[-2:])
+        before, now = still_to_go(oldest, older, old), still_to_go(older, old, new)
+        if before is None or now is None:
+            return None
+        with np.errstate(invalid="ignore", over="ignore"):
+            samples = new + now[:, None] * (new - old)
+            change = self.measure(samples, old + before[:, None] * (old - older))
+        return Told(samples, change, third + now[owners] * (third - second))
+
+    @property
+    def best(self) -> tuple[int, Floats]:
+        """The column that another halving would move least, and by which share of each output's largest value.
+
+        Infinite before there were three grids.
+        """
+        row, last = self.rows[-1], self.moved[-1]
+        found: tuple[int, Floats] = (len(row) - 1 if len(row) <= 2 else 1, unknown(row[0].shape[0]))
+        for column in range(1, len(last)):
+            told = [(column, last[column])]
+            before = self.moved[0][column] if len(self.moved) > 1 and column < len(self.moved[0]) else None
+            if before is not None and column + 1 < len(row):
+                factor = 2.0 ** POWERS[column]
+                # What is left of a column whose power shows is what the next column takes away.
+                if np.all(last[column] * (SEEN * factor) <= before):
+                    told.append((column + 1, last[column] / (factor - 1.0)))
+            found = min([found, *told], key=lambda pair: float(np.max(_known(pair[1]))))
+        return found
+
+
+def extrapolated(fine: Floats, coarse: Sequence[Floats]) -> list[Floats]:
+    """A row of the triangle from numbers on a grid and the row of twice its step."""
+    row = [fine]
+    with np.errstate(invalid="ignore", over="ignore"):
+        for power, before in zip(POWERS, coarse, strict=False):
+            factor = 2.0**power
+            row.append((factor * row[-1] - before) / (factor - 1.0))
+    return row
+
+
+def still_to_go(older: Floats, old: Floats, new: Floats) -> Floats | None:
+    """By which share of its last move each output moves yet, if one move after another is smaller by the same factor.
+
+    That is Aitken's, told by all samples of an output together; None where few of them move, or not ever less.
+    """
+    with np.errstate(invalid="ignore", over="ignore", divide="ignore"):
+        now, before = new - old, old - older
+        size = np.max(np.abs(now), axis=1, keepdims=True, initial=0.0)
+        unit = now / np.where(size > 0.0, size, 1.0)
+        squares = np.sum(unit**2, axis=1)
+        still = squares == 0.0
+        ratio = np.where(still, np.inf, np.sum(unit * before, axis=1) / np.where(still, 1.0, squares * size[:, 0]))
+        if not np.all(ratio >= LEAST_RATIO) or np.any(squares**2 < FEW * np.sum(unit**4, axis=1)):
+            return None
+        return np.asarray(1.0 / (ratio - 1.0))
+
+
+def unknown(outputs: int) -> Floats:
+    """The change of outputs of which nothing is known."""
+    return np.full(outputs, np.inf)
+
+
+def _known(change: Floats) -> Floats:
+    """Without numbers, a change is as large as can be."""
+    return np.where(np.isnan(change), np.inf, change)
+
+
+#: Intervals from which on a record is long: below, whole grids cost as little.
+LONG = 1 << 14
+#: Pieces of an answer begin at its end divided by powers of this, the first of them not below so many intervals: half
+#: the step on one costs what the whole did.
+RATIO, SHORTEST = 8, 128
+#: Pulses an interval on which all of an answer is known. On the first, answers jump where inputs do: the piece where
+#: they start is without it.
+WHOLE = (1, 2, 4)
+#: An answer whose later half exceeds its first by this factor belongs to a run that grows: what sums up would be
+#: rounding.
+GROWTH = 1e3
+
+
+@dataclass
+class Piece:
+    """A part of all answers, from one interval to before another, on its finest grid, and its limit for step 0."""
+
+    first: int
+    end: int
+    every: int
+    limit: Limit
+
+
+@dataclass(frozen=True)
+class Answers:
+    """A model on a run, as a sum of answers: to every sample of what drives it, to first samples, to initial terms.
+
+    Parameters
+    ----------
+    model
+        The model from rest, its limits of inputs done.
+    run
+        The run; of it only names, step and how inputs act in between.
+    drivers
+        Samples of what drives, as they act.
+    begun
+        Signals whose first sample acts otherwise than later ones, and those samples.
+    names
+        Output and power of the initial terms.
+    """
+
+    model: Solved
+    run: Run
+    drivers: Mapping[str, Floats]
+    begun: Mapping[str, float]
+    names: Sequence[tuple[str, float]]
+
+    @property
+    def count(self) -> int:
+        """Number of outputs."""
+        return len(self.model.outputs)
+
+    @classmethod
+    def of(cls, model: Solved, run: Run, names: Sequence[tuple[str, float]]) -> Answers | None:
+        """Those of a run; None where it is no such sum."""
+        structure = model.structure
+        outputs, coupled = model.outputs, structure.coupling == "simulated"
+        read = [(e, t) for e in model.equations for t in e.terms]
+        drivers = dict.fromkeys(
+            t.signal for e, t in read if t.signal != e.output and not (coupled and t.signal in outputs)
+        )
+        if structure.has_friction or run.readings is not None or structure.behind_filter:
+            return None
+        if any(name not in run for name in drivers) or any(
+            t.order.constant > e.order.constant + GRAIN for e, t in read
+        ):
+            return None
+        late = {name for name in drivers if structure.delay.get(name, 0.0)}
+        direct = {t.signal for e, t in read if abs(t.order.constant - e.order.constant) <= GRAIN}
+        if late and (late & direct or decided(run, structure) != "rest"):
+            # What acted before the run, and at its last sample, is no answer to one of its samples.
+            return None
+        every = {n: bridged(acting(run, structure, n)[n]) for n in drivers}
+        moving = {n: v for n, v in every.items() if v.any()}
+        ramps = [n for n in moving if n not in run.inputs or run.intersample[n] != HELD]
+        still = replace(model, structure=replace(structure, initial="rest", limited=UNSET))
+        return cls(still, run, moving, {n: float(moving[n][0]) for n in ramps if moving[n][0]}, names)
+
+    def on(self, every: int, intervals: int) -> Floats:
+        """All answers on so many pulses an interval, a block of rows an answer; not finite where there are none."""
+        try:
+            return self._on(every, intervals)
+        except ModelError:
+            # The grid happens to make the equations unsolvable.
+            rows = len(self.drivers) + len(self.begun) + len(self.names)
+            return np.full((rows * self.count, intervals + 1), np.nan)
+
+    def _on(self, every: int, intervals: int) -> Floats:
+        blocks, first = [], []
+        for name in self.drivers:
+            ramp = name not in self.run.inputs or self.run.intersample[name] != HELD
+            # What is linear in between rises to a sample before it falls.
+            rows = sampled(self.model, self._unit(name, intervals + ramp, int(ramp)), every, {})[0]
+            blocks.append(rows[:, 1:] if ramp else rows)
+            if name in self.begun:
+                first.append(sampled(self.model, self._unit(name, intervals, 0), every, {})[0] - blocks[-1])
+        more = unit_samples(self.model, self._unit("", intervals, 0), every, self.names) if self.names else []
+        return np.concatenate([*blocks, *first, *more]) if blocks or more else np.zeros((0, intervals + 1))
+
+    def _unit(self, name: str, intervals: int, row: int) -> Run:
+        """A run of nothing but one sample of one signal."""
+
+        def of(signal: str) -> Floats:
+            out = np.zeros(intervals + 1)
+            if signal == name:
+                out[row] = 1.0
+            return out
+
+        run = self.run
+        return Run.from_arrays(
+            step=run.step,
+            inputs={n: of(n) for n in run.inputs},
+            outputs={n: of(n) for n in run.outputs},
+            intersample=run.intersample,
+        )
+
+    def summed(self, answers: Floats, first: int, weights: Sequence[float]) -> Floats:
+        """What answers from one interval on make of the run behind it, shape (outputs, N - first).
+
+        The weights are those of the initial terms.
+        """
+        n = self.count
+        blocks = answers.reshape(-1, n, answers.shape[1])
+        out = np.zeros((n, self.run.length - first))
+        for block, samples in zip(blocks, self.drivers.values(), strict=False):
+            for i, row in enumerate(block):
+                if row.any():
+                    out[i] += _core.series_multiply(row, samples[: out.shape[1]], out.shape[1])
+        once = blocks[len(self.drivers) :]
+        for block, weight in zip(once, [*self.begun.values(), *weights], strict=True):
+            out[:, : answers.shape[1]] += weight * block
+        return out
+
+    def parts(self, answers: Floats) -> tuple[Floats, list[Floats]]:
+        """The run without initial terms, and what a unit of each does."""
+        units = answers.reshape(-1, self.count, answers.shape[1])[len(self.drivers) + len(self.begun) :]
+        return self.summed(answers, 0, [0.0] * len(self.names)), list(units)
+
+
+def long_run(model: Solved, run: Run, initial: Terms | None, *, tolerance: float, largest_m: int) -> Sampled | None:
+    """Samples of a long run, as :func:`ftlm.simulation.step_refinement.refined` has them; None for one that whole grids must tell.
+
+    The initial terms of the model are decided. The refinement is that of the whole record.
+    """
+    own = run.length - 1
+    if own < LONG or WHOLE[-1] * own > largest_m or model.structure.has_friction:
+        return None
+    given = None if initial is None else [(o, p) for o in model.outputs for p in initial.get(o, {})]
+    names = initial_names(model, decided(run, model.structure)) if given is None else given
+    answers = Answers.of(model, run, names)
+    if answers is None:
+        return None
+    grids = {every: answers.on(every, own) for every in WHOLE}
+    if not all(_dies_away(rows) for rows in list(grids.values())[1:]):
+        return None
+
+    def weighed(rows: Floats) -> tuple[Floats, dict[str, dict[float, float]]]:
+        driven, units = answers.parts(rows)
+        if initial is None and names:
+            return fitted(model, measured_samples(model, run, WHOLE[-1]), driven, names, units)
+        kept = {o: dict((initial or {}).get(o, {})) for o in model.outputs}
+        return driven + sum((kept[o][p] * u for (o, p), u in zip(names, units, strict=True)), np.zeros(1)), kept
+
+    rough, terms = weighed(grids[WHOLE[-1]])
+    size = np.max(np.abs(rough), axis=1)
+    weights = [terms[o][p] for o, p in names]
+
+    def moved_from(first: int) -> Callable[[Floats, Floats], Floats]:
+        def moved(new: Floats, old: Floats) -> Floats:
+            by = new - old
+            if not np.all(np.isfinite(by)):
+                return np.full(answers.count, np.inf)
+            most = np.max(np.abs(answers.summed(by, first, weights)), axis=1)
+            return np.asarray(np.where(most == 0.0, 0.0, most / np.where(size > 0.0, size, 1e-300)))
+
+        return moved
+
+    pieces = []
+    for first, end in _edges(own):
+        limit = Limit(measure=moved_from(first))
+        for every in WHOLE[0 if first else 1 :]:
+            limit.add(grids[every][:, first:end])
+        pieces.append(Piece(first, end, WHOLE[-1], limit))
+    del grids
+    change = _refined(pieces, answers, tolerance, largest_m)
+    best = np.concatenate([p.limit.told().samples for p in pieces], axis=1)
+    outputs, terms = weighed(best)
+    return Sampled(outputs, terms, pieces[-1].every, change)
+
+
+def _refined(pieces: Sequence[Piece], answers: Answers, tolerance: float, largest_m: int) -> Floats:
+    """Halve the step on the pieces that still move, until all together do not, or pulses run out; what is left."""
+    while True:
+        changes = [p.limit.told().change for p in pieces]
+        left = np.asarray(sum(c[: answers.count] for c in changes))
+        restless = [
+            p
+            for p, c in zip(pieces, changes, strict=True)
+            if np.any(c > tolerance / len(pieces)) and 2 * p.every * p.end <= largest_m
+        ]
+        if np.all(left <= tolerance) or not restless:
+            return left
+        widest = restless[-1]
+        every = 2 * widest.every
+        finer = answers.on(every, widest.end - 1)
+        for piece in pieces:
+            if piece.end <= widest.end and 2 * piece.every == every:
+                piece.limit.add(finer[:, piece.first : piece.end])
+                piece.every = every
+
+
+def _edges(own: int) -> list[tuple[int, int]]:
+    """Pieces of answers over so many intervals."""
+    ends = [own + 1]
+    while ends[0] // RATIO >= SHORTEST:
+        ends.insert(0, ends[0] // RATIO)
+    return list(zip([0, *ends[:-1]], ends, strict=True))
+
+
+def _dies_away(rows: Floats) -> bool:
+    """Whether answers do not grow by so much that their sum would lose its digits."""
+    if not np.all(np.isfinite(rows)):
+        return False
+    half = rows.shape[1] // 2
+    first, second = (np.max(np.abs(part), axis=1, initial=0.0) for part in (rows[:, :half], rows[:, half:]))
+    return bool(np.all(second <= GROWTH * first))
+
+
+def refined(
+    model: Solved, run: Run, initial: Terms | None, *, tolerance: float, largest_m: int = MAX_M, on_grid: bool = False
+) -> Sampled:
+    """Samples on grids refined, and extrapolated in the step, until they stand still or the pulses run out.
+
+    A long record is refined only as far as that moves it (:func:`ftlm.simulation.step_refinement.long_run`).
+
+    Parameters
+    ----------
+    initial
+        Coefficients of initial terms by output and exponent; None: those that bring the run closest to the measured
+        outputs, each weighted by its own deviation.
+    tolerance
+        Change, as a share of each output's largest value, at which refinement ends.
+    on_grid
+        Whether the instants are those of the run's grid although its rows have times of their own.
+    """
+    own = run.length - 1
+    every = FIRST_REFINEMENT
+    if initial is None and model.structure.has_friction:
+        # Level and velocity at the start are found by descent, whose ends scatter by more than steps move them.
+        rec = record(run, model.structure, FRICTION_REFINEMENT * own, filtered=False)
+        initial = begun_terms(model, begun(model, run, rec, FRICTION_REFINEMENT))
+    elif initial is None:
+        model = started(model, run)
+    long = long_run(model, run, initial, tolerance=tolerance, largest_m=largest_m)
+    if long is not None:
+        return long
+    times = run.time if on_grid and has_own_times(run, model.structure) else own_times(model, run)
+    limit, lost = Limit(), 0
+    while True:
+        last = 2 * every * own > largest_m
+        samples, terms = _tried(model, run, every, initial, times, last=lost == 1)
+        finite = bool(np.all(np.isfinite(samples)))
+        owners = [i for i, o in enumerate(model.outputs) for _ in terms[o]]
+        limit.add(samples, np.array([v for o in model.outputs for v in terms[o].values()]))
+        told = limit.told(owners, enough=tolerance)
+        # A stiff equation may have no stable scheme on a coarse grid; one that has none on two in a row has none.
+        lost = 0 if finite or every == FIRST_REFINEMENT else lost + 1
+        if last or lost == 2 or np.all(told.change <= tolerance):
+            break
+        every *= 2
+    return Sampled(told.samples, _like(terms, told.beside), every, told.change)
+
+
+def _like(terms: Terms, values: Floats) -> dict[str, dict[float, float]]:
+    """Initial terms of these outputs and exponents with other values."""
+    left = iter(values.tolist())
+    return {o: {e: next(left) for e in powers} for o, powers in terms.items()}
+
+
+def _tried(
+    model: Solved, run: Run, every: int, initial: Terms | None, times: Floats | None, *, last: bool = False
+) -> tuple[Floats, dict[str, dict[float, float]]]:
+    """Samples on one grid; no numbers where it happens to make the equations unsolvable, unless it is the last try."""
+    try:
+        return sampled(model, run, every, initial, times)
+    except ModelError:
+        # An own coefficient c meets 1 = c h^alpha / gamma(alpha + 2) on one step, not on two.
+        if last:
+            raise
+        count = run.length if times is None else times.size
+        return np.full((len(model.outputs), count), np.nan), {o: {} for o in model.outputs}

@@ -1,0 +1,1 @@
+"""Structures: orders, equations, input nonlinearities, sensor filters and their language."""

@@ -1,0 +1,209 @@
+"""Orders: numbers, affine functions of free orders, and the values that a person gives one."""
+
+from __future__ import annotations
+
+import ast
+import math
+from collections.abc import Iterable, Mapping
+from dataclasses import dataclass
+from itertools import pairwise
+from typing import TypeAlias
+
+from ftlm.errors import ModelError
+from ftlm.utils.validation import real_number
+
+#: Highest order of an equation, and the lowest of an input: a threefold integration.
+MAX_ORDER = 10.0
+MIN_INPUT_ORDER = -3.0
+#: A signal's order stays below its equation's highest order and this: beyond, a measured signal would be differentiated
+#: more often than its samples carry.
+MAX_EXCESS = 1.0
+#: Highest order that a search tries of itself, where the structure holds none above it.
+SEARCHED_ORDER = 3.0
+#: Orders are kept to this; what differs by less is one order.
+RESOLUTION = 1e-9
+#: What a person writes for the values of an order, see :func:`parse_values`.
+Values: TypeAlias = float | str | Iterable[float]
+
+
+@dataclass(frozen=True)
+class Order:
+    """An order: a number, or an affine function of named free orders.
+
+    Parameters
+    ----------
+    constant
+        Constant part.
+    weights
+        Weight of each free order, by name, as sorted pairs without zeros.
+    """
+
+    constant: float = 0.0
+    weights: tuple[tuple[str, float], ...] = ()
+
+    def partly(self, values: Mapping[str, float]) -> Order:
+        """Return the order with these free orders replaced by values; others stay free."""
+        constant = self.constant + sum(w * values[n] for n, w in self.weights if n in values)
+        return Order(round(constant, 9) + 0.0, tuple((n, w) for n, w in self.weights if n not in values))
+
+    @classmethod
+    def parse(cls, text: str | float) -> Order:
+        """Read ``0.5``, ``"alpha"`` or an affine expression such as ``"alpha1 - alpha2 + 2*mu2"``.
+
+        Raises
+        ------
+        ModelError
+            Anything that is not affine in its names.
+        """
+        if isinstance(text, (int, float)) and not isinstance(text, bool):
+            return cls(float(text))
+        try:
+            tree = ast.parse(str(text).strip(), mode="eval").body
+            constant, weights = _affine(tree)
+        except (SyntaxError, ValueError, OverflowError, RecursionError, MemoryError) as error:
+            shown = f"{text!r}"
+            shown = shown if len(shown) <= 60 else f"{shown[:60]}…"
+            raise ModelError(
+                f"order {shown} is neither a number nor a sum of named orders; write 0.5, alpha or alpha1-mu2+0.1"
+            ) from error
+        # A plain number is judged where its range is known.
+        if weights and not all(map(math.isfinite, (constant, *weights.values()))):
+            raise ModelError(
+                f"order {text!r:.60} holds a number that is not finite; write 0.5, alpha or alpha1-mu2+0.1"
+            )
+        return cls(constant, tuple(sorted((n, w) for n, w in weights.items() if w)))
+
+    @property
+    def names(self) -> tuple[str, ...]:
+        """Free orders that this one depends on."""
+        return tuple(name for name, _ in self.weights)
+
+    @property
+    def is_single(self) -> bool:
+        """Whether this is one free order and nothing else."""
+        return self.constant == 0 and len(self.weights) == 1 and self.weights[0][1] == 1
+
+    def at(self, values: Mapping[str, float]) -> float:
+        """Value at given free orders, rounded to 1e-9.
+
+        Raises
+        ------
+        ModelError
+            A free order without a value.
+        """
+        try:
+            return round(self.constant + sum(w * values[n] for n, w in self.weights), 9) + 0.0
+        except KeyError as error:
+            raise ModelError(f"order {error.args[0]} has no value; give it in orders=") from None
+
+    def __str__(self) -> str:
+        parts = [f"{'-' if w < 0 else '+'}{'' if abs(w) == 1 else f'{shortest(abs(w))}*'}{n}" for n, w in self.weights]
+        if self.constant or not parts:
+            parts.append(f"{'-' if self.constant < 0 else '+'}{shortest(abs(self.constant))}")
+        return "".join(parts).removeprefix("+")
+
+
+def shortest(value: float) -> str:
+    """Write a number in six digits if that is what it is, else in as many as give it back."""
+    short = f"{value:g}"
+    return short if float(short) == value else repr(value)
+
+
+def _affine(node: ast.expr) -> tuple[float, dict[str, float]]:
+    """Constant and weights of an affine expression; ValueError for anything else."""
+    match node:
+        case ast.Constant(value=int() | float() as value) if not isinstance(value, bool):
+            return float(value), {}
+        case ast.Name(id=name):
+            return 0.0, {name: 1.0}
+        case ast.UnaryOp(op=ast.USub() | ast.UAdd() as sign, operand=operand):
+            factor = -1.0 if isinstance(sign, ast.USub) else 1.0
+            constant, weights = _affine(operand)
+            return factor * constant, {n: factor * w for n, w in weights.items()}
+        case ast.BinOp(left=left, op=ast.Add() | ast.Sub() as sign, right=right):
+            factor = -1.0 if isinstance(sign, ast.Sub) else 1.0
+            c1, w1 = _affine(left)
+            c2, w2 = _affine(right)
+            return c1 + factor * c2, {n: w1.get(n, 0) + factor * w2.get(n, 0) for n in {**w1, **w2}}
+        case ast.BinOp(left=left, op=ast.Mult(), right=right):
+            c1, w1 = _affine(left)
+            c2, w2 = _affine(right)
+            if w1 and w2:
+                raise ValueError("product of orders")
+            return c1 * c2, {n: w * (c2 if w1 else c1) for n, w in {**w1, **w2}.items()}
+        case ast.BinOp(left=left, op=ast.Div(), right=ast.Constant(value=int() | float() as value)) if value:
+            constant, weights = _affine(left)
+            return constant / value, {n: w / value for n, w in weights.items()}
+    raise ValueError("not affine")
+
+
+def parse_values(name: str, spec: Values) -> float | tuple[float, ...]:
+    """Values of one order: a number, ``"low:high:step"``, a tuple (low, high, step) or a list of numbers.
+
+    Returns a number if the order is fixed, else its values in ascending order.
+    """
+    if isinstance(spec, str):
+        parts = spec.split(":")
+        try:
+            numbers = [float(p) for p in parts]
+        except ValueError:
+            raise ModelError(
+                f"order {name}: {spec!r} is no interval; write LOW:HIGH:STEP such as 0.5:1.5:0.05"
+            ) from None
+        if len(numbers) == 1:
+            return _checked(name, numbers[0])
+        if len(numbers) != 3:
+            raise ModelError(f"order {name}: {spec!r} has {len(numbers)} parts; write LOW:HIGH:STEP")
+        return grid(name, *numbers)
+    if isinstance(spec, (int, float)):
+        return _checked(name, real_number(f"order {name}", spec))
+    if isinstance(spec, tuple) and len(spec) == 2:
+        raise ModelError(f"order {name}: {spec!r} has no step; write (low, high, step), or a list for two values")
+    try:
+        numbers = [real_number(f"order {name}", v) for v in spec]
+    except TypeError:
+        raise ModelError(f"order {name}: {spec!r} is no list of numbers; write LOW:HIGH:STEP or numbers") from None
+    if isinstance(spec, tuple) and len(spec) == 3:
+        return grid(name, *numbers)
+    values = [_checked(name, v) for v in numbers]
+    if not values:
+        raise ModelError(f"order {name} has no value; give at least one")
+    values = sorted(set(values))
+    for low, high in pairwise(values):
+        if round(low, 9) == round(high, 9):
+            raise ModelError(
+                f"order {name}: values {shortest(low)} and {shortest(high)} are one order: orders are kept to "
+                f"{RESOLUTION:g}; leave one out"
+            )
+    return tuple(values)
+
+
+def _checked(name: str, value: float) -> float:
+    if not MIN_INPUT_ORDER <= value <= MAX_ORDER:
+        raise ModelError(f"order {name} = {value:g} is outside [-3, 10]; choose another value")
+    return value
+
+
+#: Most values on one axis of a lattice: a step of 1e-6 over the widest interval is a slip of the hand.
+MAX_AXIS = 1_000_000
+
+
+def grid(name: str, low: float, high: float, step: float) -> tuple[float, ...]:
+    """Multiples of ``step`` from ``low`` to ``high``, both included, counted from ``low``."""
+    low, high, step = (real_number(f"order {name}", v) for v in (low, high, step))
+    if not (math.isfinite(step) and step > 0):
+        raise ModelError(f"order {name}: step {step:g} is not positive; the paper's is 0.05")
+    if step < RESOLUTION:
+        raise ModelError(
+            f"order {name}: step {step:g} is below {RESOLUTION:g}, to which orders are kept; raise the step"
+        )
+    _checked(name, low)
+    _checked(name, high)
+    if high < low:
+        raise ModelError(f"order {name}: interval {low:g}:{high:g} is empty; put the lower end first")
+    steps = (high - low) / step
+    if steps > MAX_AXIS:
+        raise ModelError(
+            f"order {name}: {low:g}:{high:g}:{step:g} has {steps:.3g} values, more than {MAX_AXIS}; raise the step"
+        )
+    return tuple(round(low + i * step, 9) + 0.0 for i in range(int(steps + 1e-6) + 1))

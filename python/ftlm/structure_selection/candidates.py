@@ -1,0 +1,388 @@
+"""Structures inside another one: terms left out, orders whole or free, with and without an offset."""
+
+from __future__ import annotations
+
+from collections.abc import Iterator, Mapping, Sequence
+from dataclasses import dataclass, replace
+
+from msgspec import UNSET
+
+from ftlm.errors import ModelError
+from ftlm.estimation.free_parameters import FreeProblem
+from ftlm.structure.equation import Equation, Term
+from ftlm.structure.input_nonlinearity import input_name
+from ftlm.structure.structure import Structure, narrowed
+
+#: Whole orders that stand for a free one.
+WHOLE = (0.0, 1.0, 2.0, 3.0)
+
+
+@dataclass(frozen=True)
+class Variant:
+    """A structure inside another.
+
+    Parameters
+    ----------
+    kept
+        Coefficients of the terms that it has.
+    whole
+        Orders that are numbers in it, by name; all others are free.
+    offset
+        Whether each run has an unknown constant.
+    inputs
+        Free delays and limits of inputs that it has; the others do not delay, do not limit.
+    rubs
+        Frictions that it has, as :attr:`Inside.frictions` calls them.
+    """
+
+    kept: frozenset[str]
+    whole: tuple[tuple[str, float], ...]
+    offset: bool
+    inputs: frozenset[str] = frozenset()
+    rubs: frozenset[str] = frozenset()
+
+    def held(self) -> dict[str, float]:
+        """Whole orders by name."""
+        return dict(self.whole)
+
+    def with_whole(self, values: Mapping[str, float | None]) -> Variant:
+        """The same with some orders whole, or free where they are None."""
+        known = {**self.held(), **values}
+        return replace(self, whole=tuple(sorted((n, v) for n, v in known.items() if v is not None)))
+
+
+@dataclass(frozen=True)
+class Change:
+    """A step from one variant to another, in words."""
+
+    words: str
+    variant: Variant
+
+
+@dataclass(frozen=True)
+class Inside:
+    """A structure and everything inside it.
+
+    Terms with a free coefficient of their own may be left out where the structure is one equation without laws; orders
+    that stand alone may be whole; an offset that is allowed, free delays and limits, and friction of free size may be
+    left out.
+    """
+
+    structure: Structure
+
+    @property
+    def droppable(self) -> tuple[str, ...]:
+        """Coefficients of terms that may be left out."""
+        structure = self.structure
+        if structure.has_order_law or structure.coefficient_law or len(structure.equations) > 1:
+            return ()
+        return tuple(t.coefficient for t in structure.equations[0].terms if isinstance(t.coefficient, str))
+
+    @property
+    def offset_allowed(self) -> bool:
+        """Whether an offset is one of the choices."""
+        return self.structure.offset in ("auto", "constant")
+
+    @property
+    def frictions(self) -> dict[str, str | None]:
+        """Frictions that may be left out, each with the one that it needs: what falls with speed needs Coulomb's."""
+        out: dict[str, str | None] = {}
+        for item in self.structure.equations:
+            rubs = item.friction
+            if rubs is None:
+                continue
+            own = f"friction of {item.output}"
+            if isinstance(rubs.coefficient, str):
+                out[own] = None
+            if rubs.stribeck is not None and isinstance(rubs.stribeck.coefficient, str):
+                out[f"{own} near rest"] = own if own in out else None
+        return out
+
+    def _rubbing(self, item: Equation, rubs: frozenset[str]) -> Equation:
+        """An equation with no friction but some, and what may not be left out."""
+        found, own, choices = item.friction, f"friction of {item.output}", self.frictions
+        if found is None:
+            return item
+        if own in choices and own not in rubs:
+            return replace(item, coulomb=UNSET)
+        near = f"{own} near rest"
+        return replace(item, coulomb=replace(found, more=UNSET)) if near in choices and near not in rubs else item
+
+    @property
+    def sliding(self) -> Structure:
+        """The structure without the frictions that may be left out."""
+        equations = tuple(self._rubbing(e, frozenset()) for e in self.structure.equations)
+        return replace(self.structure, equations=equations)
+
+    def build(self, variant: Variant) -> Structure:
+        """The structure of a variant."""
+        structure, droppable = self.structure, set(self.droppable)
+        equations = []
+        for item in structure.equations:
+            terms = tuple(t for t in item.terms if t.coefficient not in droppable or t.coefficient in variant.kept)
+            equations.append(self._rubbing(replace(item, terms=terms), variant.rubs))
+        names = {n for e in equations for n in e.order_names}
+        signals = tuple(dict.fromkeys(n for e in equations for n in (e.output, *e.signals)))
+        left = {i.name for i in structure.free_inputs} - variant.inputs
+        free = {n: v for n, v in structure.free_delays.items() if n in signals and input_name("delay", n) not in left}
+        made = replace(
+            structure,
+            equations=tuple(equations),
+            order_values={n: v for n, v in structure.order_values.items() if n in names},
+            delay={n: v for n, v in structure.delay.items() if n in signals},
+            free_delays=free,
+            limited=tuple(x for x in structure.limits if x.signal in signals and x.name not in left) or UNSET,
+            sensor_filter=narrowed(structure.sensor_filter, signals),
+        ).with_orders({n: v for n, v in variant.whole if n in names})
+        asked = structure.offset if structure.offset == "ramp" else "constant" if variant.offset else "none"
+        return replace(made, offset=asked)
+
+    def possible(self, variant: Variant) -> bool:
+        """Whether a variant is a structure: its own orders differ and lie below the highest."""
+        try:
+            made = self.build(variant)
+        except ModelError:
+            return False
+        for item in made.equations:
+            places = [(t.signal, t.order.constant) for t in item.terms if not t.order.names]
+            if len(set(places)) < len(places):
+                return False
+            own = [order for signal, order in places if signal == item.output]
+            if not item.order.names and any(o >= item.order.constant for o in own):
+                return False
+        return True
+
+    def wholes(self, name: str) -> list[float]:
+        """Whole values that a free order may take."""
+        problem = FreeProblem.of(self.structure)
+        low, high = problem.bounds[problem.orders.index(name)]
+        return [v for v in WHOLE if low <= v <= high and (v > 0 or name not in self._highest)] or [
+            round(0.5 * (low + high), 6)
+        ]
+
+    @property
+    def _highest(self) -> set[str]:
+        return {n for e in self.structure.equations for n in e.order.names}
+
+    def skeletons(self) -> Iterator[Change]:
+        """The simplest structures: whole orders, the output's own terms, and one thing that drives it."""
+        free = [n for n in self.structure.order_names if n in self._highest]
+        tops: list[dict[str, float]] = [{}]
+        for name in free:
+            tops = [{**top, name: v} for top in tops for v in self.wholes(name) if v > 0]
+        for top in tops:
+            base = self._with_own_terms(top)
+            if base is None:
+                continue
+            drives = [
+                t for t in self.structure.equations[0].terms if t.coefficient in self.droppable and not self._owns(t)
+            ]
+            known = any(not self._owns(t) and t.fixed is not None for t in self.structure.equations[0].terms)
+            if not drives or known:
+                yield Change(self._named(base), base)
+                continue
+            for term in drives:
+                yield from self._adding(base, term)
+
+    def top(self, variant: Variant) -> tuple[float | None, ...]:
+        """Highest orders of a variant where they are whole."""
+        held = variant.held()
+        return tuple(held.get(n) for n in sorted(self._highest))
+
+    def _named(self, variant: Variant) -> str:
+        return worded(self.build(variant))
+
+    def _owns(self, term: Term) -> bool:
+        return any(term in e.terms and term.signal == e.output for e in self.structure.equations)
+
+    def _with_own_terms(self, top: Mapping[str, float]) -> Variant | None:
+        """All own terms whose whole orders differ, and every term that may not be left out."""
+        droppable = self.droppable
+        whole: dict[str, float] = dict(top)
+        kept: list[str] = []
+        for item in self.structure.equations:
+            highest = top.get(item.order.names[0]) if item.order.is_single else item.order.constant
+            taken = {t.order.constant for t in item.terms if t.signal == item.output and not t.order.names}
+            for term in item.terms:
+                if term.order.is_single and term.order.names[0] in whole:
+                    continue
+                own = term.signal == item.output
+                if not own and term.coefficient in droppable:
+                    continue
+                if term.order.is_single:
+                    name = term.order.names[0]
+                    places = [v for v in self.wholes(name) if not own or (v < (highest or 0.0) and v not in taken)]
+                    if not places:
+                        if term.coefficient in droppable:
+                            continue
+                        return None
+                    # Of own terms whose orders are sought the last is taken for damping, those before it stand below.
+                    later = item.terms[item.terms.index(term) + 1 :]
+                    below = any(t.signal == item.output and t.order.is_single for t in later)
+                    value = 1.0 if own and 1.0 in places and not (below and 0.0 in places) else places[0]
+                    whole[name] = value
+                    taken |= {value} if own else set()
+                elif own and not term.order.names and term.order.constant >= (highest or 0.0):
+                    if term.coefficient in droppable:
+                        continue
+                    return None
+                if isinstance(term.coefficient, str):
+                    kept.append(term.coefficient)
+        names = [*self.structure.coefficient_names]
+        kept += [n for n in names if n not in droppable]
+        variant = Variant(frozenset(kept), tuple(sorted(whole.items())), self.structure.offset == "constant")
+        # Without own terms there is no equation before something drives it.
+        alone = any(self._owns(t) for item in self.structure.equations for t in item.terms)
+        return variant if self.possible(variant) or not alone else None
+
+    def _adding(self, variant: Variant, term: Term) -> Iterator[Change]:
+        """A term more, its order at each of its whole values."""
+        assert isinstance(term.coefficient, str)
+        kept = variant.kept | {term.coefficient}
+        if not term.order.names:
+            grown = [replace(variant, kept=kept)]
+        elif term.order.is_single and term.order.names[0] not in variant.held():
+            name = term.order.names[0]
+            grown = [replace(variant, kept=kept).with_whole({name: v}) for v in self.wholes(name)]
+            if self._owns(term):
+                # Where every whole order is taken, it starts free.
+                grown = [v for v in grown if self.possible(v)] or [replace(variant, kept=kept)]
+        else:
+            grown = [replace(variant, kept=kept)]
+        for one in grown:
+            if self.possible(one):
+                yield Change(f"+ {self._term_in(one, term)}", one)
+
+    def _term_in(self, variant: Variant, term: Term) -> str:
+        """A term as it stands in a variant."""
+        made = self.build(variant)
+        found = next(t for e in made.equations for t in e.terms if t.coefficient == term.coefficient)
+        return str(found)
+
+    def richest(self, variant: Variant) -> Variant:
+        """The variant with every term that it has room for, each at a whole order that no other term of it has."""
+        for item in self.structure.equations:
+            for term in item.terms:
+                if term.coefficient in self.droppable and term.coefficient not in variant.kept:
+                    grown = [c.variant for c in self._adding(variant, term)]
+                    free = set(self.build(variant).order_names)
+                    variant = next((v for v in grown if set(self.build(v).order_names) <= free), variant)
+        return variant
+
+    def larger(self, variant: Variant) -> Iterator[Change]:
+        """Every variant with one thing more: a term, a free order, an offset."""
+        for item in self.structure.equations:
+            for term in item.terms:
+                if term.coefficient in self.droppable and term.coefficient not in variant.kept:
+                    yield from self._adding(variant, term)
+        present = {n for n in self.build(variant.with_whole(dict.fromkeys(variant.held()))).order_names}
+        for name in variant.held():
+            if name in present:
+                yield Change(f"{name} free", variant.with_whole({name: None}))
+        if self.offset_allowed and not variant.offset:
+            yield Change("an offset of each run", replace(variant, offset=True))
+        for number in self.structure.free_inputs:
+            if number.name not in variant.inputs:
+                yield Change(f"{number.name} free", replace(variant, inputs=variant.inputs | {number.name}))
+        for name, below in self.frictions.items():
+            if name not in variant.rubs and (below is None or below in variant.rubs):
+                yield Change(name, replace(variant, rubs=variant.rubs | {name}))
+
+    def smaller(self, variant: Variant) -> Iterator[Change]:
+        """Every variant with one thing less."""
+        made = self.build(variant)
+        for item in made.equations:
+            for term in item.terms:
+                own = term.signal == item.output
+                others = [t for t in item.terms if t is not term and (t.signal == item.output) == own]
+                if term.coefficient in self.droppable and others:
+                    less = replace(variant, kept=variant.kept - {str(term.coefficient)})
+                    if self.possible(less):
+                        yield Change(f"without {term}", less)
+        for name in made.order_names:
+            for value in self.wholes(name):
+                less = variant.with_whole({name: value})
+                if self.possible(less):
+                    yield Change(f"{name} = {value:g}", less)
+        if self.offset_allowed and variant.offset:
+            yield Change("without an offset", replace(variant, offset=False))
+        for name in sorted(variant.inputs):
+            yield Change(f"without {name}", replace(variant, inputs=variant.inputs - {name}))
+        for name in sorted(variant.rubs):
+            above = {n for n, below in self.frictions.items() if below == name}
+            yield Change(f"without {name}", replace(variant, rubs=variant.rubs - {name} - above))
+
+
+def worded(structure: Structure) -> str:
+    """A structure in one line, with the numbers of inputs that are free in it."""
+    free = "".join(f", {item.words} free" for item in structure.free_inputs)
+    return str(structure).replace("\n", "; ") + free
+
+
+def signature(structure: Structure) -> str:
+    """What a structure is but for the names of its numbers: two that differ in nothing else are one candidate."""
+    parts = []
+    for item in structure.equations:
+        terms = sorted(
+            (t.signal, "free" if t.order.is_single else str(t.order), "free" if t.fixed is None else repr(t.fixed))
+            for t in item.terms
+        )
+        parts.append(f"{item.output} {'free' if item.order.is_single else item.order} {terms}")
+    rubs = [(e.output, e.friction.stribeck is not None) for e in structure.equations if e.friction is not None]
+    rest = (structure.offset, structure.initial, structure.coupling, rubs)
+    return f"{parts} {rest} {[i.name for i in structure.free_inputs]}"
+
+
+def named(structures: Sequence[Structure] | Mapping[str, Structure]) -> dict[str, Structure]:
+    """Candidates by name; one that has none is called by its equation, one with ``offset="auto"`` is two.
+
+    Raises
+    ------
+    ModelError
+        No candidate, something that is none, or two that are the same but for the names of their numbers.
+    """
+    items = (
+        list(structures.items())
+        if isinstance(structures, Mapping)
+        else [(worded(s) if isinstance(s, Structure) else "", s) for s in structures]
+    )
+    if not items:
+        raise ModelError("there are no candidates; give structures, or one structure whose inside is searched")
+    for place, (_, structure) in enumerate(items):
+        if not isinstance(structure, Structure):
+            raise ModelError(
+                f"candidate {place} of {len(items)} is {type(structure).__name__}; use ftlm.equation(…) or "
+                "ftlm.flexible_link(…)"
+            )
+    if len({n for n, _ in items}) < len(items):
+        # The same words, told apart by what words do not say.
+        items = [(f"{n} ({k + 1})", s) for k, (n, s) in enumerate(items)]
+    out: dict[str, Structure] = {}
+    for name, structure in items:
+        if structure.offset == "auto":
+            # With and without are two candidates.
+            out |= {name: replace(structure, offset="none"), f"{name}, offset": replace(structure, offset="constant")}
+        else:
+            out[name] = structure
+    seen: dict[str, str] = {}
+    for name, structure in out.items():
+        other = seen.setdefault(_content(structure), name)
+        if other != name:
+            only = "" if repr(out[other]) == repr(structure) else " but for the names of their numbers"
+            raise ModelError(f"candidates {other!r} and {name!r} are the same structure{only}; leave one out")
+    return out
+
+
+def _content(structure: Structure) -> str:
+    """All that a candidate is, whatever its numbers are called and in which order its terms stand."""
+    if structure.has_order_law or structure.coefficient_law:
+        return repr(structure)
+    rest = (
+        sorted((v[0], v[-1], len(v)) for v in structure.order_values.values()),
+        sorted(structure.delay.items()),
+        sorted(structure.free_delays.items()),
+        structure.limits,
+        structure.sensor_filter,
+        [e.friction for e in structure.equations],
+    )
+    return f"{signature(structure)} {rest!r}"

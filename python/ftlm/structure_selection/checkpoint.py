@@ -1,0 +1,460 @@
+"""The store of a selection: every fit and judgement as it ends, so that one that was stopped goes on where it was.
+
+A selection is the same steps whoever takes them, so what is kept is what each step came to, under a digest of what was
+asked. The file has the frames of an order search's store (see :mod:`ftlm.search.store`); the first tells of which runs,
+candidates and validation it is.
+"""
+
+from __future__ import annotations
+
+import hashlib
+import os
+import threading
+from collections.abc import Callable, Mapping, Sequence
+from types import TracebackType
+from typing import Literal, TypeAlias, TypeVar
+
+import msgspec
+import numpy as np
+
+from ftlm._core import __version__
+from ftlm.data.run import Run
+from ftlm.errors import ConvergenceError, DataError, FtlmError, ModelError
+from ftlm.estimation.output_error import Growth, JointFit
+from ftlm.order_search import checkpoint as frames
+from ftlm.order_search.checkpoint import SELECTION, Log
+from ftlm.structure.structure import History, Initial, Structure
+from ftlm.structure_selection.best_subset import Screened
+from ftlm.structure_selection.candidates import Change, Variant
+from ftlm.structure_selection.cross_validation import Trial
+from ftlm.utils.validation import Floats
+
+Made = TypeVar("Made")
+#: Number of how a candidate is fitted and judged; answers of different ones must not be joined.
+ALGORITHM = 3
+#: Errors that a candidate may end with; any other is none of its own.
+End: TypeAlias = Literal["ConvergenceError", "DataError", "ModelError"]
+ENDS: dict[End, type[FtlmError]] = {
+    "ConvergenceError": ConvergenceError,
+    "DataError": DataError,
+    "ModelError": ModelError,
+}
+#: Bytes of a number.
+DOUBLE = 8
+
+
+def _plain(value: object) -> object:
+    """Numbers of NumPy as those of Python, and powers of a history as those that they are."""
+    if isinstance(value, (np.floating, np.integer, np.bool_)):
+        return value.item()
+    if isinstance(value, tuple):
+        return tuple(value)
+    # What msgspec asks of a hook that knows no better.
+    raise NotImplementedError(type(value))
+
+
+ENCODER = msgspec.msgpack.Encoder(enc_hook=_plain)
+
+
+def _digest(value: object) -> bytes:
+    return hashlib.blake2b(ENCODER.encode(value), digest_size=frames.DIGEST).digest()
+
+
+class Request(msgspec.Struct, frozen=True, forbid_unknown_fields=True, tag="selection"):
+    """The first frame: digests of what a selection is of."""
+
+    algorithm: int
+    version: str
+    runs: bytes
+    candidates: bytes
+    validation: bytes
+
+    @classmethod
+    def of(cls, runs: Sequence[Run], candidates: object, judges: Sequence[Run], words: str) -> Request:
+        """Of runs, what is chosen from, and how it is judged."""
+        return cls(
+            ALGORITHM,
+            __version__,
+            _digest([_told(r) for r in runs]),
+            _digest(candidates),
+            _digest([words, [_told(r) for r in judges]]),
+        )
+
+    def difference(self, other: Request) -> str | None:
+        """Say what sets another request apart, or None."""
+        words = {"runs": "of other runs", "candidates": "of other candidates", "validation": "by another validation"}
+        return next((said for n, said in words.items() if getattr(self, n) != getattr(other, n)), None)
+
+
+def _told(run: Run) -> list[object]:
+    """All that a fit sees of a run."""
+    own = run.readings
+    times = [] if own is None else [own.times.tobytes(), {n: v.tobytes() for n, v in own.data.items()}]
+    samples = {n: np.ascontiguousarray(run[n], "<f8").tobytes() for n in run.signals}
+    return [run.name, run.step, run.inputs, run.outputs, samples, run.units, run.intersample, times]
+
+
+class Refused(msgspec.Struct, frozen=True, forbid_unknown_fields=True, tag="refused"):
+    """A candidate that cannot be fitted."""
+
+    kind: End
+    words: str
+
+    @classmethod
+    def of(cls, error: FtlmError) -> Refused | None:
+        """Write an error; None for what ftlm itself did wrong, which is no candidate's answer."""
+        return next((cls(n, str(error)) for n, kind in ENDS.items() if type(error) is kind), None)
+
+    def error(self) -> FtlmError:
+        """Give it back."""
+        return ENDS[self.kind](self.words)
+
+
+class FitFile(msgspec.Struct, frozen=True, forbid_unknown_fields=True, tag="fit"):
+    """A fit; arrays are little-endian doubles."""
+
+    orders: dict[str, float]
+    coefficients: dict[str, float]
+    inputs: dict[str, float]
+    covariance: bytes
+    on_grid: bytes
+    noise: dict[str, float]
+    cost: float
+    samples: int
+    refinement: int
+    settled: bool
+    converged: bool
+    starts: tuple[tuple[float, str], ...]
+    residuals: tuple[dict[str, bytes], ...]
+    products: dict[str, tuple[float, tuple[str, ...]]]
+    initial: Initial
+    history: bool
+    initial_terms: int
+    origin: str
+    growth: tuple[bool, float, bool] | None
+
+    @classmethod
+    def of(cls, joint: JointFit) -> FitFile:
+        """Write a fit by squares, whose intervals are quadratic."""
+        growth = joint.growth
+        return cls(
+            joint.orders,
+            joint.coefficients,
+            joint.inputs,
+            _bytes(joint.covariance),
+            _bytes(joint.on_grid),
+            joint.noise,
+            joint.cost,
+            joint.samples,
+            joint.refinement,
+            joint.settled,
+            joint.converged,
+            tuple(joint.starts),
+            tuple({n: _bytes(e) for n, e in part.items()} for part in joint.residuals),
+            dict(joint.products),
+            joint.initial,
+            isinstance(joint.initial, History),
+            joint.initial_terms,
+            joint.origin,
+            None if growth is None else (growth.kept, growth.excess, growth.at_limit),
+        )
+
+    @property
+    def _count(self) -> int:
+        return len(self.orders) + len(self.coefficients) + len(self.inputs)
+
+    def problem(self) -> str | None:
+        """What does not fit together, or None."""
+        if len(self.covariance) != DOUBLE * self._count**2 or len(self.on_grid) != DOUBLE * self._count:
+            return f"a covariance or values of other than its {self._count} numbers"
+        if any(len(e) % DOUBLE for part in self.residuals for e in part.values()):
+            return "residuals that are no doubles"
+        if self.history and isinstance(self.initial, str):
+            return f"a history that is no powers of t but {self.initial!r}"
+        return None
+
+    def joint(self) -> JointFit:
+        """Give it back."""
+        count = self._count
+        told = History(self.initial) if self.history and not isinstance(self.initial, str) else self.initial
+        return JointFit(
+            dict(self.orders),
+            dict(self.coefficients),
+            _array(self.covariance).reshape(count, count),
+            dict(self.noise),
+            self.cost,
+            self.samples,
+            self.refinement,
+            self.settled,
+            self.converged,
+            list(self.starts),
+            [{n: _array(e) for n, e in part.items()} for part in self.residuals],
+            dict(self.products),
+            dict(self.inputs),
+            told,
+            self.initial_terms,
+            on_grid=_array(self.on_grid),
+            origin=self.origin,
+            growth=None if self.growth is None else Growth(*self.growth),
+        )
+
+
+class JudgementFile(msgspec.Struct, frozen=True, forbid_unknown_fields=True, tag="judgement"):
+    """What became of a candidate that was fitted, which is asked with its fit."""
+
+    numbers: int
+    estimation: dict[str, float]
+    validation: dict[str, dict[str, float]]
+    scores: tuple[float, ...]
+    values: dict[str, float]
+    errors: dict[str, float]
+    idle: tuple[str, ...]
+    grows: bool
+    failed: str | None
+    fine: bool
+
+    @classmethod
+    def of(cls, trial: Trial) -> JudgementFile:
+        """Write a judgement."""
+        validation = {n: dict(part) for n, part in trial.validation.items()}
+        return cls(
+            trial.numbers,
+            dict(trial.estimation),
+            validation,
+            trial.scores,
+            dict(trial.values),
+            dict(trial.errors),
+            trial.idle,
+            trial.grows,
+            trial.failed,
+            trial.fine,
+        )
+
+    def trial(self, name: str, structure: Structure, joint: JointFit) -> Trial:
+        """Give it back."""
+        return Trial(
+            name,
+            structure,
+            self.numbers,
+            self.estimation,
+            self.validation,
+            self.scores,
+            values=self.values,
+            errors=self.errors,
+            idle=self.idle,
+            grows=self.grows,
+            failed=self.failed,
+            fine=self.fine,
+            joint=None if self.failed is not None else joint,
+        )
+
+
+class SubsetFile(msgspec.Struct, frozen=True, forbid_unknown_fields=True):
+    """A subset that was screened."""
+
+    words: str
+    kept: tuple[str, ...]
+    whole: tuple[tuple[str, float], ...]
+    offset: bool
+    inputs: tuple[str, ...]
+    rubs: tuple[str, ...]
+    start: dict[str, float]
+    score: float
+
+    @classmethod
+    def of(cls, one: Screened) -> SubsetFile:
+        """Write one."""
+        v = one.change.variant
+        kept, inputs, rubs = (tuple(sorted(names)) for names in (v.kept, v.inputs, v.rubs))
+        return cls(one.change.words, kept, v.whole, v.offset, inputs, rubs, dict(one.start), one.score)
+
+    def screened(self) -> Screened:
+        """Give it back."""
+        variant = Variant(frozenset(self.kept), self.whole, self.offset, frozenset(self.inputs), frozenset(self.rubs))
+        return Screened(Change(self.words, variant), self.start, self.score)
+
+
+class SubsetsFile(msgspec.Struct, frozen=True, forbid_unknown_fields=True, tag="subsets"):
+    """All subsets that were screened."""
+
+    each: tuple[SubsetFile, ...]
+
+    @classmethod
+    def of(cls, subsets: Sequence[Screened]) -> SubsetsFile:
+        """Write them."""
+        return cls(tuple(SubsetFile.of(s) for s in subsets))
+
+    def subsets(self) -> list[Screened]:
+        """Give them back."""
+        return [s.screened() for s in self.each]
+
+
+Answer = Refused | FitFile | JudgementFile | SubsetsFile
+
+
+class Kept(msgspec.Struct, frozen=True, forbid_unknown_fields=True, tag="kept"):
+    """What a step came to, under the digest of what was asked."""
+
+    asked: bytes
+    answer: Answer
+
+
+DECODER = msgspec.msgpack.Decoder(Request | Kept)
+
+
+def _bytes(values: Floats) -> bytes:
+    return np.ascontiguousarray(values, "<f8").tobytes()
+
+
+def _array(data: bytes) -> Floats:
+    return np.frombuffer(data, "<f8").astype(np.float64)
+
+
+class Store:
+    """What a selection came to so far, locked until it is closed; threads may ask it side by side."""
+
+    def __init__(self, path: str | os.PathLike[str], request: Request) -> None:
+        self._known: dict[bytes, Answer] = {}
+        self._lock = threading.Lock()
+        self._log = Log(path, SELECTION, create=True)
+        try:
+            data = self._log.read()
+            if self._log.unbegun(data):
+                data = self._log.begin(ENCODER.encode(request))
+            self._take(data, request)
+        except BaseException:
+            self._log.close()
+            raise
+
+    def _take(self, data: bytes, request: Request) -> None:
+        path, offset, digest = self._log.path, len(SELECTION.magic), bytes(frames.DIGEST)
+        view = memoryview(data)
+        while offset < len(data):
+            got = frames.next_frame(view, offset, digest)
+            if got == "torn":
+                break
+            if isinstance(got, str):
+                raise DataError(f"store {path} is damaged: {got}; choose another file, and leave this one")
+            payload, digest, end = got
+            try:
+                frame = DECODER.decode(payload)
+            except (msgspec.MsgspecError, ValueError, RecursionError, OverflowError) as error:
+                raise DataError(
+                    f"store {path} holds something else at byte {offset}: {error}; choose another file"
+                ) from error
+            if isinstance(frame, Request) != (offset == len(SELECTION.magic)):
+                raise DataError(f"store {path} holds something else at byte {offset}; choose another file")
+            # Digests tell what was damaged, not what was written wrong.
+            wrong = frame.answer.problem() if isinstance(frame, Kept) and isinstance(frame.answer, FitFile) else None
+            if wrong is not None:
+                raise DataError(f"store {path} holds a fit with {wrong} at byte {offset}; choose another file")
+            if isinstance(frame, Request):
+                self._check_same(request, frame)
+            else:
+                self._known[frame.asked] = frame.answer
+            offset = end
+            self._log.end, self._log.digest = end, digest
+        if self._log.end < len(data):
+            # What a kill left of the last frame.
+            self._log.cut()
+
+    def _check_same(self, asked: Request, held: Request) -> None:
+        path = self._log.path
+        # Digests are of what one version writes of candidates: those of another tell nothing.
+        if (asked.algorithm, asked.version) != (held.algorithm, held.version):
+            raise DataError(
+                f"store {path} is of ftlm {held.version}, algorithm {held.algorithm}, and this is {asked.version}, "
+                f"{asked.algorithm}: finish the selection with that version, or start it again in another file"
+            )
+        difference = asked.difference(held)
+        if difference is not None:
+            raise DataError(f"store {path} holds a selection {difference}; choose another file")
+
+    def _other(self, asked: str, answer: Answer) -> DataError:
+        held = {FitFile: "a fit", Refused: "an error", JudgementFile: "a judgement", SubsetsFile: "subsets"}
+        return DataError(
+            f"store {self._log.path} holds {held[type(answer)]} where {asked} was asked for; choose another file"
+        )
+
+    def __len__(self) -> int:
+        return len(self._known)
+
+    def recalled(
+        self,
+        asked: object,
+        compute: Callable[[], Made],
+        write: Callable[[Made], Answer | None],
+        read: Callable[[Answer], Made],
+    ) -> Made:
+        """What was asked, from the store, or computed and kept; what is no answer is not kept."""
+        key = _digest(asked)
+        with self._lock:
+            answer = self._known.get(key)
+        if answer is None:
+            made = compute()
+            answer = write(made)
+            if answer is None:
+                return made
+            with self._lock:
+                self._log.append([ENCODER.encode(Kept(key, answer))])
+                self._known[key] = answer
+        # What is given is always what the store gives back, so that one that goes on has the same bits.
+        return read(answer)
+
+    def fit(
+        self,
+        structure: Structure,
+        starts: Sequence[Mapping[str, float]],
+        refine: bool,
+        compute: Callable[[], JointFit | FtlmError],
+    ) -> JointFit | FtlmError:
+        """A fit on all runs, or why there is none."""
+
+        def write(made: JointFit | FtlmError) -> Answer | None:
+            if isinstance(made, JointFit):
+                return FitFile.of(made)
+            return Refused.of(made)
+
+        def read(answer: Answer) -> JointFit | FtlmError:
+            if isinstance(answer, FitFile):
+                return answer.joint()
+            if isinstance(answer, Refused):
+                return answer.error()
+            raise self._other("a fit", answer)
+
+        return self.recalled(("fit", structure, [dict(s) for s in starts], refine), compute, write, read)
+
+    def judgement(
+        self, name: str, structure: Structure, joint: JointFit, fine: bool, compute: Callable[[], Trial]
+    ) -> Trial:
+        """A fitted candidate on what it never saw."""
+
+        def read(answer: Answer) -> Trial:
+            if not isinstance(answer, JudgementFile):
+                raise self._other("a judgement", answer)
+            return answer.trial(name, structure, joint)
+
+        asked = ("judge", structure, joint.names, _bytes(joint.values), joint.initial, fine)
+        return self.recalled(asked, compute, JudgementFile.of, read)
+
+    def subsets(self, structure: Structure, compute: Callable[[], list[Screened]]) -> list[Screened]:
+        """Subsets that were screened."""
+
+        def read(answer: Answer) -> list[Screened]:
+            if not isinstance(answer, SubsetsFile):
+                raise self._other("subsets", answer)
+            return answer.subsets()
+
+        return self.recalled(("subsets", structure), compute, SubsetsFile.of, read)
+
+    def close(self) -> None:
+        """Give the lock back."""
+        self._log.close()
+
+    def __enter__(self) -> Store:
+        return self
+
+    def __exit__(
+        self, kind: type[BaseException] | None, error: BaseException | None, trace: TracebackType | None
+    ) -> None:
+        self.close()

@@ -1,0 +1,193 @@
+"""What a selection found: candidates ranked, the chosen one, and why."""
+
+from __future__ import annotations
+
+import math
+from dataclasses import dataclass, field
+from typing import Any
+
+from ftlm.estimation.result import Identification
+from ftlm.structure_selection.cross_validation import LOST, Trial
+from ftlm.svg.figure import Figure
+from ftlm.svg.html_page import Page, Reported, Section, Table
+from ftlm.svg.line_chart import line_chart
+from ftlm.utils.files import to_frame
+from ftlm.utils.formatting import Cell
+from ftlm.validation.comparison import finite
+
+#: Rows that are printed, and a fit [%] below which one is as bad as another.
+SHOWN, HOPELESS = 12, -1000.0
+#: Said of a candidate whose free run grows.
+GROWS = " (grows without bound)"
+
+
+@dataclass(frozen=True)
+class Selection(Reported):
+    """Candidates tried on runs, the chosen one, and the reason.
+
+    Parameters
+    ----------
+    trials
+        Every candidate that was judged, by how well it predicts what it was not fitted to; those that fail on a part of
+        it on which another one does not come after, those that cannot be fitted last.
+    chosen
+        Which of them was chosen.
+    best
+        The chosen structure identified on all runs, from automatic starts as well.
+    validation
+        How candidates were judged, in words.
+    reason
+        Why this one, in words.
+    fitted
+        How many candidates were fitted in all; of each step of a growth only the most promising are judged.
+    warnings
+        What speaks against the choice.
+    """
+
+    trials: tuple[Trial, ...]
+    chosen: int
+    best: Identification
+    validation: str
+    reason: str
+    fitted: int
+    warnings: tuple[str, ...] = field(default=())
+
+    @property
+    def winner(self) -> Trial:
+        """The chosen candidate."""
+        return self.trials[self.chosen]
+
+    def _rows(self) -> list[list[Cell]]:
+        out: list[list[Cell]] = []
+        for place, trial in enumerate(self.trials):
+            mark = "chosen: " if place == self.chosen else ""
+            if trial.failed is not None:
+                out.append([f"{trial.name}: {trial.failed}", trial.numbers, None, None, None, None, ""])
+                continue
+            name = mark + trial.name + (GROWS if trial.grows else "")
+            out.append([name, trial.numbers, trial.seen, trial.unseen, trial.least, trial.bic, ", ".join(trial.idle)])
+        return out
+
+    def table(self) -> Table:
+        """Candidates as a table of a page."""
+        columns = (
+            "structure",
+            "numbers",
+            "fit where fitted %",
+            "fit where unseen %",
+            "least %",
+            "BIC",
+            "not told from 0",
+        )
+        return Table(
+            "Candidates, best prediction first",
+            columns,
+            self._rows(),
+            wrap=True,
+            note="Fits are means over runs and outputs, the least is that of the worst run or block left out. BIC "
+            "counts as many samples as the colour of the best residuals lets count.",
+        )
+
+    def figure(self) -> Figure:
+        """Fit where fitted and where unseen of the best candidate with each number of estimates."""
+        best: dict[int, Trial] = {}
+        for trial in (t for t in self.trials if t.failed is None):
+            if trial.numbers not in best or trial.score < best[trial.numbers].score:
+                best[trial.numbers] = trial
+        along = sorted(best)
+        seen, unseen = [best[n].seen for n in along], [max(best[n].unseen, LOST) for n in along]
+        chosen = [v if n == self.winner.numbers else math.nan for n, v in zip(along, unseen, strict=True)]
+        return line_chart(
+            [float(n) for n in along],
+            [("where fitted", seen), ("where unseen", unseen), ("chosen", chosen)],
+            title="What each number is worth",
+            x_label="numbers estimated",
+            y_label="fit in %",
+            dots=("chosen",),
+            caption=f"The best candidate with each number of estimates; chosen is one with {self.winner.numbers}.",
+        )
+
+    def _page(self) -> Page:
+        sections = [
+            Section(
+                "The choice",
+                paragraphs=[self.reason, f"Judged on: {self.validation}. {self.fitted} candidates fitted."],
+                warnings=list(self.warnings),
+                figures=[self.figure()],
+            ),
+            Section("Candidates", tables=[self.table()]),
+            Section("The chosen structure on all runs", paragraphs=str(self.best).splitlines()),
+        ]
+        return Page("Selection of a structure", sections, self.winner.name)
+
+    def to_frame(self) -> Any:
+        """Candidates as a pandas frame by rank."""
+        rows = [
+            {
+                "rank": k + 1,
+                "structure": t.name,
+                "numbers": t.numbers,
+                "seen": t.seen,
+                "unseen": t.unseen,
+                "least": t.least,
+                "score": t.score,
+                "bic": math.nan if t.bic is None else t.bic,
+                "chosen": k == self.chosen,
+                "failed": t.failed or "",
+            }
+            for k, t in enumerate(self.trials)
+        ]
+        return to_frame(rows, ["rank"])
+
+    def to_dict(self) -> dict[str, Any]:
+        """For JSON."""
+        return {
+            "chosen": self.winner.name,
+            "reason": self.reason,
+            "validation": self.validation,
+            "fitted": self.fitted,
+            "candidates": [
+                {
+                    "structure": t.name,
+                    "numbers": t.numbers,
+                    "estimation": dict(t.estimation),
+                    "validation": {n: dict(v) for n, v in t.validation.items()},
+                    "score": finite(t.score),
+                    "bic": None if t.bic is None else finite(t.bic),
+                    "values": dict(t.values),
+                    "standard_errors": {n: finite(e) for n, e in t.errors.items()},
+                    "idle": list(t.idle),
+                    "grows": t.grows,
+                    "failed": t.failed,
+                }
+                for t in self.trials
+            ],
+            "identification": self.best.to_dict(),
+            "warnings": list(self.warnings),
+        }
+
+    def __str__(self) -> str:
+        lines = [f"{len(self.trials)} of {self.fitted} fitted candidates judged: {self.validation}"]
+        lines.append(f"{'':2}{'unseen %':>9}{'least %':>9}{'fitted %':>10}{'numbers':>9}  structure")
+        for place, trial in enumerate(self.trials[:SHOWN]):
+            mark = "> " if place == self.chosen else "  "
+            lines.append(mark + _row(trial))
+        if self.chosen >= SHOWN:
+            lines.append("> " + _row(self.winner))
+        if len(self.trials) > SHOWN:
+            lines.append(f"  … and {len(self.trials) - SHOWN} more")
+        lines += [self.reason, *(f"warning: {w}" for w in self.warnings), "", str(self.best)]
+        return "\n".join(lines)
+
+
+def _row(trial: Trial) -> str:
+    """A candidate in a line."""
+    if trial.failed is not None:
+        return f"{'-':>9}{'-':>9}{'-':>10}{trial.numbers:>9}  {trial.name}: {trial.failed}"
+    told = trial.name + (GROWS if trial.grows else "")
+    return f"{percent(trial.unseen):>9}{percent(trial.least):>9}{percent(trial.seen):>10}{trial.numbers:>9}  {told}"
+
+
+def percent(fit: float) -> str:
+    """A fit as a table has it: how far below nothing one is that predicts nothing, nobody needs to know."""
+    return f"{fit:.2f}" if not fit < HOPELESS else f"< {HOPELESS:.0f}"

@@ -1,0 +1,356 @@
+"""Structures that are asked for in no words: one output, any inputs, whole orders first."""
+
+from __future__ import annotations
+
+import math
+import os
+from collections.abc import Callable, Mapping, Sequence
+from dataclasses import replace
+
+import numpy as np
+
+from ftlm.data.run import Run
+from ftlm.errors import ConvergenceError, ModelError
+from ftlm.estimation.free_parameters import FreeProblem
+from ftlm.estimation.identify import identify
+from ftlm.order_search.options import Settings
+from ftlm.simulation.discretization import prepare
+from ftlm.structure.parser import equation
+from ftlm.structure.structure import Structure
+from ftlm.structure_selection.candidates import Inside, named, signature, worded
+from ftlm.structure_selection.checkpoint import Request, Store
+from ftlm.structure_selection.cross_validation import Folds, Trial, criterion, spread
+from ftlm.structure_selection.result import Selection, percent
+from ftlm.structure_selection.stepwise import MOST_ALIKE, SAME, Work, grown, listed
+
+#: Highest whole orders that are tried.
+ORDERS = (1, 2, 3, 4)
+
+
+def automatic(runs: Sequence[Run], output: str | None = None) -> list[Structure]:
+    """Equations of one output driven by every input, of each whole order, to be grown and pruned.
+
+    Each has all own derivatives below its order and each input; the highest order and those of one own term and of one
+    input may become free. A measured input (``"foh"``) may be differentiated, a command that holds may not.
+
+    Raises
+    ------
+    ModelError
+        Several outputs and none chosen, or no input.
+    """
+    first = runs[0]
+    outputs = list(first.outputs)
+    if output is None:
+        if len(outputs) != 1:
+            raise ModelError(
+                f"the runs have the outputs {', '.join(outputs)}; structure='auto' is of one: use run.select([…]), or "
+                "name it in a structure in words"
+            )
+        output = outputs[0]
+    if not first.inputs:
+        raise ModelError("the runs have no input, and structure='auto' needs one; name inputs when loading")
+    made = []
+    for order in ORDERS:
+        own = [f"a{k} D^mu{k} {output}" for k in range(order - 1, 0, -1)] + [f"a0 {output}"]
+        driving = [f"b{j} D^gamma{j} {name}" for j, name in enumerate(first.inputs, 1)]
+        orders = {f"gamma{j}": _reach(first, name, order) for j, name in enumerate(first.inputs, 1)}
+        orders["alpha"] = (max(order - 0.9, 0.1), order + 0.9, 0.1)
+        orders |= {f"mu{k}": (max(k - 0.9, 0.05), k + 0.9, 0.05) for k in range(1, order)}
+        text = f"D^alpha {output} = {' + '.join([*own, *driving])}"
+        made.append(equation(text, orders=orders, offset="auto"))
+    return made
+
+
+def _reach(run: Run, name: str, order: int) -> tuple[float, float, float]:
+    """Orders at which an input may enter."""
+    return (0.0, float(order) if run.intersample[name] == "foh" else max(order - 1.0, 0.05), 0.05)
+
+
+#: Schwarz criteria closer than this tell nothing; doi:10.1080/01621459.1995.10476572.
+ALIKE = 2.0
+#: Difference of Schwarz criteria that is very strong evidence; the same source.
+STRONG = 10.0
+#: Folds from which on the scatter over them says something, and one-sided 95 % quantiles of Student's t from there on.
+FOLDS, STUDENT_95 = 3, (2.92, 2.35, 2.13, 2.02, 1.94, 1.89, 1.86, 1.83, 1.81)
+#: What one leaves over of a part that it fails on, as a score, if it is that much more than another leaves there.
+FAILS, OUTDONE = math.log(0.5), math.log(2.0)
+#: Candidates of a list beyond which somebody has made a mistake.
+MOST = 10_000
+
+
+def select(
+    runs: Run | Sequence[Run],
+    candidates: str | Structure | Sequence[Structure] | Mapping[str, Structure],
+    *,
+    validation: str | Run | Sequence[Run] | None = None,
+    threads: int | None = None,
+    progress: Callable[[int, int], None] | None = None,
+    store: str | os.PathLike[str] | None = None,
+) -> Selection:
+    """Choose the terms and orders that earn their place on runs that they were not fitted to.
+
+    A structure is grown: from the simplest one inside it (whole orders, the output's own terms, one thing that drives),
+    a term, a free order, a delay, friction or an offset more at a time, each fitted by output error from the last
+    optimum, the two most promising by Schwarz's criterion judged by free runs on what they were not fitted to (the
+    second where what it leaves over on all runs lets it matter). Where two steps in a row predict no better, it is
+    pruned, one thing less at a time. A list is judged whole, from automatic starts. None is chosen that fails on a run
+    or a block (it leaves more than half of it, and twice what another one leaves) where one fails on fewer. Chosen is,
+    among those that predict as well as the best (what is left over is within 1 %, or, up to 5 %, three or more folds do
+    not tell the difference from 0 at 95 %, or all samples are very strong evidence), the one with the least Schwarz
+    criterion, samples counted as the colour of the residuals lets them; of those alike in that the one with the fewest
+    numbers, of the lowest order, best where unseen.
+
+    Parameters
+    ----------
+    runs
+        One run or several with the same names and units.
+    candidates
+        A structure, whose inside is searched; several structures, by name or by their equations; or ``"auto"``: one
+        output, every input, whole orders 1 to 4 and the fractional ones that earn their place.
+    validation
+        ``"runs"``: each run is judged by a fit on the others, the default where there are several; ``"blocks"``: each
+        quarter of every run by a fit on the rest, the default for one run; or runs that are fitted to by nobody.
+    threads
+        Candidates at a time, by default all cores; the result does not depend on it.
+    progress
+        Called with (candidates fitted, candidates known of so far).
+    store
+        File that keeps every fit as it ends: the same call with the same file goes on where it was stopped, with
+        Ctrl-C or by the machine, and comes to the same bits.
+
+    Returns
+    -------
+    Selection
+        Prints well; ``.best`` is the chosen structure identified on all runs, ``.report`` writes a page.
+
+    Raises
+    ------
+    DataError
+        Runs that do not fit together or the structure, that are too short to be cut, or that excite nothing; a store
+        of another selection, in use, damaged, or that cannot be written.
+    ModelError
+        No candidates, two that are the same but for the names of their numbers, more than 10 000, no validation run,
+        words that are not known, one run where several are needed, a validation run that is fitted to.
+    ConvergenceError
+        No candidate that can be fitted.
+
+    Notes
+    -----
+    Initial terms are those of whole orders (none from rest, else level and velocity, Caputo's) unless the structure
+    says otherwise: with a history, which has more terms the more orders are free, candidates could not be compared.
+    Growth costs one fit for each thing that may be added, at each step; of records of more than some 1800 samples every
+    one of these is looked at on thinned samples first, and those far behind are not fitted. Where three or more terms
+    drive one equation and whole runs judge, every subset of them at whole orders is fitted and judged in closed form
+    first, on a lattice of the own coefficients, and growth begins with the best. Of a list of more than 200 candidates
+    a ``UserWarning`` says, after the first ones, how long the rest takes.
+    """
+    # Checked here as identify checks it: threads is a whole number, at least 1.
+    workers = Settings.check(coefficients="least-squares", threads=threads).threads
+    several = [runs] if isinstance(runs, Run) else list(runs)
+    folds = Folds.of(runs, validation if validation is not None else "runs" if len(several) > 1 else "blocks")
+    if not isinstance(candidates, (str, Structure, Sequence, Mapping)):
+        raise ModelError(
+            f"candidates is {type(candidates).__name__}; use ftlm.equation(…), a list or a dictionary of structures, "
+            "or 'auto'"
+        )
+    if not isinstance(candidates, (str, Structure)) and len(candidates) > MOST:
+        raise ModelError(
+            f"{len(candidates)} candidates are more than {MOST}; give one structure instead, whose inside is grown "
+            "step by step"
+        )
+    every = named(candidates) if not isinstance(candidates, (str, Structure)) else {}
+    if isinstance(candidates, str) and candidates != "auto":
+        raise ModelError(f"candidates = {candidates!r}; use 'auto', ftlm.equation(…), or a list of structures")
+    searched = automatic(folds.runs) if isinstance(candidates, str) else []
+    searched += [candidates] if isinstance(candidates, Structure) else []
+    idle = [worded(s) for s in (*searched, *every.values()) if not FreeProblem.of(s).names]
+    if idle:
+        raise ModelError(
+            f"{idle[0]} has nothing to estimate; name a coefficient or an order, or use model.compare(runs)"
+        )
+    for structure in (*searched, *every.values()):
+        # Refused here, once, and not as a failure of every candidate.
+        prepare(folds.runs, replace(structure.as_given(), offset="none"), None, power_of_two=False, gaps=True)
+    if store is None:
+        return _found(Work(folds, workers, progress), searched, every)
+    judges = [f.judged for f in folds.parts if not any(f.judged is r for r in folds.runs)]
+    asked = Request.of(folds.runs, [searched, every], judges, folds.words)
+    with Store(store, asked) as kept:
+        return _found(Work(folds, workers, progress, store=kept), searched, every)
+
+
+def _found(work: Work, searched: Sequence[Structure], every: Mapping[str, Structure]) -> Selection:
+    """What structures grown inside some, and those of a list, come to."""
+    for structure in searched:
+        grown(Inside(structure), work)
+    if every:
+        listed(every, work)
+    return _chosen(work, work.folds)
+
+
+def _chosen(work: Work, folds: Folds) -> Selection:
+    """Rank what was judged, choose, and identify the choice."""
+    there = [t for t in work.trials if t.joint is not None]
+    if not there:
+        why = next((f"; {t.name}: {t.failed}" for t in work.trials), "")
+        raise ConvergenceError(f"no candidate can be fitted to {folds.words}{why}")
+    kept: dict[str, Trial] = {}
+    for trial in work.trials:
+        key = signature(trial.structure)
+        if key not in kept or trial.score < kept[key].score:
+            kept[key] = trial
+    ranked = _ranked(list(kept.values()))
+    scatter = min(spread(t.joint) for t in there if t.joint is not None)
+    ranked = [t if t.joint is None else replace(t, bic=criterion(t.joint, t.numbers, scatter)) for t in ranked]
+    best = ranked[0]
+    near = [k for k in _peers(ranked) if _as_good(ranked[k], best)]
+    # What the grid leaves is a fraction of an order, and to a criterion of thousands of samples a fraction counts.
+    for k, trial in zip(near, work.quietly(work.refined, [ranked[k] for k in near]), strict=True):
+        ranked[k] = trial
+    scatter = min(spread(t.joint) for t in ranked if t.joint is not None)
+    ranked = [t if t.joint is None else replace(t, bic=criterion(t.joint, t.numbers, scatter)) for t in ranked]
+    best, winner = ranked[0], _winner([ranked[k] for k in near])
+    found = identify(list(folds.runs), _as_judged(winner, folds), threads=work.threads)
+    warnings = []
+    if winner.joint is not None and found.joint is not None and found.joint.noise:
+        lower = [o for o, v in found.joint.noise.items() if v < 0.99 * winner.joint.noise.get(o, v)]
+        if lower:
+            warnings.append(
+                f"from automatic starts the chosen structure fits {', '.join(lower)} better than where it was judged: "
+                "another optimum; .best is that one"
+            )
+    if winner.unseen < 50.0:
+        warnings.append(
+            f"the best candidate predicts unseen runs with {percent(winner.unseen)} %: none of them is the machine"
+        )
+    worse = [f"{name} ({percent(fit)} %)" for name, fit in winner.parts.items() if not fit > 0.0]
+    if worse:
+        warnings.append(f"the chosen structure predicts worse than the mean of what was left out on {', '.join(worse)}")
+    return Selection(
+        tuple(ranked),
+        ranked.index(winner),
+        found,
+        folds.words,
+        _reason(winner, best, ranked),
+        work.done,
+        tuple(warnings),
+    )
+
+
+def _failures(every: Sequence[Trial]) -> list[list[str]]:
+    """Parts that each predicts badly and another one, that does not grow, leaves far less of."""
+    left = [dict(zip(t.parts, t.scores, strict=False)) for t in every]
+    least: dict[str, float] = {}
+    for scores in (part for part, t in zip(left, every, strict=True) if not t.grows):
+        for name, score in scores.items():
+            least[name] = min(score, least.get(name, math.inf))
+    return [[n for n, v in s.items() if v > FAILS and v > least.get(n, math.inf) + OUTDONE] for s in left]
+
+
+def _ranked(every: Sequence[Trial]) -> list[Trial]:
+    """The best first: what fails nowhere, then by what is left over on the mean.
+
+    A mean of logarithms makes good on three blocks what is lost on the fourth, and a user cannot.
+    """
+    failures = dict(zip(map(id, every), map(len, _failures(every)), strict=True))
+    return sorted(every, key=lambda t: (t.failed is not None, t.grows, failures[id(t)], t.score, t.numbers, t.name))
+
+
+def _peers(ranked: Sequence[Trial]) -> list[int]:
+    """Places of those that grow, and fail, no more than the best does."""
+    best, failures = ranked[0], [len(f) for f in _failures(ranked)]
+    return [
+        k for k, t in enumerate(ranked) if t.failed is None and t.grows == best.grows and failures[k] <= failures[0]
+    ]
+
+
+def _as_good(trial: Trial, best: Trial) -> bool:
+    """Whether a candidate predicts like the best: within 1 %, or up to 5 % if folds do not tell the difference from 0.
+
+    The best is the luckiest of many: a single standard error would refuse a true structure for it in one case of ten.
+    Where one block alone says what the others cannot, leaving it out costs the truth far more than 5 %: very strong
+    evidence on all samples lets it stand beside. So it does, within 5 %, where folds are too few to tell a scatter.
+    """
+    apart = np.array(trial.scores) - np.array(best.scores)
+    far, likely = trial.score - best.score, _bic(trial) <= _bic(best) - STRONG
+    if apart.size < FOLDS:
+        return far <= SAME or (far <= MOST_ALIKE and likely)
+    scatter = float(np.std(apart, ddof=1)) / math.sqrt(apart.size)
+    quantile = STUDENT_95[min(apart.size - FOLDS, len(STUDENT_95) - 1)]
+    return (far <= quantile * scatter and likely) or far <= max(SAME, min(quantile * scatter, MOST_ALIKE))
+
+
+def _winner(near: Sequence[Trial]) -> Trial:
+    """Of those that predict alike, the one with the least criterion; of those alike in that, the best where unseen.
+
+    From rest an equation differentiated throughout is the same equation: of these it is the one of the lowest order.
+    """
+    least = min(_bic(t) for t in near)
+    alike = [t for t in near if _bic(t) <= least + ALIKE]
+    return min(alike, key=lambda t: (t.numbers, _whole_order(t), t.score, t.looseness))
+
+
+def _whole_order(trial: Trial) -> int:
+    """The highest orders to the next whole number, all equations together."""
+    return sum(round(e.order.partly(trial.values).constant) for e in trial.structure.equations)
+
+
+def _bic(trial: Trial) -> float:
+    return math.inf if trial.bic is None else trial.bic
+
+
+def _as_judged(trial: Trial, folds: Folds) -> Structure:
+    """The structure with the initial terms that it was judged with.
+
+    From rest none are needed, and none are forbidden: what it is told of next may be a run in motion.
+    """
+    if trial.joint is None or (trial.structure.initial == "auto" and trial.joint.initial == "rest"):
+        return trial.structure
+    return replace(trial.structure, initial=trial.joint.initial)
+
+
+def _reason(winner: Trial, best: Trial, ranked: Sequence[Trial]) -> str:
+    """Why the winner is the winner."""
+    lead = f"Chosen: {winner.name} ({winner.numbers} numbers, {percent(winner.unseen)} % where unseen)"
+    peers = [ranked[k] for k in _peers(ranked)]
+    if winner is best:
+        lead += ", which predicts best"
+    else:
+        more = best.numbers - winner.numbers
+        lead += (
+            f", which leaves {100 * (math.exp(winner.score - best.score) - 1):.2g} % more than the best prediction"
+            + (f" with {more} numbers fewer" if more > 0 else "")
+            + " and has the least Schwarz criterion of those that predict alike"
+        )
+    for word, others in (
+        ("fewer", [t for t in peers if t.numbers < winner.numbers]),
+        ("more", [t for t in peers if t.numbers > winner.numbers]),
+    ):
+        if others:
+            near = min(others, key=lambda t: t.score)
+            share = 100 * (math.exp(near.score - winner.score) - 1)
+            lead += (
+                f"; the best with {word} ({near.numbers}) leaves {abs(share):.3g} % {'more' if share >= 0 else 'less'}"
+            )
+    return lead + "." + _failing(winner, ranked)
+
+
+def _failing(winner: Trial, ranked: Sequence[Trial]) -> str:
+    """Which candidate predicts better on the mean and fails somewhere, and where the winner itself does, in words."""
+    failures = dict(zip(map(id, ranked), _failures(ranked), strict=True))
+    told = ""
+    ahead = [t for t in ranked if failures[id(t)] and t.score < winner.score and t.grows == winner.grows]
+    if ahead:
+        other = min(ahead, key=lambda t: t.score)
+        name, share = failures[id(other)][0], 100 * (1 - math.exp(other.score - winner.score))
+        told += (
+            f" {other.name} leaves {share:.2g} % less on the mean and is not chosen: it fails on {name}, with "
+            f"{percent(other.parts[name])} % where the chosen one has {percent(winner.parts[name])}."
+        )
+    for name in failures[id(winner)]:
+        other = max((t for t in ranked if name in t.parts and not t.grows), key=lambda t: t.parts[name])
+        told += (
+            f" It fails on {name}, with {percent(winner.parts[name])} % where {other.name} has "
+            f"{percent(other.parts[name])}, which fails elsewhere."
+        )
+    return told

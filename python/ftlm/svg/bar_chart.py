@@ -1,0 +1,235 @@
+"""Bars: how often values occur, and figures of several things side by side."""
+
+from __future__ import annotations
+
+import math
+from collections.abc import Sequence
+
+import numpy as np
+from markupsafe import Markup
+from numpy.typing import ArrayLike
+
+from ftlm.errors import DataError
+from ftlm.svg.figure import NARROW, SMALL, TINY, Figure, svg, svg_text, text_width, ticks
+from ftlm.svg.line_chart import LINES
+from ftlm.utils.formatting import number, shortened
+from ftlm.utils.validation import Floats
+
+#: Most bars of a histogram.
+MOST_BARS = 41
+HEIGHT = 190.0
+#: Height of one bar of several things [px].
+BAR = 16.0
+#: Letters of a name beside its bars.
+MOST_LETTERS = 26
+
+
+def histogram(values: ArrayLike, *, title: str, x_label: str, caption: str = "") -> Figure:
+    """How often values occur, beside the normal curve of the same mean and deviation.
+
+    Parameters
+    ----------
+    values
+        Shape (N,); those that are not finite are left out, and counted in the caption.
+    title, x_label
+        Text, with units.
+    caption
+        Sentence below.
+
+    Raises
+    ------
+    DataError
+        Fewer than two finite values.
+    """
+    every = np.asarray(values, dtype=np.float64).ravel()
+    there = every[np.isfinite(every)]
+    if there.size < 2:
+        raise DataError(f"a histogram needs two finite values at least, not {there.size}; give a longer run")
+    # As many bars as Sturges and the spread of outliers ask for, symmetric about the mean.
+    mean, deviation = float(np.mean(there)), float(np.std(there))
+    reach = float(np.max(np.abs(there - mean)))
+    if reach <= max(1e-12 * abs(mean), TINY):
+        reach = 0.1 * abs(mean) if abs(mean) > TINY else 1.0
+    bars = min(MOST_BARS, 2 * math.ceil(math.log2(there.size)) + 1)
+    edges = mean + np.linspace(-reach, reach, bars + 1)
+    counts, _ = np.histogram(there, edges)
+    width = edges[1] - edges[0]
+    at = np.linspace(edges[0], edges[-1], 121)
+    curve = there.size * width * _normal(at, mean, deviation) if deviation > 0 else np.zeros(at.size)
+    lost = every.size - there.size
+    said = f"{caption} {lost} values are not finite and left out.".strip() if lost else caption
+    described = (
+        f"Histogram of {there.size} values: mean {number(mean, 3)}, standard deviation {number(deviation, 3)}, from "
+        f"{number(float(there.min()), 3)} to {number(float(there.max()), 3)}."
+    )
+    wide, small = (
+        _histogram(edges, counts, at, curve, (title, described, x_label), narrow=narrow) for narrow in (False, True)
+    )
+    return Figure(title, wide, small, said)
+
+
+def _normal(x: Floats, mean: float, deviation: float) -> Floats:
+    return np.exp(-0.5 * ((x - mean) / deviation) ** 2) / (deviation * math.sqrt(2 * math.pi))
+
+
+def _histogram(
+    edges: Floats,
+    counts: Floats,
+    at: Floats,
+    curve: Floats,
+    words: tuple[str, str, str],
+    *,
+    narrow: bool,
+) -> Markup:
+    title, described, x_label = words
+    width = NARROW if narrow else SMALL
+    highest = 1.05 * max(float(counts.max()), float(curve.max()))
+    low, high = float(edges[0]), float(edges[-1])
+    upward, across = ticks(0.0, highest, 4), ticks(low, high, 4 if narrow else 6)
+    left, top, h = max(30.0, 10 + max(map(text_width, upward.labels))), 26.0, HEIGHT - 66
+    w = width - left - 14.0
+
+    def place(x: float, y: float) -> tuple[float, float]:
+        return left + w * (x - low) / (high - low), top + h * (1 - y / highest)
+
+    out = [Markup('<g class="grid" fill="none" stroke="currentColor" stroke-opacity="0.14">')]
+    out += [Markup('<path d="M{:.1f} {:.1f}h{:.1f}"/>').format(left, place(low, v)[1], w) for v in upward.values]
+    out.append(Markup("</g>"))
+    bar = Markup(
+        '<rect class="shade2" x="{:.1f}" y="{:.1f}" width="{:.1f}" height="{:.1f}" fill="{}" fill-opacity=".55"/>'
+    )
+    for a, b, count in zip(edges[:-1], edges[1:], counts.tolist(), strict=True):
+        (x, y), (right, bottom) = place(float(a), count), place(float(b), 0.0)
+        out.append(bar.format(x, y, max(right - x - 0.8, 0.4), bottom - y, LINES[2][0]))
+    path = "M" + "L".join("{:.1f} {:.1f}".format(*place(float(x), float(y))) for x, y in zip(at, curve, strict=True))
+    out.append(
+        Markup('<path class="line1" fill="none" stroke="{}" stroke-width="1.6" d="{}"/>').format(LINES[1][0], path)
+    )
+    out.append(
+        Markup('<path fill="none" stroke="currentColor" stroke-opacity="0.55" d="M{:.1f} {:.1f}h{:.1f}"/>').format(
+            left, top + h, w
+        )
+    )
+    out.append(Markup('<g font-size="12" fill="currentColor">'))
+    out += [
+        svg_text(left - 6, place(low, v)[1] + 4, t, "end") for v, t in zip(upward.values, upward.labels, strict=True)
+    ]
+    out += [
+        svg_text(place(v, 0)[0], top + h + 16, t, "middle") for v, t in zip(across.values, across.labels, strict=True)
+    ]
+    factor = f" ({across.factor})" if across.factor else ""
+    out += [svg_text(4, top - 12, "samples", "start"), svg_text(left + w, top + h + 34, x_label + factor, "end")]
+    out.append(Markup("</g>"))
+    return svg(width, round(HEIGHT), title, described, out, narrow=narrow)
+
+
+def bar_chart(
+    names: Sequence[str],
+    groups: Sequence[tuple[str, ArrayLike]],
+    *,
+    title: str,
+    x_label: str,
+    low: float = 0.0,
+    high: float | None = None,
+    caption: str = "",
+    width: int = 720,
+) -> Figure:
+    """Figures of several things as bars, those of one thing together.
+
+    Parameters
+    ----------
+    names
+        Of the things, from above.
+    groups
+        (what the figures are, one figure a thing), at most five.
+    title, x_label
+        Text, with units.
+    low, high
+        Ends of the axis; a bar beyond them ends there, its number says how far it goes. By default from 0 to the
+        largest.
+    caption
+        Sentence below.
+    width
+        Of the wide drawing, in pixels; it scales.
+
+    Raises
+    ------
+    DataError
+        Nothing to draw, more than five groups, or figures that are not one a name.
+    """
+    tables = [(name, np.asarray(values, dtype=np.float64)) for name, values in groups]
+    if not names or not 0 < len(tables) < len(LINES):
+        raise DataError(
+            f"{len(names)} names and {len(tables)} groups of bars; give names, and 1 to {len(LINES) - 1} groups"
+        )
+    for name, values in tables:
+        if values.shape != (len(names),):
+            raise DataError(
+                f"bars of {name!r} have shape {values.shape}, there are {len(names)} names; give one a name"
+            )
+    finite = np.concatenate([v[np.isfinite(v)] for _, v in tables])
+    end = high if high is not None else float(np.max(finite, initial=low))
+    end = end if end > low else low + 1.0
+    described = f"Bars, {x_label}. " + " ".join(
+        f"{thing}: " + ", ".join(f"{group} {number(float(v[k]), 3)}" for group, v in tables) + "."
+        for k, thing in enumerate(names)
+    )
+    words = (title, described, x_label)
+    wide, small = (_bars(names, tables, (low, end), words, NARROW if n else width, narrow=n) for n in (False, True))
+    return Figure(title, wide, small, caption)
+
+
+def _bars(
+    names: Sequence[str],
+    tables: Sequence[tuple[str, Floats]],
+    ends: tuple[float, float],
+    words: tuple[str, str, str],
+    width: int,
+    *,
+    narrow: bool,
+) -> Markup:
+    title, described, x_label = words
+    shown = [shortened(n, 16 if narrow else MOST_LETTERS) for n in names]
+    left, value = 10 + max(map(text_width, shown)), 52.0
+    top = 8.0 + 18.0 * (len(tables) > 1)
+    w, step = width - left - value, BAR * len(tables) + 8
+    low, high = ends
+    out = []
+    across = ticks(low, high, 4 if narrow else 8)
+    h = step * len(names)
+    out.append(Markup('<g class="grid" fill="none" stroke="currentColor" stroke-opacity="0.14">'))
+    out += [
+        Markup('<path d="M{:.1f} {:.1f}v{:.1f}"/>').format(left + w * (v - low) / (high - low), top, h)
+        for v in across.values
+    ]
+    out.append(Markup("</g>"))
+    bar = Markup(
+        '<rect class="shade{}" x="{:.1f}" y="{:.1f}" width="{:.1f}" height="{:.1f}" fill="{}" fill-opacity="{}"/>'
+    )
+    texts = []
+    for i, name in enumerate(shown):
+        texts.append(svg_text(left - 6, top + step * i + BAR * len(tables) / 2 + 6, name, "end"))
+        for k, (_, values) in enumerate(tables):
+            v, y = float(values[i]), top + step * i + BAR * k + 2
+            inside = min(max(v, low), high) if math.isfinite(v) else low
+            length = w * (inside - low) / (high - low)
+            out.append(bar.format(k + 1, left, y, max(length, 0.0), BAR - 3, LINES[k + 1][0], "0.85"))
+            text = number(v, 4) if math.isfinite(v) else "–"
+            texts.append(svg_text(left + length + 5, y + BAR - 5, text, "start"))
+    axis = Markup('<path fill="none" stroke="currentColor" stroke-opacity="0.55" d="M{:.1f} {:.1f}v{:.1f}"/>')
+    out += [axis.format(left, top, h), Markup('<g font-size="12" fill="currentColor">'), *texts]
+    place = left
+    for k, (name, _) in enumerate(tables if len(tables) > 1 else ()):
+        out.append(
+            Markup('<rect class="shade{}" x="{:.1f}" y="3" width="14" height="10" fill="{}"/>').format(
+                k + 1, place, LINES[k + 1][0]
+            )
+        )
+        out.append(svg_text(place + 19, 12, name, "start"))
+        place += 19 + text_width(name) + 16
+    out += [
+        svg_text(left + w * (v - low) / (high - low), top + h + 15, t, "middle")
+        for v, t in zip(across.values, across.labels, strict=True)
+    ]
+    out += [svg_text(left + w, top + h + 32, x_label, "end"), Markup("</g>")]
+    return svg(width, round(top + h + 40), title, described, out, narrow=narrow)

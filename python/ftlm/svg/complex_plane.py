@@ -1,0 +1,220 @@
+"""Points of the complex plane, such as poles, with the sector in which they may not lie."""
+
+from __future__ import annotations
+
+import math
+from collections.abc import Sequence
+
+import numpy as np
+from markupsafe import Markup
+from numpy.typing import ArrayLike
+
+from ftlm.errors import DataError
+from ftlm.svg.figure import LETTER, NARROW, SMALL, Figure, svg, svg_text, text_width, ticks
+from ftlm.svg.line_chart import LINES
+from ftlm.utils.formatting import number
+from ftlm.utils.validation import Complex
+
+#: Height of the plot, and half the size of a cross [px].
+HEIGHT, CROSS = 260.0, 5.0
+#: Share of the plot that is left free around the farthest point.
+MARGIN = 1.18
+
+
+def plane_chart(
+    points: Sequence[complex],
+    *,
+    title: str,
+    x_label: str,
+    y_label: str,
+    sector: float = math.pi / 2,
+    caption: str = "",
+) -> Figure:
+    """Crosses in the complex plane, with the same unit in both directions.
+
+    Parameters
+    ----------
+    points
+        Where they are, finite; conjugate ones are both given.
+    title, x_label, y_label
+        Text, with units.
+    sector
+        Half-angle [rad] around the positive axis that is shaded: what is in it is not stable.
+    caption
+        Sentence below.
+
+    Raises
+    ------
+    DataError
+        A point that is not finite, or a sector that is no angle between 0 and pi.
+    """
+    values = np.asarray(list(points), dtype=np.complex128)
+    bad = ~np.isfinite(values)
+    if np.any(bad):
+        raise DataError(f"point {int(np.argmax(bad))} of {values.size} is not finite; leave it out")
+    if not 0 < sector < math.pi:
+        raise DataError(f"sector = {sector!r} is no angle between 0 and pi")
+    inside = int(np.sum(np.abs(np.angle(values)) < sector))
+    far = float(np.max(np.abs(values), initial=0.0)) or 1.0
+    listed = ", ".join(f"{number(v.real, 3)} {'−' if v.imag < 0 else '+'} {number(abs(v.imag), 3)}j" for v in values)
+    described = f"{values.size} points in the plane: {listed or 'none'}. {inside} in the shaded sector."
+    wide, small = (
+        _drawing(values, far, sector, (title, described, x_label, y_label), narrow=narrow) for narrow in (False, True)
+    )
+    return Figure(title, wide, small, caption)
+
+
+def _drawing(values: Complex, far: float, sector: float, words: tuple[str, str, str, str], *, narrow: bool) -> Markup:
+    title, described, x_label, y_label = words
+    width = NARROW if narrow else SMALL
+    upward = ticks(-far * MARGIN, far * MARGIN, 5)
+    left, top = max(30.0, 10 + max(map(text_width, upward.labels))), 26.0
+    w, h = width - left - 14.0, HEIGHT
+    # As many pixels a unit in both directions: far fits in the shorter one.
+    scale = min(w, h) / (2 * far * MARGIN)
+    x0, y0 = left + w / 2, top + h / 2
+    across = ticks(-w / 2 / scale, w / 2 / scale, 4 if narrow else 8)
+    out = [Markup('<g class="grid" fill="none" stroke="currentColor" stroke-opacity="0.14">')]
+    out += [Markup('<path d="M{:.1f} {:.1f}v{:.1f}"/>').format(x0 + v * scale, top, h) for v in across.values]
+    out += [Markup('<path d="M{:.1f} {:.1f}h{:.1f}"/>').format(left, y0 - v * scale, w) for v in upward.values]
+    out.append(Markup("</g>"))
+    inner = Markup('<svg x="{:.1f}" y="{:.1f}" width="{:.1f}" height="{:.1f}" viewBox="{:.1f} {:.1f} {:.1f} {:.1f}">')
+    out.append(inner.format(left, top, w, h, -w / 2, -h / 2, w, h))
+    reach = 2 * (w + h)
+    x, y = reach * math.cos(sector), reach * math.sin(sector)
+    # Beyond a right angle the sector also covers what lies above and below its arms' ends.
+    arms = [(x, -y), (reach, -reach), (reach, reach), (x, y)]
+    path = "M0 0" + "".join(f"L{a:.1f} {b:.1f}" for a, b in arms) + "Z"
+    out.append(Markup('<path class="shade1" fill="{}" fill-opacity="0.16" d="{}"/>').format(LINES[1][0], path))
+    edge = Markup('<path class="line1" fill="none" stroke="{}" stroke-width="1.2" stroke-dasharray="5 3" d="{}"/>')
+    out.append(edge.format(LINES[1][0], f"M{x:.1f} {-y:.1f}L0 0L{x:.1f} {y:.1f}"))
+    axes = Markup(
+        '<path fill="none" stroke="currentColor" stroke-opacity="0.55" d="M{:.1f} 0h{:.1f}M0 {:.1f}v{:.1f}"/>'
+    )
+    out.append(axes.format(-w / 2, w, -h / 2, h))
+    for value in values.tolist():
+        a, b = value.real * scale, -value.imag * scale
+        cross = f"M{a - CROSS:.1f} {b - CROSS:.1f}l{2 * CROSS} {2 * CROSS}m0 {-2 * CROSS}l{-2 * CROSS} {2 * CROSS}"
+        out.append(
+            Markup('<path class="line2" fill="none" stroke="{}" stroke-width="2.2" d="{}"/>').format(LINES[2][0], cross)
+        )
+    out.append(Markup('</svg><g font-size="12" fill="currentColor">'))
+    for v, label in zip(upward.values, upward.labels, strict=True):
+        out.append(svg_text(left - 6, y0 - v * scale + 4, label, "end"))
+    for v, label in zip(across.values, across.labels, strict=True):
+        # A label at the edge would be cut off.
+        place = min(max(x0 + v * scale, left + LETTER * len(label) / 2), width - LETTER * len(label) / 2 - 2)
+        out.append(svg_text(place, top + h + 16, label, "middle"))
+    factor = f" ({upward.factor})" if upward.factor else ""
+    out += [svg_text(4, top - 12, y_label + factor, "start"), svg_text(left + w, top + h + 34, x_label + factor, "end")]
+    out.append(Markup("</g>"))
+    return svg(width, round(top + h + 44), title, described, out, narrow=narrow)
+
+
+#: Height of the plot, radius of a dot [px].
+HEIGHT_LOCUS, DOT = 240.0, 2.6
+#: Share of the data's reach that is left free around it.
+MARGIN_LOCUS = 0.06
+
+
+def locus_chart(
+    curve: ArrayLike, points: ArrayLike, *, title: str, x_label: str, y_label: str, caption: str = ""
+) -> Figure:
+    """A curve and dots in the complex plane.
+
+    Parameters
+    ----------
+    curve
+        The model's values, complex, in the order of frequency; those that are not finite are left out.
+    points
+        Measured values, complex, finite.
+    title, x_label, y_label
+        Text, with units.
+    caption
+        Sentence below.
+
+    Raises
+    ------
+    DataError
+        A measured value that is not finite, or none.
+    """
+    line, dots = np.asarray(curve, dtype=np.complex128), np.asarray(points, dtype=np.complex128)
+    bad = ~np.isfinite(dots)
+    if dots.size == 0 or np.any(bad):
+        where = f"value {int(np.argmax(bad))} of {dots.size} is not finite" if dots.size else "there is no value"
+        raise DataError(f"measured: {where}; leave it out")
+    line = line[np.isfinite(line)]
+    ends = f"from {_said(dots[0])} to {_said(dots[-1])}"
+    described = f"Locus in the complex plane. {dots.size} measured points {ends}, and the model's curve."
+    wide, small = (
+        _drawing_locus(line, dots, (title, described, x_label, y_label), narrow=narrow) for narrow in (False, True)
+    )
+    return Figure(title, wide, small, caption)
+
+
+def _said(value: complex) -> str:
+    return f"{number(value.real, 3)} {'−' if value.imag < 0 else '+'} {number(abs(value.imag), 3)}j"
+
+
+def _drawing_locus(line: Complex, dots: Complex, words: tuple[str, str, str, str], *, narrow: bool) -> Markup:
+    title, described, x_label, y_label = words
+    width = NARROW if narrow else SMALL
+    # Dots decide the frame; a curve that strays from them leaves it.
+    low, high = complex(dots.real.min(), dots.imag.min()), complex(dots.real.max(), dots.imag.max())
+    reach = max(high.real - low.real, high.imag - low.imag) or abs(high) or 1.0
+    pad = MARGIN_LOCUS * reach
+    spread_x, spread_y = high.real - low.real + 2 * pad, high.imag - low.imag + 2 * pad
+    guess = ticks(low.imag - pad, low.imag - pad + spread_y, 5)
+    left, top = max(34.0, 10 + max(map(text_width, guess.labels))), 48.0
+    w = width - left - 14.0
+    scale = min(w / spread_x, HEIGHT_LOCUS / spread_y)
+    h = max(scale * spread_y, 90.0)
+    x0, y0 = (low.real + high.real) / 2 - w / scale / 2, (low.imag + high.imag) / 2 - h / scale / 2
+    upward, across = ticks(y0, y0 + h / scale, max(2, round(h / 48))), ticks(x0, x0 + w / scale, 4 if narrow else 8)
+
+    def right(v: float) -> float:
+        return left + (v - x0) * scale
+
+    def down(v: float) -> float:
+        return top + h - (v - y0) * scale
+
+    out = [Markup('<g class="grid" fill="none" stroke="currentColor" stroke-opacity="0.14">')]
+    out += [Markup('<path d="M{:.1f} {:.1f}v{:.1f}"/>').format(right(v), top, h) for v in across.values]
+    out += [Markup('<path d="M{:.1f} {:.1f}h{:.1f}"/>').format(left, down(v), w) for v in upward.values]
+    out.append(Markup("</g>"))
+    inner = Markup('<svg x="{:.1f}" y="{:.1f}" width="{:.1f}" height="{:.1f}" viewBox="{:.1f} {:.1f} {:.1f} {:.1f}">')
+    out.append(inner.format(left, top, w, h, left, top, w, h))
+    zeros = [f"M{left:.1f} {down(0):.1f}h{w:.1f}"] if y0 < 0 < y0 + h / scale else []
+    zeros += [f"M{right(0):.1f} {top:.1f}v{h:.1f}"] if x0 < 0 < x0 + w / scale else []
+    if zeros:
+        axes = Markup('<path fill="none" stroke="currentColor" stroke-opacity="0.55" d="{}"/>')
+        out.append(axes.format("".join(zeros)))
+    # Far outside of the frame it no longer matters where, and the bound keeps numbers short.
+    places = [(float(np.clip(right(v.real), -1e4, 1e4)), float(np.clip(down(v.imag), -1e4, 1e4))) for v in line]
+    if places:
+        path = "M" + "L".join(f"{x:.1f} {y:.1f}" for x, y in places)
+        curve = Markup('<path class="line1" fill="none" stroke="{}" stroke-width="1.5" d="{}"/>')
+        out.append(curve.format(LINES[1][0], path))
+    dot = Markup('<circle class="line0" fill="none" stroke="{}" stroke-width="1.6" cx="{:.1f}" cy="{:.1f}" r="{}"/>')
+    out += [dot.format(LINES[0][0], right(v.real), down(v.imag), DOT) for v in dots.tolist()]
+    out.append(Markup('</svg><g font-size="12" fill="currentColor">'))
+    for v, label in zip(upward.values, upward.labels, strict=True):
+        out.append(svg_text(left - 6, down(v) + 4, label, "end"))
+    for v, label in zip(across.values, across.labels, strict=True):
+        place = min(max(right(v), left + LETTER * len(label) / 2), width - LETTER * len(label) / 2 - 2)
+        out.append(svg_text(place, top + h + 16, label, "middle"))
+    ratios = [f" ({axis.factor})" if axis.factor else "" for axis in (upward, across)]
+    out += [
+        svg_text(4, top - 10, y_label + ratios[0], "start"),
+        svg_text(left + w, top + h + 34, x_label + ratios[1], "end"),
+    ]
+    out.append(
+        Markup('<path class="line1" fill="none" stroke="{}" stroke-width="1.5" d="M{:.1f} 12h20"/>').format(
+            LINES[1][0], left
+        )
+    )
+    out.append(svg_text(left + 26, 16, "model", "start"))
+    out.append(dot.format(LINES[0][0], left + 90, 12, DOT))
+    out.append(svg_text(left + 100, 16, "measured", "start"))
+    out.append(Markup("</g>"))
+    return svg(width, round(top + h + 44), title, described, out, narrow=narrow)

@@ -1,0 +1,210 @@
+"""A figure, and the pieces of SVG that every drawing has."""
+
+from __future__ import annotations
+
+import math
+import unicodedata
+from collections.abc import Iterable
+from dataclasses import dataclass, field
+from decimal import Decimal
+
+import numpy as np
+from markupsafe import Markup
+from numpy.typing import ArrayLike, NDArray
+
+from ftlm.utils.formatting import SUPERSCRIPTS
+from ftlm.utils.validation import Floats
+
+#: Width of the drawing for telephones; its text stays as large as the wide one's.
+NARROW = 360
+#: Width of charts that stand side by side.
+SMALL = 520
+#: Text at 12 px: width of a letter, height of a line.
+LETTER, LINE = 6.7, 15
+
+
+@dataclass(frozen=True)
+class Figure:
+    """A chart of a report; `line_chart` makes them.
+
+    Parameters
+    ----------
+    title
+        What is shown.
+    svg
+        The drawing, trusted markup.
+    narrow
+        The same for narrow screens, or empty.
+    caption
+        What the eye cannot see in the drawing, such as values that are not finite.
+    """
+
+    title: str
+    svg: Markup
+    narrow: Markup = field(default_factory=Markup)
+    caption: str = ""
+
+    def _repr_html_(self) -> str:
+        return str(
+            Markup("<figure>{}<figcaption>{}. {}</figcaption></figure>").format(self.svg, self.title, self.caption)
+        )
+
+
+class Figures(tuple[Figure, ...]):
+    """Charts that belong together: a notebook shows them, :func:`print` names them."""
+
+    __slots__ = ()
+
+    def __str__(self) -> str:
+        return "\n".join(figure.title for figure in self)
+
+    def _repr_html_(self) -> str:
+        return "".join(figure._repr_html_() for figure in self)
+
+
+def svg(
+    width: int,
+    height: int,
+    title: str,
+    described: str,
+    parts: Iterable[Markup],
+    *,
+    narrow: bool,
+    attributes: str = "",
+) -> Markup:
+    """A whole drawing with what is said of it to those who listen."""
+    return Markup(
+        '<svg class="chart {}" role="img" viewBox="0 0 {} {}" width="{}" height="{}"{}>'
+        "<title>{}</title><desc>{}</desc>{}</svg>"
+    ).format(
+        "narrow" if narrow else "wide",
+        width,
+        height,
+        width,
+        height,
+        attributes,
+        title,
+        described,
+        Markup("").join(parts),
+    )
+
+
+def svg_text(x: float, y: float, text: str, anchor: str) -> Markup:
+    """A word whose start, middle or end is at a place."""
+    return Markup('<text x="{:.1f}" y="{:.1f}" text-anchor="{}">{}</text>').format(x, y, anchor, text)
+
+
+def text_width(text: str) -> float:
+    """Width in pixels, more or less."""
+    return LETTER * sum(2 if unicodedata.east_asian_width(c) in "WF" else 1 for c in text)
+
+
+#: Points of one line in the wide chart: two for every pixel column of its plot, so no peak is lost on any screen.
+POINTS = 1500
+#: Differences below this are none: denormal numbers have too few digits for an axis.
+TINY = 1e-290
+#: The axis follows the measured line, and not one that strays from it by more than this many times its height.
+STRAY = 3.0
+
+
+@dataclass(frozen=True)
+class Ticks:
+    """Round numbers on an axis: values, labels, and the power of ten that all labels leave out, as ×10⁻³ and as -3."""
+
+    values: list[float]
+    labels: list[str]
+    factor: str = ""
+    power: int = 0
+
+
+def ticks(low: float, high: float, most: int = 6) -> Ticks:
+    """Return multiples of 1, 2 or 5 times a power of ten within an interval.
+
+    Parameters
+    ----------
+    low, high
+        Ends, low < high.
+    most
+        About as many ticks; at least two come.
+    """
+    raw = (high - low) / max(most, 1)
+    exponent = math.floor(math.log10(raw))
+    size = next((s for s in (1, 2, 5) if s * 10.0**exponent >= raw * (1 - 1e-9)), 10)
+    if size == 10:
+        size, exponent = 1, exponent + 1
+    step = size * 10.0**exponent
+    first, last = math.ceil(low / step - 1e-9), math.floor(high / step + 1e-9)
+    if last - first < 1 and most < 20:
+        return ticks(low, high, most + 1)
+    # Whole multiples of a power of ten, so that 0.3 is not 0.30000000000000004.
+    multiples = [k * size for k in range(first, last + 1)]
+    values = [float(m * 10**exponent) if exponent >= 0 else m / 10**-exponent for m in multiples]
+    largest = max(abs(v) for v in values)
+    shift = 0 if 1e-3 <= largest < 1e5 else 3 * math.floor(math.log10(largest) / 3)
+    decimals = max(0, shift - exponent)
+    labels = [f"{Decimal(m).scaleb(exponent - shift):.{decimals}f}".replace("-", "−") for m in multiples]
+    return Ticks(values, labels, f"×10{str(shift).translate(SUPERSCRIPTS)}" if shift else "", shift)
+
+
+def log_ticks(low: float, high: float, most: int) -> Ticks:
+    """Ticks between 10**low and 10**high: powers of ten, or 1-2-5 between them where the powers are few."""
+    every = max(1, math.ceil((high - low) / most))
+    first, last = math.ceil(low / every - 1e-9), math.floor(high / every + 1e-9)
+    powers = [k * every for k in range(first, last + 1)]
+    if len(powers) >= 3:
+        labels = [f"{10.0**p:g}" if -3 <= p <= 4 else f"10{str(p).translate(SUPERSCRIPTS)}" for p in powers]
+        return Ticks([float(p) for p in powers], labels)
+    fine = [(s, p) for p in range(math.floor(low), math.ceil(high) + 1) for s in (1, 2, 5)]
+    inside = [(s, p) for s, p in fine if low <= math.log10(s) + p <= high]
+    if len(inside) >= 2:
+        labels = [f"{s * 10.0**p:g}".replace("-", "−") for s, p in inside]
+        return Ticks([math.log10(s) + p for s, p in inside], labels)
+    found = ticks(10.0**low, 10.0**high, most)
+    kept = [(math.log10(v), label) for v, label in zip(found.values, found.labels, strict=True) if v > 0]
+    return Ticks([v for v, _ in kept], [label for _, label in kept], found.factor)
+
+
+def decimate(y: ArrayLike, most: int = POINTS) -> NDArray[np.intp]:
+    """Return indices of the points that draw a line: first, last, and smallest and largest of every stretch.
+
+    Parameters
+    ----------
+    y
+        Values; those that are not finite are left out.
+    most
+        Most indices, at least 4.
+
+    Returns
+    -------
+    ndarray of int
+        Ascending. All finite values where they are no more than ``most``.
+    """
+    values = np.asarray(y, dtype=np.float64)
+    finite = np.flatnonzero(np.isfinite(values))
+    if finite.size <= most:
+        return finite
+    edges = np.linspace(0, finite.size, max(1, (most - 2) // 2) + 1).astype(np.intp)
+    # One pass each for all stretches: sort by (stretch, value), then take the ends of every stretch.
+    stretch = np.repeat(np.arange(edges.size - 1), np.diff(edges))
+    order = np.lexsort((values[finite], stretch))
+    picked = np.concatenate([order[edges[:-1]], order[edges[1:] - 1], [0, finite.size - 1]])
+    kept: NDArray[np.intp] = finite[np.unique(picked)]
+    return kept
+
+
+def limits(values: list[Floats], margin: float) -> tuple[float, float]:
+    """Return ends of an axis that holds these values with a margin, never equal."""
+    finite = np.concatenate(values) if values else np.empty(0)
+    if finite.size == 0:
+        return 0.0, 1.0
+    low, high = float(np.min(finite)), float(np.max(finite))
+    if high - low <= max(1e-12 * max(abs(low), abs(high)), TINY):
+        spread = 0.1 * abs(low) if abs(low) > TINY else 1.0
+        return low - spread, high + spread
+    return low - margin * (high - low), high + margin * (high - low)
+
+
+def snapped(low: float, high: float) -> tuple[float, float]:
+    """Move ends to a round number that is near: pulses begin half a step after 0 and end half a step before 10."""
+    values = ticks(low - 0.01 * (high - low), high + 0.01 * (high - low), 9).values
+    return min(low, values[0]), max(high, values[-1])

@@ -1,0 +1,232 @@
+"""Heat maps: scores over two axes."""
+
+from __future__ import annotations
+
+import math
+from collections.abc import Sequence
+from dataclasses import dataclass
+from itertools import groupby
+
+import numpy as np
+from markupsafe import Markup
+from numpy.typing import ArrayLike, NDArray
+
+from ftlm.errors import DataError
+from ftlm.svg.figure import LETTER, NARROW, SMALL, Figure, svg, svg_text, text_width
+from ftlm.utils.formatting import number, shortened, symbol
+from ftlm.utils.validation import Floats
+
+
+@dataclass(frozen=True)
+class Landscape:
+    """Scores of a lattice over two orders, the others as in the best model.
+
+    Parameters
+    ----------
+    names
+        The two orders, across and upward.
+    x, y
+        Their values, ascending.
+    scores
+        Shape (y, x); infinite where a pair is no candidate or its free run diverges.
+    others
+        What the other numbers do, in words.
+    score
+        What the score is, in words.
+    correlation
+        Of the two orders in a joint fit; not a number otherwise.
+    """
+
+    names: tuple[str, str]
+    x: Floats
+    y: Floats
+    scores: Floats
+    others: str = "Other orders as in the best model."
+    score: str = "score"
+    correlation: float = math.nan
+
+
+#: From best to worst, after viridis reversed in lightness: dark is good on white, and every step differs in lightness.
+HEAT = ("#440154", "#472c7a", "#3b518b", "#2c718e", "#21908d", "#27ad81", "#5cc863", "#aadc32", "#fde725")
+NO_SCORE = "#9aa3ad"
+
+
+def heat_map(landscape: Landscape, *, title: str = "") -> Figure:
+    """Scores of an order lattice over two of its orders, best dark.
+
+    Parameters
+    ----------
+    landscape
+        From :func:`ftlm.report.landscape`.
+    title
+        Default: says what is shown.
+    """
+    across, upward = landscape.names
+    heading = title or f"Score over {symbol(across)} and {symbol(upward)}"
+    finite = np.isfinite(landscape.scores)
+    good = landscape.scores[finite & (landscape.scores > 0)]
+    if good.size == 0:
+        raise DataError("no candidate of this lattice has a finite score; widen it")
+    low, high = float(good.min()), float(good.max())
+    row, column = divmod(int(np.argmin(np.where(finite, landscape.scores, np.inf))), landscape.scores.shape[1])
+    at = f"{symbol(across)} = {landscape.x[column]:g}, {symbol(upward)} = {landscape.y[row]:g}"
+    described = f"Heat map of {landscape.score}. Best {number(low)} at {at}; worst {number(high)}."
+    left_out = int(np.sum(~finite))
+    caption = f"Best: {at} (ring). Dark is good; colours are steps of the logarithm. {landscape.others}"
+    if landscape.score != "score":
+        caption += f" Score: {landscape.score}."
+    if left_out:
+        caption += f" Grey: {left_out} pairs that are no candidate or whose free run diverges."
+    wide, small = (
+        _heat_drawing(landscape, (low, high), (row, column), heading, described, narrow=n) for n in (False, True)
+    )
+    return Figure(heading, wide, small, caption)
+
+
+def _classes(scores: Floats, low: float, high: float) -> NDArray[np.intp]:
+    """Step of the logarithm that each score is in; -1 where there is none."""
+    first, span = math.log(low), math.log(high) - math.log(low)
+    with np.errstate(divide="ignore", invalid="ignore"):
+        place = (np.log(scores) - first) / (span if span > 0 else 1.0)
+    steps = np.clip(np.nan_to_num(place * len(HEAT)), 0, len(HEAT) - 1)
+    return np.where(np.isfinite(place), steps, -1).astype(np.intp)
+
+
+def _rectangle(x: float, y: float, width: float, height: str, colour: str) -> Markup:
+    """A cell, a little wider than its place, so that no seam shows."""
+    return Markup('<rect x="{:.1f}" y="{:.1f}" width="{:.1f}" height="{}" fill="{}"/>').format(
+        x, y, width + 0.3, height, colour
+    )
+
+
+def _picked(count: int, most: int) -> list[int]:
+    """Indices of about as many cells as have room for a label, first and last among them."""
+    return sorted({round(k) for k in np.linspace(0, count - 1, most).tolist()})
+
+
+def _heat_drawing(
+    landscape: Landscape, ends: tuple[float, float], best: tuple[int, int], title: str, described: str, *, narrow: bool
+) -> Markup:
+    width = NARROW if narrow else SMALL
+    rows, columns = landscape.scores.shape
+    x_marks, y_marks = ([f"{v:g}" for v in axis] for axis in (landscape.x, landscape.y))
+    longest = max(map(len, x_marks))
+    left, top, below = max(46.0, LETTER * max(map(len, y_marks)) + 12), 26.0, 84.0
+    w, h = width - left - max(14.0, LETTER * longest / 2), min(max(rows * 6.0, 140.0), 300.0)
+    cell_w, cell_h, bottom = w / columns, h / rows, top + h
+    out = []
+    for i, row in enumerate(_classes(landscape.scores, *ends).tolist()):
+        j = 0
+        # Cells alike in a row are one rectangle.
+        for step, alike in groupby(row):
+            count, colour = len(list(alike)), HEAT[step] if step >= 0 else NO_SCORE
+            place = left + j * cell_w, bottom - (i + 1) * cell_h
+            out.append(_rectangle(*place, count * cell_w, f"{cell_h + 0.3:.1f}", colour))
+            j += count
+    centre = left + (best[1] + 0.5) * cell_w, bottom - (best[0] + 0.5) * cell_h
+    ring = Markup('<circle cx="{:.1f}" cy="{:.1f}" r="7" fill="none" stroke="{}" stroke-width="{}"/>')
+    out += [ring.format(*centre, colour, thickness) for colour, thickness in (("#fff", 4), ("#d1480a", 2))]
+    out.append(Markup('<g font-size="12" fill="currentColor">'))
+    fit = max(2, min(columns, 5 if narrow else 9, int(w / (LETTER * longest + 14))))
+    out += [svg_text(left + (k + 0.5) * cell_w, bottom + 16, x_marks[k], "middle") for k in _picked(columns, fit)]
+    for k in _picked(rows, min(rows, 7)):
+        out.append(svg_text(left - 6, bottom - (k + 0.5) * cell_h + 4, y_marks[k], "end"))
+    across, upward = landscape.names
+    out.append(svg_text(4, top - 12, f"order {symbol(upward)}", "start"))
+    out.append(svg_text(left + w, bottom + 34, f"order {symbol(across)}", "end"))
+    size = 20.0 if narrow else 26.0
+    out.append(svg_text(left, bottom + 76, f"score {number(ends[0], 3)}", "start"))
+    out.append(svg_text(left + size * len(HEAT), bottom + 76, number(ends[1], 3), "end"))
+    out.append(Markup("</g>"))
+    out += [_rectangle(left + k * size, bottom + 48, size, "12", colour) for k, colour in enumerate(HEAT)]
+    return svg(width, round(bottom + below), title, described, out, narrow=narrow)
+
+
+#: From -1 to 1, blue over a light grey to vermilion: both ends dark, and the middle reads black.
+SCALE = ("#1f4e8c", "#4b80bd", "#8fb3d9", "#c8d9ea", "#eceff1", "#f4d5c4", "#e9a27f", "#cf6535", "#9c3009")
+#: Cells with these colours carry white numbers.
+DARK = {0, 1, 7, 8}
+NO_VALUE = "#9aa3ad"
+#: Largest cell, and the smallest one that has room for its number [px].
+LARGEST_CELL, ROOM = 46.0, 30.0
+MOST_LETTERS = 12
+
+
+def correlation_map(names: Sequence[str], values: ArrayLike, *, title: str, caption: str = "") -> Figure:
+    """A correlation matrix as coloured cells.
+
+    Parameters
+    ----------
+    names
+        Of the rows and columns.
+    values
+        Shape (N, N), from -1 to 1; what is not a number has a grey cell.
+    title
+        What is shown.
+    caption
+        Sentence below.
+
+    Raises
+    ------
+    DataError
+        A matrix that is not square or not of these names, or numbers beyond 1.
+    """
+    matrix = np.asarray(values, dtype=np.float64)
+    if matrix.shape != (len(names), len(names)) or not len(names):
+        raise DataError(f"a matrix of shape {matrix.shape} for {len(names)} names; give one row and column a name")
+    beyond = np.abs(matrix) > 1 + 1e-6
+    if np.any(beyond):
+        row, column = divmod(int(np.argmax(beyond)), len(names))
+        raise DataError(f"the correlation of {names[row]} and {names[column]} is {matrix[row, column]}, beyond 1")
+    off = np.where(np.eye(len(names), dtype=bool) | ~np.isfinite(matrix), 0.0, matrix)
+    at = np.unravel_index(int(np.argmax(np.abs(off))), off.shape)
+    farthest = f"{names[int(at[0])]} and {names[int(at[1])]} {number(float(off[at]), 3)}"
+    described = f"Correlations of {', '.join(names)}. The largest: {farthest}."
+    wide, small = (_drawing(names, matrix, title, described, narrow=narrow) for narrow in (False, True))
+    return Figure(title, wide, small, caption)
+
+
+def _drawing(names: Sequence[str], matrix: Floats, title: str, described: str, *, narrow: bool) -> Markup:
+    width, count = (NARROW if narrow else SMALL), len(names)
+    labels = [shortened(symbol(n), MOST_LETTERS) for n in names]
+    left = 10 + max(map(text_width, labels))
+    cell = min((width - left - 8) / count, LARGEST_CELL)
+    # Names above the columns stand upright where they have no room.
+    turned = max(map(text_width, labels)) > cell - 4
+    top = 8 + (max(map(text_width, labels)) if turned else 16)
+    out, texts = [], []
+    box = Markup('<rect x="{:.1f}" y="{:.1f}" width="{:.1f}" height="{:.1f}" fill="{}"/>')
+    for i in range(count):
+        for j in range(count):
+            value = float(matrix[i, j])
+            known = np.isfinite(value)
+            step = int(np.clip(round((value + 1) / 2 * (len(SCALE) - 1)), 0, len(SCALE) - 1)) if known else -1
+            x, y = left + j * cell, top + i * cell
+            out.append(box.format(x, y, cell - 1, cell - 1, SCALE[step] if known else NO_VALUE))
+            if cell >= ROOM and i != j:
+                ink = "#fff" if step in DARK or not known else "#15181c"
+                text = f"{value:.2f}".replace("0.", ".").replace("-", "−") if known else "–"
+                texts.append(
+                    Markup(
+                        '<text x="{:.1f}" y="{:.1f}" text-anchor="middle" fill="{}" font-size="11">{}</text>'
+                    ).format(x + cell / 2 - 0.5, y + cell / 2 + 4, ink, text)
+                )
+    out.append(Markup('<g font-size="12" fill="currentColor">'))
+    for k, label in enumerate(labels):
+        out.append(svg_text(left - 6, top + (k + 0.5) * cell + 4, label, "end"))
+        x = left + (k + 0.5) * cell
+        if turned:
+            out.append(
+                Markup('<text x="0" y="0" transform="translate({:.1f} {:.1f}) rotate(-90)">{}</text>').format(
+                    x + 4, top - 6, label
+                )
+            )
+        else:
+            out.append(svg_text(x, top - 6, label, "middle"))
+    foot = top + count * cell + 12
+    size = 18.0 if narrow else 22.0
+    out += [box.format(left + k * size, foot, size, 10, colour) for k, colour in enumerate(SCALE)]
+    out.append(svg_text(left, foot + 24, "−1", "start"))
+    out.append(svg_text(left + size * len(SCALE) / 2, foot + 24, "0", "middle"))
+    out.append(svg_text(left + size * len(SCALE), foot + 24, "1", "end"))
+    return svg(width, round(foot + 32), title, described, [*out, *texts, Markup("</g>")], narrow=narrow)

@@ -1,0 +1,550 @@
+"""What the slider of a chart reads out: values of its lines at instants, short enough to lie in the page."""
+
+from __future__ import annotations
+
+import json
+import math
+from collections.abc import Collection, Sequence
+from dataclasses import dataclass
+
+import numpy as np
+from markupsafe import Markup
+from numpy.typing import ArrayLike
+
+from ftlm.errors import DataError
+from ftlm.svg.figure import (
+    LETTER,
+    LINE,
+    NARROW,
+    POINTS,
+    STRAY,
+    Figure,
+    Ticks,
+    decimate,
+    limits,
+    log_ticks,
+    snapped,
+    svg,
+    svg_text,
+    text_width,
+    ticks,
+)
+from ftlm.utils.formatting import number, shortened
+from ftlm.utils.validation import Floats
+
+#: Places of a slider: more than its track has pixels.
+PLACES = 750
+#: Parts into which the span of a line is divided: five digits of it.
+PARTS = 1e5
+
+
+def readings(
+    x: Floats, lines: Sequence[tuple[str, int, Floats]], x_label: str, y_label: str, places: int = PLACES
+) -> str:
+    """Values of lines at the places of a slider, as JSON of whole numbers.
+
+    Parameters
+    ----------
+    x
+        Shape (N,), ascending.
+    lines
+        (name, style, values of shape (N,)), not a number where there is none.
+    x_label, y_label
+        Text, a unit at its end in brackets.
+    places
+        About as many at most.
+
+    Returns
+    -------
+    str
+        Every place is a sample. That at which the first two lines are farthest apart is among them, and is said.
+    """
+    there = np.flatnonzero(np.isfinite(x))
+    if not there.size or not lines:
+        return ""
+    chosen = there[:: max(1, math.ceil(there.size / min(places, PLACES)))]
+    begin = None
+    if len(lines) > 1:
+        apart = np.abs(lines[0][2][there] - lines[1][2][there])
+        if np.isfinite(apart).any():
+            begin = there[int(np.nanargmax(apart))]
+    chosen = np.unique(np.append(chosen, [there[-1], *([] if begin is None else [begin])]))
+    name, unit = _parted(x_label)
+    told = {
+        "name": name,
+        "unit": unit,
+        "y": _parted(y_label)[1],
+        "at": _whole(x[chosen]),
+        "begin": 0 if begin is None else int(np.searchsorted(chosen, begin)),
+        "apart": begin is not None,
+        "lines": [{"name": n, "style": s, "at": _whole(y[chosen])} for n, s, y in lines],
+    }
+    return json.dumps(told, separators=(",", ":"), allow_nan=False)
+
+
+def _parted(label: str) -> tuple[str, str]:
+    """What an axis shows and in which unit."""
+    bare, bracket, unit = label.rpartition(" [")
+    return (bare, unit[:-1]) if bracket and unit.endswith("]") else (label, "")
+
+
+def _whole(values: Floats) -> list[object]:
+    """A power of ten and whole numbers that times it are the values; null for none."""
+    finite = values[np.isfinite(values)]
+    if not finite.size:
+        return [0, [None] * values.size]
+    low, high = float(finite.min()), float(finite.max())
+    largest = max(abs(low), abs(high))
+    # Beyond twelve digits of the largest value a browser's numbers have no whole ones.
+    fine = max((high / PARTS - low / PARTS), largest * 1e-12, 1e-290)
+    power = math.floor(math.log10(fine))
+    scaled = values / 10.0**power
+    return [power, [None if math.isnan(v) else round(v) for v in scaled.tolist()]]
+
+
+#: Values beyond this are drawn as gaps: differences of two of them leave the range of double precision.
+HUGE = 1e300
+#: Coordinates inside the plot are whole tenths of a pixel.
+SUB = 10
+#: Diameter of a dot [px].
+DOT = 4.6
+#: Letters of a label beside its line; the legend above the narrow chart has room for more.
+MOST_LETTERS = 22
+#: (light, dark, dashes). Vermilion, blue, green, purple after Okabe and Ito, darkened to a contrast of 3:1 on white and
+#: lightened for the dark; dashes tell lines apart without any colour. The first is the neutral line.
+LINES = (
+    ("#3d4650", "#7f8b97", ""),
+    ("#d1480a", "#ff8f45", ""),
+    ("#0a6cb0", "#5ab8f5", "8 3"),
+    ("#00855f", "#3fcfa3", "3 3"),
+    ("#9b3f83", "#e99ac8", "9 3 2 3"),
+    ("#7a6300", "#e6cb4f", "14 4"),
+)
+#: What a line begins with that others are compared with.
+NEUTRAL = ("measured", "simulated arm")
+
+
+@dataclass(frozen=True)
+class _Plot:
+    """Place of the plot in the drawing [px], and the data at its edges."""
+
+    left: float
+    top: float
+    width: float
+    height: float
+    frame: tuple[float, float, float, float]
+
+    def across(self, x: Floats | float) -> Floats:
+        low, high, _, _ = self.frame
+        return np.asarray(self.left + self.width * (np.asarray(x) - low) / (high - low))
+
+    def down(self, y: Floats | float) -> Floats:
+        _, _, low, high = self.frame
+        return np.asarray(self.top + self.height * (high - np.asarray(y)) / (high - low))
+
+    def tenths(self, x: Floats, y: Floats) -> tuple[list[int], list[int]]:
+        """Places in whole tenths of a pixel; far outside they no longer matter, and the bound keeps them short."""
+        down = np.clip(self.down(y) - self.top, -self.height, 2 * self.height)
+        xs, ys = (np.rint(places * SUB).astype(np.int64).tolist() for places in (self.across(x) - self.left, down))
+        return xs, ys
+
+
+@dataclass(frozen=True)
+class _Line:
+    name: str
+    style: int
+    x: Floats
+    y: Floats  # logarithms on a logarithmic axis; not a number where nothing can be drawn
+    dots: bool = False
+
+
+@dataclass(frozen=True)
+class _Shade:
+    style: int
+    x: Floats
+    low: Floats
+    high: Floats
+
+
+@dataclass(frozen=True)
+class _Chart:
+    """What both drawings show."""
+
+    title: str
+    described: str
+    x_label: str
+    y_label: str
+    lines: list[_Line]
+    shades: list[_Shade]
+    frame: tuple[float, float, float, float]
+    log_x: bool
+    log_y: bool
+    stems: bool
+
+    @property
+    def named(self) -> list[_Line]:
+        return [line for line in self.lines if line.name]
+
+    def ticks(self, *, narrow: bool) -> tuple[Ticks, Ticks]:
+        """Round numbers across and upward."""
+        x_low, x_high, y_low, y_high = self.frame
+        across = (log_ticks if self.log_x else ticks)(x_low, x_high, 4 if narrow else 9)
+        return across, log_ticks(y_low, y_high, 6) if self.log_y else ticks(y_low, y_high, 5)
+
+
+def line_chart(
+    x: ArrayLike,
+    lines: Sequence[tuple[str, ArrayLike]],
+    *,
+    title: str,
+    x_label: str,
+    y_label: str,
+    width: int = 720,
+    height: int = 260,
+    log_x: bool = False,
+    log_y: bool = False,
+    caption: str = "",
+    points: int = POINTS,
+    bands: Sequence[tuple[ArrayLike, ArrayLike]] = (),
+    stems: bool = False,
+    dots: Collection[str] = (),
+    slider: bool = False,
+) -> Figure:
+    """Chart of one or several lines over a common axis.
+
+    Parameters
+    ----------
+    x
+        Shape (N,).
+    lines
+        (name, values of shape (N,)); a lone line may do without a name. A line whose name begins with "measured" or
+        "simulated arm" is neutral and lies beneath; the others are coloured and dashed in the order given.
+    title, x_label, y_label
+        Text, with units.
+    width, height
+        Of the wide drawing, in pixels; it scales.
+    log_x, log_y
+        Logarithmic axes.
+    caption
+        Sentence below; what could not be drawn is added to it.
+    points
+        Most points of a line.
+    bands
+        (low, high) of a shade behind the first lines, in their order; each of shape (N,).
+    stems
+        Draw every value as a stem from 0 instead of a line.
+    dots
+        Names of lines that are dots where they have a value, and nothing elsewhere.
+    slider
+        Give a page's script what it needs for a slider that reads the lines out, sample by sample; on axes that are
+        not logarithmic.
+
+    Returns
+    -------
+    Figure
+        With a second drawing for narrow screens.
+
+    Raises
+    ------
+    DataError
+        No line, or a line whose length is not that of x.
+    """
+    drawn, notes = _checked(x, lines, x_label, log_x, log_y, dots)
+    x_low, x_high = limits([drawn[0].x[np.isfinite(drawn[0].x)]], 0.02 if stems else 0.0)
+    if not (log_x or stems):
+        x_low, x_high = snapped(x_low, x_high)
+    shades = [_shade(drawn[k], low, high, log_y) for k, (low, high) in enumerate(bands[: len(drawn)])]
+    # Edges of shades widen the axis and are never told to have left it, so they are lines of no name and no neutral.
+    edges = [_Line("", 1, b.x, y) for b in shades for y in (b.low, b.high) if np.isfinite(y).any()]
+    y_low, y_high, strays = _y_limits(drawn if stems else [*drawn, *edges])
+    if stems:
+        around_zero = [0.0, *(float(np.nanmax(b.high)) for b in shades), *(float(np.nanmin(b.low)) for b in shades)]
+        y_low, y_high = min(y_low, *(1.1 * v for v in around_zero)), max(y_high, *(1.1 * v for v in around_zero))
+    notes += [f"{name} leaves the axis (to {number(10.0**far if log_y else far, 3)})." for name, far in strays]
+    described = f"Line chart. {y_label} against {x_label}" + ("; logarithmic vertical axis" if log_y else "")
+    described += "; logarithmic horizontal axis. " if log_x else ". "
+    described += " ".join(_described(line, log_y) for line in drawn)
+    chart = _Chart(
+        title, described, x_label, y_label, drawn, shades, (x_low, x_high, y_low, y_high), log_x, log_y, stems
+    )
+    read = ""
+    if slider and not (log_x or log_y):
+        # A page of many charts has few points a line, and room for as few to be read out.
+        values = [(line.name, line.style, line.y) for line in drawn]
+        read = readings(drawn[0].x, values, x_label, y_label, max(2, points // 2))
+    wide = _drawing(chart, width, height, points, narrow=False, read=read)
+    small = _drawing(chart, NARROW, 240, max(4, points // 2), narrow=True)
+    return Figure(title, wide, small, " ".join(([caption] if caption else []) + notes))
+
+
+def _logarithms(values: Floats) -> Floats:
+    """Places on a logarithmic axis; not a number where there is none."""
+    with np.errstate(divide="ignore", invalid="ignore"):
+        return np.log10(np.where(values > 0, values, np.nan))
+
+
+def _shade(line: _Line, low: ArrayLike, high: ArrayLike, log_y: bool) -> _Shade:
+    """Edges of a band behind a line; where an edge is not finite there is none."""
+    edges = []
+    for edge in (low, high):
+        values = np.array(edge, dtype=np.float64)
+        if values.shape != line.x.shape:
+            raise DataError(f"a band of {line.name!r} has shape {values.shape}, x {line.x.shape}; give one length")
+        values = _logarithms(values) if log_y else values
+        edges.append(np.where(np.abs(values) < HUGE, values, np.nan))
+    return _Shade(line.style, line.x, *edges)
+
+
+def _checked(
+    x: ArrayLike, lines: Sequence[tuple[str, ArrayLike]], x_label: str, log_x: bool, log_y: bool, dots: Collection[str]
+) -> tuple[list[_Line], list[str]]:
+    """Lines ready to draw, and in words what of them cannot be drawn."""
+    if not lines:
+        raise DataError("a chart needs at least one line; give (name, values) pairs")
+    across = np.array(x, dtype=np.float64)
+    across = _logarithms(across) if log_x else across
+    drawn, notes, coloured = [], [], 0
+    for name, values in lines:
+        y = np.array(values, dtype=np.float64)
+        if y.ndim != 1 or y.shape != across.shape:
+            raise DataError(f"line {name!r} has shape {y.shape}, x {across.shape}; give arrays of one length")
+        bad = ~(np.isfinite(y) & np.isfinite(across)) | (np.abs(y) > HUGE)
+        if np.any(bad) and name not in dots:
+            first = across[int(np.argmax(bad))]
+            where = f" (first at {x_label} = {first:.4g})" if np.isfinite(first) else ""
+            notes.append(f"{name}: {np.sum(bad)} of {y.size} values are not finite{where} and leave a gap.")
+        y[bad] = np.nan
+        if log_y:
+            below = ~bad & (y <= 0)
+            if np.any(below):
+                notes.append(f"{name}: {np.sum(below)} values of 0 or less have no place on a logarithmic axis.")
+            y = _logarithms(y)
+        neutral = name.startswith(NEUTRAL)
+        style = 0 if neutral else 1 + coloured % (len(LINES) - 1)
+        coloured += not neutral
+        drawn.append(_Line(name, style, across, y, name in dots))
+    return drawn, notes
+
+
+def _y_limits(lines: list[_Line]) -> tuple[float, float, list[tuple[str, float]]]:
+    """Return ends of the vertical axis, and lines that leave it with their farthest values."""
+    every = [line.y[np.isfinite(line.y)] for line in lines]
+    low, high = limits(every, 0.05)
+    neutral = [y for y, line in zip(every, lines, strict=True) if line.style == 0 and y.size]
+    if not neutral:
+        return low, high, []
+    # A free run that runs away would flatten what it is to be compared with.
+    bottom, top = limits(neutral, 0.0)
+    reach = STRAY * (top - bottom)
+    floor, ceiling = bottom - reach, top + reach
+    strays = []
+    for y, line in zip(every, lines, strict=True):
+        if y.size and (np.min(y) < floor or np.max(y) > ceiling):
+            middle = (bottom + top) / 2
+            strays.append((line.name, float(y[np.argmax(np.abs(y - middle))])))
+    return max(low, floor), min(high, ceiling), strays
+
+
+def _described(line: _Line, log_y: bool) -> str:
+    finite = line.y[np.isfinite(line.y)]
+    if finite.size == 0:
+        return f"{line.name}: no value that can be drawn."
+    ends = [float(np.min(finite)), float(np.max(finite)), float(finite[-1])]
+    low, high, last = (number(10.0**v if log_y else v, 4) for v in ends)
+    return f"{line.name or 'Values'}: from {low} to {high}, at the end {last}."
+
+
+def _drawing(chart: _Chart, width: int, height: int, points: int, *, narrow: bool, read: str = "") -> Markup:
+    across, upward = chart.ticks(narrow=narrow)
+    named = chart.named
+    legend = _legend(named, width) if narrow else []
+    left = max(30.0, 10 + max(map(text_width, upward.labels)))
+    # Beside the lines: a gap, a swatch, the label.
+    side = max((text_width(shortened(line.name, MOST_LETTERS)) for line in named), default=0.0)
+    right = 14.0 if narrow or not named else 34 + side
+    top = 26.0 + (LINE * (legend[-1][2] + 1) + 5 if legend else 0)
+    if narrow:
+        height += int(top - 26)
+    plot = _Plot(left, top, width - left - right, height - top - 40.0, chart.frame)
+    parts = [*_grid(plot, across, upward), *_curves(chart, plot, points)]
+    parts += [Markup('<g font-size="12" fill="currentColor">'), *_labels(chart, plot, across, upward, width)]
+    if named:
+        parts += _legend_marks(legend) if narrow else _end_labels(named, plot)
+    parts.append(Markup("</g>"))
+    told = Markup("") if chart.log_x or chart.log_y or chart.stems else _zoomable(plot, across, upward)
+    if read:
+        told += Markup(' data-readings="{}"').format(read)
+    return svg(width, height, chart.title, chart.described, parts, narrow=narrow, attributes=told)
+
+
+def _grid(plot: _Plot, across: Ticks, upward: Ticks) -> list[Markup]:
+    """A line for every round number, and both axes."""
+    left, top, w, h = plot.left, plot.top, plot.width, plot.height
+    along, up = Markup('<path d="M{:.1f} {:.1f}h{:.1f}"/>'), Markup('<path d="M{:.1f} {:.1f}v{:.1f}"/>')
+    axes = Markup(
+        '</g><path fill="none" stroke="currentColor" stroke-opacity="0.55" d="M{:.1f} {:.1f}v{:.1f}h{:.1f}"/>'
+    )
+    return [
+        Markup('<g class="grid" fill="none" stroke="currentColor" stroke-opacity="0.14">'),
+        *(along.format(left, float(plot.down(v)), w) for v in upward.values),
+        *(up.format(float(plot.across(v)), top, h) for v in across.values),
+        axes.format(left, top, h, w),
+    ]
+
+
+def _curves(chart: _Chart, plot: _Plot, points: int) -> list[Markup]:
+    """Shades and lines in a drawing of their own, which cuts off what leaves the axes and has whole coordinates."""
+    out = [
+        Markup(
+            '<svg class="plot" preserveAspectRatio="none" x="{:.1f}" y="{:.1f}" width="{:.1f}" height="{:.1f}" '
+            'viewBox="0 0 {:.0f} {:.0f}">'
+        ).format(plot.left, plot.top, plot.width, plot.height, plot.width * SUB, plot.height * SUB)
+    ]
+    shaded = Markup('<path class="shade{}" fill="{}" fill-opacity="0.2" d="{}"/>')
+    for shade in chart.shades:
+        if d := _outline(shade, plot, points):
+            out.append(shaded.format(shade.style, LINES[shade.style][0], d))
+    if chart.stems:
+        zero = float(plot.down(0.0) - plot.top) * SUB
+        axis = Markup('<path fill="none" stroke="currentColor" stroke-opacity="0.55" d="M0 {:.0f}h{:.0f}"/>')
+        out.append(axis.format(zero, plot.width * SUB))
+    # The neutral line lies beneath the others.
+    for line in sorted(chart.lines, key=lambda item: item.style != 0 or item.dots):
+        if d := _stem_path(line, plot) if chart.stems else _path(line, plot, points):
+            stroke = _stroke(line.style, dots=line.dots)
+            out.append(Markup('<path vector-effect="non-scaling-stroke" {} d="{}"/>').format(stroke, d))
+    return [*out, Markup("</svg>")]
+
+
+def _labels(chart: _Chart, plot: _Plot, across: Ticks, upward: Ticks, width: int) -> list[Markup]:
+    """Numbers and names of both axes."""
+    left, bottom, w = plot.left, plot.top + plot.height, plot.width
+    out = [Markup('<g class="ticks">')]
+    for v, label in zip(upward.values, upward.labels, strict=True):
+        out.append(svg_text(left - 6, float(plot.down(v)) + 4, label, "end"))
+    for v, label in zip(across.values, across.labels, strict=True):
+        out.append(svg_text(float(plot.across(v)), bottom + 16, label, "middle"))
+    out.append(Markup("</g>"))
+    y_text, x_text = (
+        shortened(f"{label} ({axis.factor})" if axis.factor else label, int((width - 8) / LETTER))
+        for label, axis in ((chart.y_label, upward), (chart.x_label, across))
+    )
+    out += [svg_text(4, plot.top - 12, y_text, "start"), svg_text(left + w, bottom + 34, x_text, "end")]
+    if not any(np.isfinite(line.y).any() for line in chart.lines):
+        out.append(svg_text(left + w / 2, plot.top + plot.height / 2, "no finite value to draw", "middle"))
+    return out
+
+
+def _zoomable(plot: _Plot, across: Ticks, upward: Ticks) -> Markup:
+    """What the page's script needs to zoom: data at the edges, place of the plot, powers of ten left out of labels."""
+    frame = " ".join(repr(float(v)) for v in plot.frame)
+    place = f"{plot.left:.1f} {plot.top:.1f} {plot.width:.1f} {plot.height:.1f}"
+    return Markup(' data-frame="{}" data-plot="{}" data-powers="{} {}"').format(
+        frame, place, across.power, upward.power
+    )
+
+
+def _outline(shade: _Shade, plot: _Plot, points: int) -> str:
+    """Closed path around a band where both its edges are finite."""
+    good = np.flatnonzero(np.isfinite(shade.low) & np.isfinite(shade.high) & np.isfinite(shade.x))
+    if good.size < 2:
+        return ""
+    good = good[:: max(1, good.size // points)]
+    xs, top = plot.tenths(shade.x[good], shade.high[good])
+    _, bottom = plot.tenths(shade.x[good], shade.low[good])
+    there = [f"{x} {y}" for x, y in zip(xs, top, strict=True)]
+    back = [f"{x} {y}" for x, y in zip(xs[::-1], bottom[::-1], strict=True)]
+    return "M" + "L".join([*there, *back]) + "Z"
+
+
+def _stem_path(line: _Line, plot: _Plot) -> str:
+    kept = np.flatnonzero(np.isfinite(line.y) & np.isfinite(line.x))
+    zero = round(float(plot.down(0.0) - plot.top) * SUB)
+    return "".join(f"M{x} {zero}V{y}" for x, y in zip(*plot.tenths(line.x[kept], line.y[kept]), strict=True))
+
+
+def _stroke(style: int, *, dots: bool = False) -> Markup:
+    light, _, dashes = LINES[style]
+    dashes = "" if dots else dashes
+    # The measured line is wide enough to show on both sides of one that follows it exactly.
+    thickness = DOT if dots else 3.4 if style == 0 else 1.5
+    dash = Markup(' stroke-dasharray="{}"').format(dashes) if dashes else ""
+    # The page's style sheet replaces the colour in the dark; the attribute serves wherever there is no page.
+    return Markup(
+        'class="line{}" fill="none" stroke="{}" stroke-width="{:g}" stroke-linejoin="round" stroke-linecap="{}"{}'
+    ).format(style, light, thickness, "butt" if dashes else "round", dash)
+
+
+def _path(line: _Line, plot: _Plot, points: int) -> str:
+    """Path data in whole tenths of a pixel, each point relative to the one before, a new start after every gap."""
+    kept = decimate(line.y, points)
+    if kept.size == 0:
+        return ""
+    xs, ys = plot.tenths(line.x[kept], line.y[kept])
+    starts = np.diff(np.cumsum(~np.isfinite(line.y))[kept], prepend=-1) != 0
+    # A line of no length, h0: a lone point between gaps still shows, as a dot.
+    parts = [
+        f"M{x} {y}h0" if start else f"l{x - before} {y - above}"
+        for x, y, before, above, start in zip(xs, ys, [0, *xs], [0, *ys], starts.tolist(), strict=False)
+    ]
+    return "".join(parts).replace(" -", "-")
+
+
+def _swatch(line: _Line, x: float, y: float, length: int) -> Markup:
+    """What a line looks like, beside its name."""
+    at, reach = (x + length / 2, 0) if line.dots else (x, length)
+    return Markup('<path {} d="M{:.1f} {:.1f}h{}"/>').format(_stroke(line.style, dots=line.dots), at, y, reach)
+
+
+def _end_labels(lines: list[_Line], plot: _Plot) -> list[Markup]:
+    """Swatch and name beside the end of every line, moved apart where lines end together."""
+    x, top, bottom = plot.left + plot.width, plot.top, plot.top + plot.height
+    ends = []
+    for line in lines:
+        finite = line.y[np.isfinite(line.y)]
+        ends.append(float(np.clip(plot.down(finite[-1]), top, bottom)) if finite.size else (top + bottom) / 2)
+    # Lines that end together keep the order in which they were given.
+    order = sorted(range(len(lines)), key=lambda i: (round(ends[i] / LINE), i))
+    places = [ends[i] for i in order]
+    for k in range(1, len(places)):
+        places[k] = max(places[k], places[k - 1] + LINE)
+    if places[-1] > bottom:
+        places[-1] = bottom
+        for k in range(len(places) - 2, -1, -1):
+            places[k] = min(places[k], places[k + 1] - LINE)
+    out = []
+    for i, y in zip(order, places, strict=True):
+        out.append(_swatch(lines[i], x + 8, y, 16))
+        out.append(svg_text(x + 28, y + 4, shortened(lines[i].name, MOST_LETTERS), "start"))
+    return out
+
+
+def _legend(lines: list[_Line], width: int) -> list[tuple[_Line, float, int]]:
+    """Place of every entry above a narrow chart: (line, x, row)."""
+    entries, x, row = [], 4.0, 0
+    for line in lines:
+        needed = 26 + text_width(shortened(line.name, 2 * MOST_LETTERS)) + 14
+        if x > 4 and x + needed > width:
+            x, row = 4.0, row + 1
+        entries.append((line, x, row))
+        x += needed
+    return entries
+
+
+def _legend_marks(entries: list[tuple[_Line, float, int]]) -> list[Markup]:
+    out = []
+    for line, x, row in entries:
+        y = 8.0 + LINE * row
+        out.append(_swatch(line, x, y, 20))
+        out.append(svg_text(x + 26, y + 4, shortened(line.name, 2 * MOST_LETTERS), "start"))
+    return out
+
+
+def chart_css() -> Markup:
+    """Return the rules that give the lines their colours by the page's variables, light and dark."""
+    light = "".join(f"--line{i}:{c};" for i, (c, _, _) in enumerate(LINES))
+    dark = "".join(f"--line{i}:{c};" for i, (_, c, _) in enumerate(LINES))
+    rules = "".join(f".line{i}{{stroke:var(--line{i})}}.shade{i}{{fill:var(--line{i})}}" for i in range(len(LINES)))
+    return Markup(
+        f":root{{{light}}}@media screen and (prefers-color-scheme:dark){{:root{{{dark}}}}}{rules}"  # our constants
+    )

@@ -1,0 +1,308 @@
+"""What ftlm tells a program's log: the logger ``ftlm``, silent until the program listens."""
+
+from __future__ import annotations
+
+import contextlib
+import importlib
+import logging
+import os
+import secrets
+import stat
+from collections.abc import Iterable, Mapping, Sequence
+from dataclasses import dataclass
+from pathlib import Path
+from typing import Any, Generic, Protocol, TypeVar
+
+import msgspec
+
+from ftlm._core import __version__
+from ftlm.errors import DataError, ModelError
+from ftlm.utils.validation import shown, words_of
+
+#: Files read and written and fits begun and ended at INFO, what makes a result doubtful at WARNING.
+LOG = logging.getLogger("ftlm")
+LOG.addHandler(logging.NullHandler())
+
+
+#: Systems that tell text from bytes are to write bytes.
+_NEW = os.O_WRONLY | os.O_CREAT | os.O_EXCL | getattr(os, "O_BINARY", 0)
+
+
+@dataclass(frozen=True)
+class Words:
+    """How errors speak of a file that cannot be written, which depends on who asked for it.
+
+    Parameters
+    ----------
+    quoted
+        Whether its name stands in quotes.
+    folder
+        What to do where a folder has that name; nothing where that counts as a file that exists.
+    overwrite
+        How to overwrite a file that exists.
+    failed
+        What is said of a failure, with its reason.
+    """
+
+    quoted: bool = False
+    folder: str = ""
+    overwrite: str = "force=True (--force)"
+    failed: str = "cannot be written: {}; choose another folder"
+
+    def shown(self, path: Path) -> str:
+        """Write a path."""
+        return repr(str(path)) if self.quoted else str(path)
+
+
+#: Models, pages and tables; runs; what a command was told to write.
+PLAIN = Words()
+RUN = Words(
+    quoted=True,
+    folder="give the name of a file in it",
+    failed="cannot be written ({}); check the folder and the space left",
+)
+COMMAND = Words(folder="name a file in it", overwrite="--force")
+
+
+def check_new(path: str | os.PathLike[str], *, force: bool, words: Words = PLAIN) -> Path:
+    """Refuse the name of a folder, and that of a file that must not be overwritten."""
+    file = Path(path)
+    if words.folder and file.is_dir():
+        raise DataError(f"{words.shown(file)} is a folder; {words.folder}")
+    there = _status(file)
+    # A dangling link is a file that someone meant to be there.
+    if there is not None and not force:
+        raise DataError(f"{words.shown(file)} exists; choose another name, or overwrite it with {words.overwrite}")
+    if there is not None and not stat.S_ISREG(there.st_mode) and not stat.S_ISDIR(there.st_mode):
+        # A device of the system would be gone, and what stands behind a link is not what was asked for.
+        kind = "a link" if stat.S_ISLNK(there.st_mode) else "a device, pipe or socket"
+        raise DataError(f"{words.shown(file)} is {kind}, no regular file, and is not overwritten; choose another name")
+    return file
+
+
+def _status(file: Path) -> os.stat_result | None:
+    """What has that name, itself and not what it leads to; None where nothing has."""
+    try:
+        return file.lstat()
+    except (OSError, ValueError):
+        return None
+
+
+def check_free(*paths: str | os.PathLike[str] | None, force: bool, words: Words = PLAIN) -> None:
+    """Refuse before any work what could not be written after it; no path is no file to write."""
+    for path in paths:
+        if path is None:
+            continue
+        file = check_new(path, force=force, words=words)
+        folder = file.absolute().parent
+        if not folder.is_dir():
+            raise DataError(f"{words.shown(file.parent)} is no folder; make it first")
+        if not os.access(folder, os.W_OK):
+            raise DataError(
+                f"{words.shown(file)} cannot be written: {words.shown(file.parent)} is read-only; choose another folder"
+            )
+
+
+def check_folder(folder: Path, names: Iterable[str], *, force: bool) -> None:
+    """Make a folder and refuse before any work those of its files that could not be written after it."""
+    try:
+        folder.mkdir(parents=True, exist_ok=True)
+    except OSError as error:
+        raise DataError(f"{folder} cannot be made: {error.strerror or error}; choose another folder") from error
+    there = [name for name in names if os.path.lexists(folder / name)]
+    if there and not force:
+        raise DataError(f"{folder / there[0]} exists ({len(there)} such files); choose another folder, or --force")
+
+
+def write_atomically(path: str | os.PathLike[str], content: bytes, *, force: bool, words: Words = PLAIN) -> Path:
+    """Write beside, flush to disk, rename: a reader sees the old file or the new one, whole.
+
+    Raises
+    ------
+    DataError
+        The file exists and ``force`` is not set, or it cannot be written.
+    """
+    file = check_new(path, force=force, words=words)
+    try:
+        # In its folder, since no rename crosses disks; short, so that long names have room.
+        beside = file.with_name(f".{file.name}.{secrets.token_hex(4)}")
+        there = _status(file)
+        # Never through a link that another program left. The permissions are those that a new file has here, or those
+        # of the file that is overwritten, from the first byte on.
+        descriptor = os.open(beside, _NEW, 0o666 if there is None else stat.S_IMODE(there.st_mode) & 0o777)
+        try:
+            with os.fdopen(descriptor, "wb") as stream:
+                stream.write(content)
+                stream.flush()
+                if there is not None and hasattr(os, "fchmod"):
+                    os.fchmod(stream.fileno(), stat.S_IMODE(there.st_mode) & 0o777)
+                os.fsync(stream.fileno())
+            if force or not _named(beside, file):
+                os.replace(beside, file)
+        except FileExistsError:
+            with contextlib.suppress(OSError):
+                beside.unlink()
+            # Somebody made it between the check and now.
+            check_new(file, force=False, words=words)
+            raise
+        except BaseException:
+            with contextlib.suppress(OSError):
+                beside.unlink()
+            raise
+    except (OSError, ValueError) as error:
+        why = error.strerror if isinstance(error, OSError) else None
+        raise DataError(f"{words.shown(file)} {words.failed.format(why or error)}") from error
+    # The rename itself survives a power cut only when the folder is on disk too; not every system can do that.
+    with contextlib.suppress(OSError):
+        descriptor = os.open(file.parent, os.O_RDONLY)
+        try:
+            os.fsync(descriptor)
+        finally:
+            os.close(descriptor)
+    LOG.info("written: %s (%d bytes)", file, len(content))
+    return file
+
+
+def _named(beside: Path, file: Path) -> bool:
+    """Give a file a second name that nobody has, and take the first away; refuse one that was taken meanwhile.
+
+    Where the file system has no links it is false, and an empty file of that name waits for the file's renaming.
+    """
+    try:
+        os.link(beside, file, follow_symlinks=False)
+    except FileExistsError:
+        raise
+    except (OSError, NotImplementedError):
+        os.close(os.open(file, _NEW, 0o666))
+        return False
+    beside.unlink()
+    return True
+
+
+#: Longest name of a file in a message.
+LONGEST = 300
+
+
+class Versioned(Protocol):
+    """What stands in such a file."""
+
+    schema: int
+
+
+T = TypeVar("T", bound=Versioned)
+
+
+class Head(msgspec.Struct):
+    """What every such file says of itself, whatever else a later version put into it."""
+
+    format: str
+    schema: int
+    written_by: str = ""
+
+
+@dataclass(frozen=True)
+class Saved(Generic[T]):
+    """A kind of file.
+
+    Parameters
+    ----------
+    what
+        Name of what is in it.
+    source
+        What to give instead of another file.
+    kind
+        Its record.
+    latest
+        The last schema that this version reads.
+    most
+        Largest size that is read [bytes].
+    """
+
+    what: str
+    source: str
+    kind: type[T]
+    latest: int
+    most: int = 1 << 20
+
+    def read(self, path: str | os.PathLike[str]) -> T:
+        """The record of a file.
+
+        Raises
+        ------
+        DataError
+            A file that cannot be read, is too large, is none of this kind, or is of a later version.
+        """
+        if not isinstance(path, (str, os.PathLike)):
+            raise DataError(f"path = {shown(path)} is no path of a file; give {self.source}")
+        file = Path(path)
+        try:
+            content = self._content(file)
+        except DataError:
+            raise
+        except (OSError, ValueError) as error:
+            # What no file system takes is not put into words as it is.
+            name = str(file) if str(file).isprintable() and len(str(file)) <= LONGEST else shown(str(file), LONGEST)
+            why = (error.strerror if isinstance(error, OSError) else None) or error
+            raise DataError(f"{self.what} {name} cannot be read: {why}; check the path") from error
+        try:
+            return msgspec.json.decode(content, type=self.kind)
+        except (msgspec.MsgspecError, ValueError, RecursionError) as error:
+            self._check_later(file, content)
+            raise DataError(f"{file} is no ftlm {self.what}: {words_of(error, LONGEST)}; give {self.source}") from error
+
+    def _content(self, file: Path) -> bytes:
+        """All of a file that may be one of this kind."""
+        state = file.stat()
+        if not stat.S_ISREG(state.st_mode):
+            raise DataError(f"{file} is no regular file; give {self.source}")
+        if state.st_size > self.most:
+            raise DataError(
+                f"{file} has {state.st_size} bytes, no {self.what} is larger than {self.most}; give {self.source}"
+            )
+        return file.read_bytes()
+
+    def _check_later(self, file: Path, content: bytes) -> None:
+        """Say of a file that cannot be read whether a later version can."""
+        try:
+            head = msgspec.json.decode(content, type=Head)
+        except (msgspec.MsgspecError, ValueError, RecursionError):
+            return
+        if head.format == f"ftlm-{self.what}" and head.schema > self.latest:
+            raise self._later(file, head.schema, head.written_by)
+
+    def _later(self, path: str | os.PathLike[str], schema: int, writer: str = "") -> DataError:
+        by = f", {shown(writer, LONGEST)}" if writer else ""
+        return DataError(
+            f"{path} is a {self.what} of a later version of ftlm{by}: it has schema {shown(schema)}, and this version, "
+            f"{__version__}, reads up to {self.latest}; upgrade ftlm"
+        )
+
+    def check_schema(self, path: str | os.PathLike[str], read: Versioned, of: int) -> None:
+        """Refuse what a later version wrote, and what says so and has nothing of it.
+
+        Raises
+        ------
+        DataError
+            A schema beyond the latest that this version reads, or beyond that of what is in the file.
+        """
+        if read.schema > self.latest:
+            raise self._later(path, read.schema, getattr(read, "written_by", ""))
+        if not 1 <= read.schema <= of:
+            raise DataError(
+                f"{path} says that it has schema {read.schema}, and what it holds has schema {of}; give {self.source}"
+            )
+
+
+def to_frame(rows: Sequence[Mapping[str, Any]], index: Sequence[str]) -> Any:
+    """Rows as a pandas frame.
+
+    Raises
+    ------
+    ModelError
+        pandas is not installed.
+    """
+    try:
+        pandas = importlib.import_module("pandas")
+    except ImportError:
+        raise ModelError("pandas is not installed; pip install pandas") from None
+    return pandas.DataFrame.from_records(list(rows)).set_index(list(index))

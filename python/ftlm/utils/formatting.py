@@ -1,0 +1,113 @@
+"""Names and numbers as people write them: Greek letters, subscripts, significant digits."""
+
+from __future__ import annotations
+
+import math
+import re
+import shutil
+import textwrap
+from numbers import Integral
+
+from markupsafe import Markup
+
+#: Significant digits of every estimated number: more than any estimate here deserves, enough to compare with the paper.
+DIGITS = 5
+DIVERGED = "diverged"
+#: Letters of a line, at most and at least: of a terminal that is narrower as many as it has.
+WIDTH, NARROW = 110, 40
+_EQUATION = re.compile(r"D\^?\S* \S+ = ")
+GREEK = {
+    "alpha": "α",
+    "beta": "β",
+    "gamma": "γ",
+    "delta": "δ",
+    "theta": "θ",
+    "mu": "μ",
+    "nu": "ν",
+    "tau": "τ",
+    "phi": "φ",
+    "omega": "ω",
+}
+_SUBSCRIPTS = str.maketrans("0123456789", "₀₁₂₃₄₅₆₇₈₉")
+SUPERSCRIPTS = str.maketrans("-0123456789", "⁻⁰¹²³⁴⁵⁶⁷⁸⁹")
+SYMBOL = re.compile(rf"({'|'.join(GREEK)}|[A-Za-z])_?(\d*)", re.ASCII)
+
+
+def symbol(name: str) -> str:
+    """Return a signal's or parameter's name as it is written by hand: ``theta12`` becomes θ₁₂; any other name stays."""
+    found = SYMBOL.fullmatch(name)
+    if not found:
+        return name
+    return GREEK.get(found[1], found[1]) + found[2].translate(_SUBSCRIPTS)
+
+
+def symbol_html(name: str) -> Markup:
+    """Return the same as `symbol` with a real subscript, escaped."""
+    found = SYMBOL.fullmatch(name)
+    if not found:
+        return Markup("<i>{}</i>").format(name)
+    stem = Markup("<i>{}</i>").format(GREEK.get(found[1], found[1]))
+    return stem + Markup("<sub>{}</sub>").format(found[2]) if found[2] else stem
+
+
+class Exact(float):
+    """A number that was chosen, not estimated, such as an order on a lattice: printed as it is."""
+
+
+Cell = str | float | None
+
+
+def number(value: float, digits: int = DIGITS) -> str:
+    """Return a number with this many significant digits; infinity is ∞ with the word "diverged"."""
+    if isinstance(value, Integral):
+        return f"{value:,}".replace(",", "\u202f")
+    if math.isnan(value):
+        return "undefined"
+    if math.isinf(value):
+        return f"{'−' if value < 0 else ''}∞ {DIVERGED}"
+    if value == 0:
+        return "0"
+    text = f"{value:.10g}" if isinstance(value, Exact) else f"{value:#.{digits}g}"
+    mantissa, _, exponent = text.partition("e")
+    mantissa = mantissa.removesuffix(".").replace("-", "−")
+    return f"{mantissa}×10{str(int(exponent)).translate(SUPERSCRIPTS)}" if exponent else mantissa
+
+
+def unbounded(value: float, spec: str = ".3g") -> str:
+    """Return a standard error or an end of an interval in short, infinity as ∞: the runs do not see the number."""
+    return f"{'−' if value < 0 else ''}∞" if math.isinf(value) else f"{value:{spec}}"
+
+
+def shortened(text: str, most: int) -> str:
+    """A text of at most so many letters, with an ellipsis for the rest."""
+    return text if len(text) <= most else text[: most - 1] + "…"
+
+
+def with_error(value: float, error: float | None) -> str:
+    """Return a number with two digits of its standard error, and as many digits itself; five without one."""
+    if error is None or not math.isfinite(error) or error <= 0 or not math.isfinite(value):
+        return f"{value:.5g}"
+    decimals = 1 - math.floor(math.log10(error))
+    if abs(value) >= 1e6 or not 0 <= decimals <= 9:
+        return f"{value:.5g} ± {error:.2g}"
+    return f"{value:.{decimals}f} ± {error:.{decimals}f}"
+
+
+def columns() -> int:
+    """Letters of a line: those of the terminal, or of ``COLUMNS``, within bounds; the most where there is none."""
+    return min(max(shutil.get_terminal_size((WIDTH, 40)).columns, NARROW), WIDTH)
+
+
+def wrapped(text: str, lead: str = "", further: str | None = None) -> list[str]:
+    """Lines no longer than a terminal, those after the first set in, as far as `further` if that is given."""
+    # Equations break between their terms; what is ± something, or so many per cent, stays together.
+    bound = re.sub(" (?![+-] )" if _EQUATION.match(text) else " (?=[±%])|(?<=±) ", "\u00a0", text)
+    lines = textwrap.wrap(
+        bound,
+        columns(),
+        initial_indent=lead,
+        subsequent_indent=" " * (len(lead) or 2) if further is None else further,
+        break_long_words=False,
+        break_on_hyphens=False,
+    )
+    return [line.replace("\u00a0", " ") for line in lines]

@@ -1,0 +1,249 @@
+"""Refuses arguments that are not what they should be, and finds the words for it."""
+
+from __future__ import annotations
+
+import difflib
+import operator
+import os
+import re
+from collections.abc import Callable, Hashable, Iterable, Mapping, Sequence
+from typing import TypeAlias
+
+import numpy as np
+from numpy.typing import ArrayLike, NDArray
+
+from ftlm.errors import DataError, ModelError
+
+#: Environment variable that gives the threads of what does not say its own.
+THREADS = "FTLM_THREADS"
+#: Kinds of NumPy's numbers that a real number may be; `float` of others drops their imaginary part, or counts days.
+_REAL = frozenset("fiuO")
+
+
+def shown(value: object, most: int = 60) -> str:
+    """Return a value as an error message shows it, whatever it is: cut off, and long integers by their length."""
+    if type(value) is int and value.bit_length() > 3 * most:
+        # A long integer has no decimal form in Python.
+        return f"an integer of {value.bit_length()} bits"
+    try:
+        text = repr(value)
+    except Exception:
+        return f"a {type(value).__name__}"
+    return text if len(text) <= most else f"{text[:most]}…"
+
+
+def words_of(error: BaseException, most: int = 500) -> str:
+    """Return what an error of somebody else's says: cut off, in characters that a file can hold."""
+    try:
+        text = str(error)
+    except Exception:
+        return "what it says cannot be read"
+    return (text if len(text) <= most else f"{text[:most]}…").encode("utf-8", "backslashreplace").decode()
+
+
+def check_choice(name: str, value: object, known: Iterable[str]) -> None:
+    """Refuse anything but one of some words."""
+    words = list(known)
+    if not isinstance(value, str) or value not in words:
+        raise ModelError(f"{name} = {shown(value)} is not known; use {' or '.join(map(repr, words))}")
+
+
+def _is_number(value: object) -> bool:
+    """Whether a value may be a real number; a complex one is none, whatever its imaginary part."""
+    if isinstance(value, (str, bytes, bytearray, bool, complex)):
+        return False
+    return getattr(getattr(value, "dtype", None), "kind", "f") in _REAL
+
+
+def whole_number(value: object) -> int | None:
+    """Return a value that is a whole number as an int, anything else as None; the message is the caller's."""
+    if not _is_number(value):
+        return None
+    try:
+        number = int(value)  # type: ignore[call-overload]
+        return int(number) if number == value else None
+    except (TypeError, ValueError, OverflowError):
+        return None
+
+
+def check_seed(seed: object) -> int:
+    """Return the seed of random numbers as an int: any integer, NumPy's too, and neither a truth value nor 3.0."""
+    try:
+        number = -1 if isinstance(seed, bool) else operator.index(seed)  # type: ignore[arg-type]
+    except TypeError:
+        number = -1
+    if number < 0:
+        raise ModelError(f"seed = {shown(seed)} is not a whole number from 0")
+    return number
+
+
+def check_pulses(m: object, below: float = 1 << 62) -> int:
+    """Return a number of block pulses, of which the core counts fewer than 2^62."""
+    pulses = whole_number(m)
+    if pulses is None or not 1 <= pulses < below:
+        raise ModelError(f"m = {m!r} is no number of pulses; give a whole number, at least 1")
+    return pulses
+
+
+def real_number(name: str, value: object) -> float:
+    """Return a real number as a float; it may be infinite or not a number, which is for the caller to judge.
+
+    Raises
+    ------
+    ModelError
+        Text, nothing, a truth value, a complex number, or an integer beyond the range of floating point.
+    """
+    try:
+        if not _is_number(value):
+            raise TypeError
+        return float(value)  # type: ignore[arg-type]
+    except (TypeError, ValueError, OverflowError):
+        raise ModelError(f"{name} = {shown(value)} is not a number; give one") from None
+
+
+def listed(names: Iterable[object], most: int = 40) -> str:
+    """Return names for an error message: quoted, joined, and cut off after `most` of them."""
+    every = [repr(name) for name in names]
+    if not every:
+        return "none"
+    return ", ".join(every[:most]) + (f", … and {len(every) - most} more" if len(every) > most else "")
+
+
+def nearest(word: object, names: Iterable[object]) -> str:
+    """Return " (did you mean …?)" for the closest of names, or an empty string."""
+    options = [str(name) for name in names]
+    begun = [option for option in options if len(option) > 1 and str(word).casefold().startswith(option.casefold())]
+    close = [max(begun, key=len)] if begun else difflib.get_close_matches(str(word), options, n=1, cutoff=0.5)
+    return f" (did you mean {close[0]!r}?)" if close else ""
+
+
+def bad_rows(thing: str, what: str, first: int, count: int, way_out: str) -> DataError:
+    """Return the error for bad rows: the thing, the first 0-based row, the count and the way out."""
+    return DataError(f"{thing}: {what}, first at row {first}, {count} in all; {way_out}")
+
+
+def names_to_columns(argument: str, given: object) -> dict[str, Hashable]:
+    """Return {signal: column} for what a person gave: nothing, one name, a list of names or a mapping."""
+    if given is None:
+        return {}
+    if isinstance(given, str):
+        return {given: given}
+    if isinstance(given, Mapping):
+        return dict(given)
+    if not isinstance(given, Iterable):
+        raise DataError(f"{argument}= is a {type(given).__name__}; pass a dict of name: column, or a list of names")
+    names = list(given)
+    for index, name in enumerate(names):
+        if not isinstance(name, str):
+            raise DataError(f"{argument}=: entry {index} is {name!r}, not a name; pass a dict of name: column")
+        if name in names[:index]:
+            raise DataError(f"{argument}=: the name {name!r} is given twice; give every name once")
+    return {name: name for name in names}
+
+
+def as_mapping(argument: str, given: object, of: str = "array") -> Mapping[str, object]:
+    """Return a mapping by name as it is, and refuse anything else."""
+    if not isinstance(given, Mapping):
+        raise DataError(f"{argument}= is a {type(given).__name__}; pass a dict of name: {of}")
+    return given
+
+
+def check_known(what: str, given: Iterable[str], known: Sequence[str]) -> None:
+    """Refuse a name that does not occur in an equation."""
+    for name in given:
+        if name not in known:
+            near = difflib.get_close_matches(str(name), known, 1)
+            hint = f"did you mean {near[0]}?" if near else f"known: {', '.join(dict.fromkeys(known)) or 'none'}"
+            raise ModelError(f"{what} {name!r} does not occur in the equation; {hint}")
+
+
+def available_threads() -> int:
+    """Cores that this process may use."""
+    try:
+        return len(os.sched_getaffinity(0))
+    except AttributeError:  # not on macOS or Windows
+        return os.cpu_count() or 1
+
+
+def check_threads(threads: int | None) -> int:
+    """Threads to use: by default what ``FTLM_THREADS`` gives, else all cores.
+
+    Raises
+    ------
+    ModelError
+        Fewer than one or more than 1 024, or ``FTLM_THREADS`` is no such number.
+    """
+    if threads is None:
+        given = os.environ.get(THREADS, "").strip()
+        if given and not (given.isascii() and given.isdecimal() and len(given) < 5 and 1 <= int(given) <= 1024):
+            raise ModelError(f"{THREADS}={given!r} is no number of threads; give 1 to 1024, or leave it out")
+        return int(given) if given else available_threads()
+    count = whole_number(threads)
+    if count is None or not 1 <= count <= 1024:
+        raise ModelError(f"threads = {threads!r} is outside [1, 1024]; leave it out to use all cores")
+    return count
+
+
+#: Real and complex arrays of double precision.
+Floats: TypeAlias = NDArray[np.float64]
+Complex: TypeAlias = NDArray[np.complex128]
+
+
+def as_floats(name: str, values: object) -> NDArray[np.float64]:
+    """Return a float64 array of real numbers; never a view that is written to.
+
+    Raises
+    ------
+    DataError
+        Text, objects or complex numbers, rows of different lengths.
+    """
+    try:
+        array = np.asarray(values)
+    except ValueError as error:
+        raise DataError(f"{name} is no array: {str(error).rstrip('.')}; give rows of equal length") from error
+    if array.dtype.kind not in "fiub":
+        raise DataError(f"{name} holds {array.dtype} values; give real numbers")
+    return np.asarray(array, dtype=np.float64, order="C")
+
+
+def along(
+    name: str, values: ArrayLike, axis: int, work: Callable[[NDArray[np.float64]], NDArray[np.float64]]
+) -> NDArray[np.float64]:
+    """Apply ``work``, which takes and returns rows, along one axis of an array."""
+    array = as_floats(name, values)
+    if array.ndim == 0 or not -array.ndim <= axis < array.ndim:
+        raise DataError(f"{name} has {array.ndim} dimensions and no axis {axis}; give an array and one of its axes")
+    moved = np.moveaxis(array, axis, -1)
+    if moved.size == 0:
+        raise DataError(f"{name} has shape {array.shape} and holds no value; give at least one")
+    rows = np.ascontiguousarray(moved.reshape(-1, moved.shape[-1]))
+    return np.moveaxis(work(rows).reshape(moved.shape), -1, axis)
+
+
+CSV_TIME = "t_s"
+_NAME_LENGTH = 200
+_SIGNAL_NAME = re.compile(r"[^\W\d][\w.\[\]]*")
+
+
+def is_run_name(name: object) -> bool:
+    """Return whether a run may be called this."""
+    return isinstance(name, str) and 0 < len(name) <= _NAME_LENGTH and name.isprintable() and name[0] not in "=+-@"
+
+
+def check_run_name(name: object) -> None:
+    """Refuse what cannot be written into any file as the name of a run."""
+    if not is_run_name(name):
+        raise DataError(
+            f"name={name!r} cannot name a run; use 1 to {_NAME_LENGTH} printable characters, not beginning with = + - @"
+        )
+
+
+def check_signal_name(name: object) -> None:
+    """Refuse what cannot be the name of a column or stand in an equation."""
+    if not isinstance(name, str) or len(name) > _NAME_LENGTH or not _SIGNAL_NAME.fullmatch(name):
+        raise DataError(
+            f"{name!r} cannot name a signal; begin with a letter or _ and use letters, digits, _ . [ ] "
+            f"(at most {_NAME_LENGTH})"
+        )
+    if name == CSV_TIME:
+        raise DataError(f"{name!r} is the name of the time in csv files; give the signal another name")

@@ -1,0 +1,600 @@
+"""Figures of an error: (45), RMSE, NR, fit."""
+
+from __future__ import annotations
+
+import math
+from collections.abc import Container, Iterable, Mapping, Sequence
+from dataclasses import astuple, dataclass, field, replace
+from typing import Any
+
+import numpy as np
+from markupsafe import Markup
+from numpy.typing import ArrayLike
+
+from ftlm import _core
+from ftlm.data.run import Run, Runs, as_runs
+from ftlm.data.sampling import read
+from ftlm.errors import DataError
+from ftlm.model.model import Solved, check_solved
+from ftlm.simulation.discretization import Record, check_m, compared_times, default_m, equation_tuple, records, whole
+from ftlm.simulation.output_samples import Sampled, initial_exponents, looked_like_rest, measured_samples
+from ftlm.simulation.simulate import compared, respond
+from ftlm.simulation.step_refinement import refined
+from ftlm.structure.structure import Structure, offset_exponents
+from ftlm.svg.html_page import Table
+from ftlm.utils.files import to_frame
+from ftlm.utils.formatting import Cell, Exact, symbol_html
+from ftlm.utils.validation import Floats, as_floats
+
+
+def finite(value: float) -> float | None:
+    """For JSON, which has no infinity: None stands for a figure that is not finite."""
+    return float(value) if math.isfinite(value) else None
+
+
+@dataclass(frozen=True)
+class Metrics:
+    """The four figures of one output.
+
+    Parameters
+    ----------
+    error
+        Sum of absolute errors over the block pulses (paper (45)), in the unit of the output.
+    rmse
+        Root mean square error (paper (46)).
+    nr
+        Normalised residual RMSE / sigma(y) (paper (47)).
+    fit
+        100 (1 - ‖y - ŷ‖ / ‖y - mean‖) in percent.
+    """
+
+    error: float
+    rmse: float
+    nr: float
+    fit: float
+
+    def to_dict(self) -> dict[str, float | None]:
+        """For JSON."""
+        return {name: finite(getattr(self, name)) for name in ("error", "rmse", "nr", "fit")}
+
+
+#: Figures that nothing is known of.
+UNKNOWN = Metrics(math.nan, math.nan, math.nan, math.nan)
+
+
+def metrics(measured: ArrayLike, predicted: ArrayLike) -> Metrics:
+    """Error (45), RMSE (46), NR (47) and fit of a prediction.
+
+    Parameters
+    ----------
+    measured, predicted
+        Arrays of shape (M,) in the same unit.
+
+    Returns
+    -------
+    Metrics
+        Not finite where the prediction is not; NR and fit of a constant measurement mean nothing.
+
+    Raises
+    ------
+    DataError
+        Not one-dimensional, empty or of different lengths; measured values that are not finite real numbers.
+    """
+    y, prediction = as_floats("measured", measured), as_floats("predicted", predicted)
+    if y.ndim != 1 or y.size == 0 or prediction.shape != y.shape:
+        raise DataError(
+            f"measured has shape {y.shape}, predicted {prediction.shape}; give two vectors of one length, at least 1"
+        )
+    return Metrics(*_core.metrics(y, y - prediction))
+
+
+def pooled(measured: list[Floats], residuals: list[Floats]) -> Metrics:
+    """Figures over several runs, of what was read; each run's mean is its own."""
+    known = [~np.isnan(y) for y in measured]
+    if not all(k.all() for k in known):
+        measured = [y[k] for y, k in zip(measured, known, strict=True)]
+        residuals = [e[k] for e, k in zip(residuals, known, strict=True)]
+    if len(measured) == 1:
+        return Metrics(*_core.metrics(measured[0], residuals[0]))
+    return Metrics(*_core.metrics(np.concatenate([y - np.mean(y) for y in measured]), np.concatenate(residuals)))
+
+
+#: Own-output orders closer to alpha than this make I^(alpha - nu) nearly the identity on smooth signals.
+NEAR_IDENTITY = 0.25
+#: A free run this many times worse than the equation error says that the equation error flatters.
+FLATTERED = 5.0
+#: Points of fit lost from estimation to validation beyond which the model describes its own data, not the machine.
+LOST = 20.0
+#: A free run with a normalised residual above this explains nothing.
+USELESS = 0.5
+#: Free runs are refined until halving the step moves them by less than this share of their largest value,
+STILL = 1e-6
+#: or to so many pulses, four an interval at least; what still moves by more than VISIBLE then is said.
+LARGEST_M = 1 << 20
+VISIBLE = 1e-3
+
+
+@dataclass(frozen=True)
+class Comparison:
+    """A model beside measured runs.
+
+    Parameters
+    ----------
+    output_error, equation_error
+        Figures by output, over all runs: of the free run, and of the equation with measured signals on its right-hand
+        side.
+    per_run
+        The same for each run by name: (equation error, output error).
+    simulated, measured
+        By output, one array a run: samples when they were read, or pulse means (see ``sampled``). What was not read is
+        NaN in ``measured``, and no figure of the output error counts it; that of the equation error is not known then.
+    step
+        Pulse width of each run [s], of the equation error.
+    m
+        Number of block pulses of the equation error.
+    initial
+        Coefficients of the initial terms of the free run, one mapping a run: output -> exponent -> value. They belong
+        to that run alone.
+    warnings
+        What makes these figures doubtful, in words.
+    times
+        When each value of ``simulated`` and ``measured`` holds [s since the first row], one array a run.
+    sampled
+        Whether the output error is that of samples at the run's instants; False for pulse means, as the paper has them.
+    offsets
+        Unknown constants of the equations, one mapping a run: output -> ``"constant"`` [unit of D^alpha y] (and
+        ``"ramp"``, that a second) -> value. Estimated anew on each run; empty for a model without an offset, and for
+        an output whose run has a history beside it, which hides it.
+    unequated
+        Outputs without an equation error, by name, and why: it is not known where friction acts or samples are missing.
+    """
+
+    output_error: dict[str, Metrics]
+    equation_error: dict[str, Metrics]
+    per_run: list[tuple[str, dict[str, Metrics], dict[str, Metrics]]]
+    simulated: dict[str, list[Floats]]
+    measured: dict[str, list[Floats]]
+    step: list[float]
+    m: int
+    initial: list[dict[str, dict[float, float]]]
+    warnings: tuple[str, ...] = field(default=())
+    times: list[Floats] = field(default_factory=list)
+    sampled: bool = True
+    offsets: tuple[dict[str, dict[str, float]], ...] = field(default=())
+    unequated: Mapping[str, str] = field(default_factory=dict)
+
+    @property
+    def fit_percent(self) -> dict[str, float]:
+        """Fit of the free run in percent, by output."""
+        return {name: figures.fit for name, figures in self.output_error.items()}
+
+    def to_frame(self) -> Any:
+        """Both errors of every run as a pandas frame, by run, output and kind of error."""
+        rows = [
+            {"run": run, "output": name, "of": kind, "error": f.error, "rmse": f.rmse, "nr": f.nr, "fit": f.fit}
+            for run, equation, output in self.per_run
+            for kind, figures in (("equation error", equation), ("output error", output))
+            for name, f in figures.items()
+        ]
+        return to_frame(rows, ["run", "output", "of"])
+
+    def to_dict(self) -> dict[str, Any]:
+        """For JSON."""
+        return {
+            "m": self.m,
+            "output_error": {n: f.to_dict() for n, f in self.output_error.items()},
+            "equation_error": {n: f.to_dict() for n, f in self.equation_error.items()},
+            "runs": [
+                {
+                    "run": name,
+                    "equation_error": {n: f.to_dict() for n, f in equation.items()},
+                    "output_error": {n: f.to_dict() for n, f in output.items()},
+                }
+                for name, equation, output in self.per_run
+            ],
+            **({"offsets": list(self.offsets)} if self.offsets else {}),
+            "warnings": list(self.warnings),
+        }
+
+    def __str__(self) -> str:
+        width = max(len(name) for name in self.output_error) + 2
+        lines = [f"{'output':<{max(width, 8)}}{'':<16}{'error':>12}{'RMSE':>12}{'NR':>10}{'fit %':>12}"]
+        for name in self.output_error:
+            both = (("equation error", self.equation_error[name]), ("output error", self.output_error[name]))
+            for label, f in both[1 if name in self.unequated else 0 :]:
+                lines.append(
+                    f"{name:<{max(width, 8)}}{label:<16}{f.error:>12.5g}{f.rmse:>12.5g}{f.nr:>10.4g}{f.fit:>12.4g}"
+                )
+        if self.sampled:
+            count = max(sum(read(y).size for y in parts) for parts in self.measured.values())
+            known = (
+                f", equation error over {self.m} block pulses a run" if set(self.measured) - set(self.unequated) else ""
+            )
+            lines.append(f"output error over {count} samples{known}")
+        else:
+            lines.append(f"over {self.m} block pulses a run")
+        lines += without_equation_error(self.unequated)
+        lines += offsets_in_words(self)
+        lines += [f"warning: {w}" for w in self.warnings]
+        return "\n".join(lines)
+
+    def _repr_html_(self) -> str:
+        return comparison_html(self)
+
+
+#: Why an output has no equation error.
+RUBBED = "friction acts on it, and the sign of a measured velocity is that of its noise, most of all at rest"
+UNREAD = "not every sample of it was read, and the straight lines between the others are no measurement"
+#: Of an offset beside a history.
+HIDDEN = "not told apart from what the run did before its start; begin the run at rest to learn it"
+
+
+def compare(model: Solved, runs: Run | Sequence[Run], *, m: int | None = None) -> Comparison:
+    """Equation error and output error of a model on measured runs.
+
+    The output error compares sample by sample: y[k], after the input of its row has acted, with the free run at that
+    instant on a grid refined until it stands still (as :func:`ftlm.simulate` has it), initial terms fitted to the run's
+    samples. Its fit is 100 (1 - ‖y - ŷ‖ / ‖y - mean y‖), in percent.
+
+    Parameters
+    ----------
+    model
+        The model.
+    runs
+        One run or several with the same names and units.
+    m
+        Number of block pulses a run for the equation error; default that of the identification, or what the runs carry.
+
+    Returns
+    -------
+    Comparison
+        On the data that a model was identified from, its figures are those printed with it. Initial terms, and offsets
+        where the structure has them, are estimated anew on each of these runs.
+
+    Raises
+    ------
+    DataError
+        Runs that do not fit, a signal that is not there, a constant output.
+    ModelError
+        An m that the runs do not carry.
+    """
+    several, m = _checked(model, runs, m)
+    return compared_samples(model, several, free_runs(model, several), m=m)
+
+
+def free_runs(model: Solved, runs: Sequence[Run]) -> list[Sampled]:
+    """The free run on each run, with initial terms fitted to it, on a grid fine enough not to matter."""
+    return [refined(model, run, None, tolerance=STILL, largest_m=max(LARGEST_M, 4 * run.length)) for run in runs]
+
+
+def compared_samples(model: Solved, runs: Runs, free: Sequence[Sampled], *, m: int) -> Comparison:
+    """Compare free runs, sample by sample, and the equation error on m pulses, with these runs."""
+    full = records(runs, model.structure, m)
+    parts = []
+    for run, sampled, rec in zip(runs, free, full, strict=True):
+        measured = dict(zip(model.outputs, measured_samples(model, run, sampled.refinement), strict=True))
+        simulated = dict(zip(model.outputs, sampled.outputs, strict=True))
+        parts.append(_beside(model, rec, simulated, measured, sampled.initial, gaps=run.missing))
+    times = [compared_times(run, model.structure) for run in runs]
+    found = _comparison(model, runs, parts, m, times, sampled=True)
+    warnings = list(found.warnings)
+    if restless := [run.name for run, sampled in zip(runs, free, strict=True) if _moves(sampled)]:
+        warnings.append(
+            f"the free run on {', '.join(restless)} still moves with the step at the finest grid: the model is stiffer "
+            "than these samples can show, and its output error is provisional"
+        )
+    if moving := looked_like_rest(model, runs):
+        warnings.append(
+            f"{', '.join(moving)} starts at zero and is simulated from rest, but what that leaves over dies away like "
+            "motion from before the start; give the model's structure initial='history' to have that estimated"
+        )
+    return replace(found, warnings=tuple(warnings))
+
+
+def _moves(sampled: Sampled) -> bool:
+    """Whether halving the step still moves a finite run visibly."""
+    return bool(np.all(np.isfinite(sampled.outputs)) and np.any(sampled.change > VISIBLE))
+
+
+def compare_means(model: Solved, runs: Run | Sequence[Run], *, m: int | None = None) -> Comparison:
+    """Both errors on the pulse means of m block pulses, as the paper's tables have them.
+
+    Means average neighbours: with noise they flatter, and where few pulses carry a period they condemn.
+    """
+    several, m = _checked(model, runs, m)
+    whole(several, "figures of pulse means")
+    pairs = zip(compared(several, model, m), records(several, model.structure, m), strict=True)
+    parts = []
+    for free, full in pairs:
+        responses, initial = respond(model, free)
+        parts.append(_beside(model, full, responses, {o: free.of(o) for o in model.outputs}, initial))
+    middles = [np.asarray((np.arange(m) + 0.5) * p.step, dtype=np.float64) for p in parts]
+    return _comparison(model, several, parts, m, middles, sampled=False)
+
+
+def _checked(model: Solved, runs: Run | Sequence[Run], m: int | None) -> tuple[Runs, int]:
+    """Runs that hold what the model needs, and the number of pulses."""
+    check_solved(model)
+    several = as_runs(runs)
+    carried = min(run.length for run in several) - 1
+    chosen = min(model.m or default_m(several, power_of_two=False), carried) if m is None else m
+    m = check_m(chosen, several, power_of_two=False)
+    for run in several:
+        run.require_outputs([o for o in model.outputs if o in run])
+    return several, m
+
+
+def without_equation_error(why: Mapping[str, str]) -> list[str]:
+    """Outputs that have no equation error, in words."""
+    return [f"{name} has no equation error: {reason}" for name, reason in why.items()]
+
+
+def offsets_of(model: Solved, initial: Mapping[str, Mapping[float, float]]) -> dict[str, dict[str, float]]:
+    """Constants of the equations from the powers of t that they integrate to: c t^alpha / Gamma(alpha + 1).
+
+    None of an equation whose run has a history beside them: its powers of t hide a constant.
+    """
+    out: dict[str, dict[str, float]] = {}
+    for item in model.equations:
+        alone = initial_exponents(item, "caputo", model.structure.offset)
+        found = {round(e, 9) for e in initial[item.output] if e > -1}
+        if isinstance(model.structure.initial, str) and not found <= set(alone):
+            out[item.output] = {}
+            continue
+        exponents, values = map(np.array, zip(*initial[item.output].items(), strict=True))
+        out[item.output] = {
+            name: float(values[np.argmin(np.abs(exponents - power))]) * math.gamma(power + 1.0)
+            for name, power in offset_exponents(item.order.constant, model.structure.offset).items()
+        }
+    return out
+
+
+def offsets_in_words(comparison: Comparison) -> list[str]:
+    """Offsets of every run that has some, a line an output."""
+    lines = []
+    for (run, _, _), offsets in zip(comparison.per_run, comparison.offsets, strict=False):
+        for output, values in offsets.items():
+            if not values:
+                lines.append(f"offset in the equation of {output} in {run}: {HIDDEN}")
+                continue
+            ramp = f" and {values['ramp']:.6g} t" if "ramp" in values else ""
+            lines.append(
+                f"offset in the equation of {output} in {run} (estimated on that run, for it alone): "
+                f"{values['constant']:.6g}{ramp}"
+            )
+    return lines
+
+
+@dataclass(frozen=True)
+class _Beside:
+    """A model beside one run, by output: the free run and what was measured, the equation's signal and its error."""
+
+    step: float
+    initial: dict[str, dict[float, float]]
+    simulated: dict[str, Floats]
+    measured: dict[str, Floats]
+    equated: dict[str, Floats]
+    missed: dict[str, Floats]
+
+
+def _beside(
+    model: Solved,
+    full: Record,
+    simulated: dict[str, Floats],
+    measured: dict[str, Floats],
+    initial: dict[str, dict[float, float]],
+    *,
+    gaps: Container[str] = (),
+) -> _Beside:
+    """A free run with what it is compared with, and the equation error, with all signals behind the sensor filter.
+
+    The equation of an output with gaps has no error: it would be that of the straight lines over them.
+    """
+    core, inputs, powers = full.core(), list(full.inputs), full.start
+    missed = {
+        e.output: _core.equation_error(core, equation_tuple(e, full.signals), inputs, powers)
+        for e in model.equations
+        # Nor has one with friction: the sign of a measured velocity is that of its noise, most of all at rest.
+        if e.output not in gaps and e.friction is None
+    }
+    return _Beside(full.step, initial, simulated, measured, {o: full.of(o) for o in model.outputs}, missed)
+
+
+def _comparison(
+    model: Solved, runs: Sequence[Run], parts: Sequence[_Beside], m: int, times: list[Floats], *, sampled: bool
+) -> Comparison:
+    """All runs together."""
+    equation_error, output_error = _figures(parts)
+    # The runs' own figures may be known where those of all of them are not.
+    rubbed = {e.output for e in model.equations if e.friction is not None}
+    unequated = {o: RUBBED if o in rubbed else UNREAD for o, f in equation_error.items() if f is UNKNOWN}
+    return Comparison(
+        output_error,
+        equation_error,
+        [(run.name, *_figures([p])) for run, p in zip(runs, parts, strict=True)],
+        {o: [p.simulated[o] for p in parts] for o in model.outputs},
+        {o: [p.measured[o] for p in parts] for o in model.outputs},
+        [p.step for p in parts],
+        m,
+        [p.initial for p in parts],
+        tuple(near_identity(model.structure, equation_error, output_error)),
+        times,
+        sampled,
+        tuple(offsets_of(model, p.initial) for p in parts) if model.structure.offset != "none" else (),
+        unequated,
+    )
+
+
+def _figures(parts: Sequence[_Beside]) -> tuple[dict[str, Metrics], dict[str, Metrics]]:
+    """Figures of the equation error and of the free run, over these runs together."""
+    outputs = parts[0].measured
+    equation = {
+        o: pooled([p.equated[o] for p in parts], [p.missed[o] for p in parts])
+        if all(o in p.missed for p in parts)
+        else UNKNOWN
+        for o in outputs
+    }
+    free = {o: pooled([p.measured[o] for p in parts], [p.measured[o] - p.simulated[o] for p in parts]) for o in outputs}
+    return equation, free
+
+
+def near_identity(
+    structure: Structure, equation_error: Mapping[str, Metrics], output_error: Mapping[str, Metrics]
+) -> list[str]:
+    """Warnings in words where the equation error flatters a model.
+
+    Own-output orders close to alpha reproduce any smooth output from itself; only the free run shows it.
+    """
+    warnings = []
+    for item in structure.equations:
+        name, alpha = item.output, item.order.constant
+        equation, output = equation_error[name], output_error[name]
+        close = [t.order.constant for t in item.terms if t.signal == name and alpha - t.order.constant < NEAR_IDENTITY]
+        # Negated so that a figure that is not a number counts as bad; an equation error that is not known says nothing.
+        unknown = math.isnan(equation.nr) and math.isfinite(output.nr)
+        worse = not output.nr <= FLATTERED * equation.nr and not unknown
+        useless = not output.nr <= USELESS
+        if close and worse:
+            listed = ", ".join(f"{order:g}" for order in close)
+            listed = f"orders {listed} are" if len(close) > 1 else f"order {listed} is"
+            warnings.append(
+                f"{name}: {listed} close to alpha = {alpha:g}, so the equation nearly says that {name} "
+                f"equals itself; its free run has NR {output.nr:.3g} against {equation.nr:.3g} for the equation error. "
+                "Do not use these orders"
+            )
+        elif worse and useless:
+            warnings.append(
+                f"{name}: the free run (NR {output.nr:.3g}) is far worse than the equation error ({equation.nr:.3g}); "
+                "the equation error flatters this model"
+            )
+        elif useless:
+            warnings.append(f"{name}: the free run explains little of the output (NR {output.nr:.3g})")
+    return warnings
+
+
+def validation_warnings(own: Comparison, validation: Comparison) -> list[str]:
+    """Validation runs that are those a model was identified from, and outputs whose fit is lost on the others."""
+    warnings = []
+    for k, (name, _, _) in enumerate(own.per_run):
+        for j, (other, _, _) in enumerate(validation.per_run):
+            if all(np.array_equal(own.measured[o][k], validation.measured[o][j], equal_nan=True) for o in own.measured):
+                warnings.append(
+                    f"{other}: its outputs are those of {name}, which the model was identified from; "
+                    "it validates nothing"
+                )
+    return warnings + lost_fits({n: f.fit for n, f in own.output_error.items()}, validation)
+
+
+def lost_fits(before: Mapping[str, float], validation: Comparison) -> list[str]:
+    """Name outputs whose fit on other runs is far below that on the estimation data."""
+    warnings = []
+    for other, _, figures in validation.per_run:
+        for output, f in figures.items():
+            # Negated so that a fit that is not a number counts as lost.
+            if np.isfinite(before.get(output, np.nan)) and not f.fit >= before[output] - LOST:
+                warnings.append(
+                    f"{other}: the fit of {output} falls from {before[output]:.3g} % on the estimation data to "
+                    f"{f.fit:.3g} %; the model describes the data it was identified from better than the machine"
+                )
+    return warnings
+
+
+_FIGURES = ("error (45)", "RMSE", "NR", "fit %")
+
+
+def errors_table(
+    compared: Iterable[tuple[str, Comparison]], *, units: Mapping[str, str] | None = None, title: str = "Both errors"
+) -> Table:
+    """Return equation error and output error side by side, a row for each output of each comparison.
+
+    Parameters
+    ----------
+    compared
+        (what the data were to the model, comparison), such as ``("estimation", result.comparison)``. Where a comparison
+        holds several runs, each follows with its own rows.
+    units
+        Units of the outputs.
+    title
+        Caption.
+    """
+    rows: list[list[Cell]] = []
+    headings: dict[int, str] = {}
+    unequated: dict[str, str] = {}
+
+    def add(
+        heading: str, equation: Mapping[str, Metrics], output: Mapping[str, Metrics], without: Container[str]
+    ) -> None:
+        headings[len(rows)] = heading
+        for name in output:
+            unit = (units or {}).get(name, "")
+            label = symbol_html(name) + (Markup(" [{}]").format(unit) if unit else Markup(""))
+            known = equation[name] is not UNKNOWN
+            rows.append(
+                [label, *(astuple(equation[name]) if known else [None] * len(_FIGURES)), *astuple(output[name])]
+            )
+
+    for label, comparison in compared:
+        runs, without = comparison.per_run, comparison.unequated
+        unequated |= without
+        if len(runs) > 1:
+            add(f"{label}: {len(runs)} runs together", comparison.equation_error, comparison.output_error, without)
+        for name, equation, output in runs:
+            add(f"{label}: {name}", equation, output, without)
+    reasons = [f"{words}." for words in without_equation_error(unequated)]
+    own = 1 + len(_FIGURES)
+    if unequated and all(cell is None for row in rows for cell in row[1:own]):
+        # Four columns of nothing would push what is known off a narrow screen.
+        kept: list[list[Cell]] = [[row[0], *row[own:]] for row in rows]
+        single = (("", 1), ("output error (free run)", 4))
+        return Table(title, ("output", *_FIGURES), kept, groups=single, headings=headings, note=" ".join(reasons))
+    note = (
+        "The equation error uses the measured output on the right-hand side and flatters a model whose orders are "
+        "close to one another; only the free run shows what the model knows."
+    )
+    groups = (("", 1), ("equation error", 4), ("output error (free run)", 4))
+    return Table(
+        title, ("output", *_FIGURES, *_FIGURES), rows, groups=groups, headings=headings, note=" ".join([note, *reasons])
+    )
+
+
+def filter_state(exponent: float) -> str:
+    """What the exponent of an impulse, -1, or of a derivative of one stands for."""
+    return f"filter's state {round(-exponent)}"
+
+
+def initial_terms_table(comparison: Comparison, *, title: str = "Initial terms of the free runs") -> Table | None:
+    """Return initial terms by run and output, or None where every run starts at rest."""
+    rows: list[list[Cell]] = [
+        [name, symbol_html(output), Exact(exponent) if exponent > -1 else filter_state(exponent), value]
+        for (name, _, _), initial in zip(comparison.per_run, comparison.initial, strict=True)
+        for output, terms in initial.items()
+        for exponent, value in terms.items()
+    ]
+    if not rows:
+        return None
+    rows += [
+        [name, symbol_html(output), f"offset: {what}", value]
+        for (name, _, _), offsets in zip(comparison.per_run, comparison.offsets, strict=False)
+        for output, values in offsets.items()
+        for what, value in values.items()
+    ]
+    note = "They describe how that record starts and are never carried to another."
+    if comparison.offsets:
+        note += (
+            " An offset c on the right-hand side is the power alpha with the coefficient c/Gamma(alpha + 1); it is "
+            "estimated on each run for that run alone."
+        )
+    return Table(title, ("run", "output", "exponent of t", "coefficient"), rows, note=note)
+
+
+def warned(warnings: Sequence[str]) -> Markup:
+    """Return warnings as a list, or nothing."""
+    if not warnings:
+        return Markup("")
+    items = Markup("").join(Markup("<li>{}</li>").format(w) for w in warnings)
+    return Markup("<p><strong>Warnings</strong></p><ul>{}</ul>").format(items)
+
+
+def comparison_html(comparison: Comparison) -> str:
+    """Return both errors of every run, warnings first."""
+    return str(warned(comparison.warnings) + errors_table([("compared", comparison)]).to_html())

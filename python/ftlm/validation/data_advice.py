@@ -1,0 +1,672 @@
+"""What to do about a run before anything is identified from it: faults and poor excitation, in sentences."""
+
+from __future__ import annotations
+
+import html
+import itertools
+import math
+from collections.abc import Iterable, Iterator
+from dataclasses import asdict, dataclass
+from statistics import NormalDist
+from typing import Any
+
+import numpy as np
+from numpy.typing import NDArray
+
+from ftlm import _core
+from ftlm.data.run import Measured
+from ftlm.data.sampling import read
+from ftlm.structure.structure import Structure
+from ftlm.utils.linalg import orthonormal, solved
+from ftlm.utils.statistics import is_rest, noise_of
+from ftlm.utils.validation import Floats
+
+#: What tells rows of a past apart, as a share of all that they do.
+ALIKE = 3e-7
+#: A spectral line below this share of the largest one is not counted as excitation.
+LINE = 0.01
+#: Bins that one line fills through the Blackman-Harris window, whose side lobes are 92 dB down.
+LINE_BINS = 8
+BLACKMAN_HARRIS = (0.35875, -0.48829, 0.14128, -0.01168)
+#: A mean above this share of the deviation is a level, and not what is left of waves that the record cuts.
+LEVEL_SHARE = 0.3
+#: Two inputs more correlated than this move together.
+TOGETHER = 0.999
+#: Rows below which no fit means much.
+FEW_ROWS = 100
+#: An output that stands still for longer than this share of the run while an input moves is dead for that time.
+DEAD_SHARE = 0.005
+DEAD_ROWS = 50
+#: Samples in a row at an extreme that are clipped and not a turning point; share of the run from which it is said.
+CLIPPED_ROWS = 3
+CLIPPED_SHARE = 0.002
+#: A spike stands out of its neighbours on both sides by this many noise deviations and this share of the range.
+SPIKE_SIGMAS = 12.0
+SPIKE_SHARE = 0.03
+MOST_SPIKES = 0.01
+#: A wrap jumps by more than this share of the range against the slope on both sides.
+WRAP_SHARE = 0.6
+WRAP_SLOPE = 5
+#: A trend that the inputs do not explain: share of the output's deviation, and significance over blocks.
+DRIFT_SHARE = 0.15
+DRIFT_SIGMAS = 6.0
+DRIFT_BLOCKS = 16
+DRIFT_M = 1024
+DRIFT_LAGS = 12
+#: Least share of a trend that the inputs' responses must leave for it to be told from them.
+TREND_LEFT = 1e-3
+#: Orders of the autoregressions that whiten input and output, rows used, lags looked at, quarters that must agree.
+FEEDBACK_ORDER = 20
+FEEDBACK_ROWS = 8_000
+FEEDBACK_LAGS = 10
+FEEDBACK_PARTS = 4
+FEEDBACK_LEVEL = 1e-6
+#: An input that its own past predicts to within this share is a signal made beforehand, not a controller's.
+PREDICTED = 1e-4
+
+
+@dataclass(frozen=True)
+class Finding:
+    """One thing to know about a run.
+
+    Parameters
+    ----------
+    kind
+        ``excitation``, ``constant``, ``dead``, ``offset``, ``drift``, ``saturation``, ``spikes``, ``wrap``,
+        ``feedback``, ``short`` or ``twin``.
+    signal
+        The signal concerned; empty where it is the whole run.
+    sentence
+        What was found, with numbers, and what to do.
+    """
+
+    kind: str
+    signal: str
+    sentence: str
+
+
+@dataclass(frozen=True)
+class Advice:
+    """Everything to know about a run before a model is identified from it; empty where nothing stands out.
+
+    Parameters
+    ----------
+    run
+        Name of the run.
+    findings
+        What was found, gravest kinds first.
+    """
+
+    run: str
+    findings: tuple[Finding, ...]
+
+    @property
+    def kinds(self) -> tuple[str, ...]:
+        """Kinds of what was found, each once."""
+        return tuple(dict.fromkeys(f.kind for f in self.findings))
+
+    def __iter__(self) -> Iterator[Finding]:
+        return iter(self.findings)
+
+    def __len__(self) -> int:
+        return len(self.findings)
+
+    def to_dict(self) -> list[dict[str, str]]:
+        """For JSON."""
+        return [{"kind": f.kind, "signal": f.signal, "sentence": f.sentence} for f in self.findings]
+
+    def __str__(self) -> str:
+        if not self.findings:
+            return f"advice on {self.run}: nothing stands out"
+        return "\n".join([f"advice on {self.run}:", *(f"  {f.sentence}" for f in self.findings)])
+
+    def _repr_html_(self) -> str:
+        items = "".join(f"<li>{html.escape(f.sentence)}</li>" for f in self.findings)
+        return f"<p>Advice on {html.escape(self.run)}:</p><ul>{items or '<li>nothing stands out</li>'}</ul>"
+
+
+def advise(run: Measured, structure: Structure | None = None) -> Advice:
+    """Look for faults and poor excitation in a run; see :meth:`ftlm.Run.advice`."""
+    return Advice(run.name, tuple(_findings(run, structure)))
+
+
+def _findings(run: Measured, structure: Structure | None) -> Iterator[Finding]:
+    run = run.bridged()
+    moving = [n for n in run.signals if np.ptp(run[n]) > 0]
+    for name in run.signals:
+        if name not in moving:
+            yield _constant(run, name)
+    yield from _twins(run, moving)
+    inputs = [n for n in run.inputs if n in moving]
+    outputs = [n for n in run.outputs if n in moving]
+    for name in outputs:
+        yield from dead(run, name)
+    usual = []
+    for name in outputs:
+        wraps = list(_wraps(run, name))
+        yield from wraps
+        # What jumps from one end to the other has no turning points, trend or spikes worth the name.
+        if not wraps:
+            usual.append(name)
+            yield from _saturation(run, name)
+            yield from _spikes(run, name)
+    for name in inputs:
+        yield from _saturation(run, name)
+    yield from _short(run, outputs)
+    yield from _excitation(run, inputs)
+    if structure is not None:
+        yield from excitation_for(run, structure)
+    yield from _feedback(run, inputs, usual)
+    yield from _drift(run, inputs, usual)
+    for name in outputs:
+        yield from _offset(run, name)
+
+
+def _with_unit(run: Measured, name: str, value: float) -> str:
+    unit = run.units.get(name, "")
+    return f"{value:.4g} {unit}".strip() if unit not in ("", "1") else f"{value:.4g}"
+
+
+def _times(count: int) -> str:
+    return f"{count} time{'' if count == 1 else 's'}"
+
+
+def _stretches(flags: NDArray[np.bool_]) -> tuple[NDArray[np.intp], NDArray[np.intp]]:
+    """Starts and lengths of the stretches of true values."""
+    edges = np.diff(np.concatenate([[False], flags, [False]]).astype(np.int8))
+    starts = np.flatnonzero(edges == 1)
+    return starts, np.flatnonzero(edges == -1) - starts
+
+
+def _twins(run: Measured, names: list[str]) -> Iterator[Finding]:
+    for one, other in itertools.combinations(names, 2):
+        if np.array_equal(run[one], run[other]):
+            yield Finding(
+                "twin", other, f"{one} and {other} hold the same number in every row: one of them is the wrong column"
+            )
+
+
+def _constant(run: Measured, name: str) -> Finding:
+    level = _with_unit(run, name, float(run[name][0]))
+    if name in run.inputs:
+        return Finding(
+            "constant",
+            name,
+            f"input {name} is {level} in all {run.length} rows: it excites nothing but one transient from the start; "
+            "record its command, or a run in which it moves",
+        )
+    return Finding(
+        "constant",
+        name,
+        f"output {name} is {level} in all {run.length} rows: a dead channel, or the wrong column; check the sensor",
+    )
+
+
+def dead(run: Measured, name: str) -> Iterator[Finding]:
+    """Say where an output without gaps stands still although it changes from row to row elsewhere."""
+    y = run[name]
+    still = np.diff(y) == 0
+    starts, lengths = _stretches(still)
+    if not lengths.size:
+        return
+    # Coarse steps or a machine that sticks stand still all the time; a dead channel does so only once or twice.
+    if float(np.mean(still)) > 0.3 and np.median(lengths) > 1:
+        return
+    at = int(np.argmax(lengths))
+    first, rows = int(starts[at]), int(lengths[at]) + 1
+    if rows < max(DEAD_ROWS, DEAD_SHARE * run.length):
+        return
+    # At an extreme it is clipped, which is said elsewhere; before the first input acts, a machine may well rest.
+    if _entered_steeply(y, first, rows):
+        return
+    resting = y[first] == 0 and first == 0
+    inputs_moved = any(np.ptp(run[n][first : first + rows]) > 0 or run[n][first] != 0 for n in run.inputs)
+    if resting and not inputs_moved:
+        return
+    begin, end = first * run.step, (first + rows) * run.step
+    after = f"use slice({end:.4g}, None)" if first < run.length // 20 else "check the sensor, or slice it away"
+    yield Finding(
+        "dead",
+        name,
+        f"output {name} is exactly {_with_unit(run, name, float(y[first]))} from {begin:.4g} s to {end:.4g} s "
+        f"({rows} rows) and changes from row to row elsewhere: a channel that was off or was being zeroed; {after}",
+    )
+
+
+def _few_levels(x: Floats) -> bool:
+    return bool(np.unique(x).size < max(12, 0.01 * x.size))
+
+
+def _quantum(y: Floats) -> float:
+    changes = np.abs(np.diff(y))
+    changes = changes[changes > 1e-12 * float(np.max(np.abs(y)))]
+    return float(changes.min()) if changes.size else 0.0
+
+
+def _entered_steeply(y: Floats, first: int, rows: int) -> bool:
+    """Whether a stretch of equal values is cut off a moving signal: it moved fast just before and just after."""
+    moving = np.abs(np.diff(y))
+    typical = float(np.median(moving[moving > 0])) if np.any(moving > 0) else 0.0
+    # A slow turn that an input's step ends is steep on one side only.
+    before = abs(y[first - 1] - y[first - 2]) if first >= 2 else math.inf
+    end = first + rows
+    after = abs(y[end + 1] - y[end]) if end + 1 < y.size else math.inf
+    at_extreme = y[first] in (y.min(), y.max())
+    return bool(at_extreme and rows < y.size and min(before, after) > max(4 * _quantum(y), 0.2 * typical))
+
+
+def _saturation(run: Measured, name: str) -> Iterator[Finding]:
+    y = run[name]
+    levels = np.unique(y)
+    if name in run.inputs and _few_levels(y):
+        return  # a signal of a few levels sits at its extremes by design
+    noise, quantum = noise_of(y), _quantum(y)
+    if name in run.inputs:
+        role, remedy = "input", "harmless if this is what the machine received, else record the measured input"
+    else:
+        role, remedy = "output", "the true value is not known there: lower the amplitude or widen the range"
+    for extreme, word in ((levels[0], "lowest"), (levels[-1], "highest")):
+        starts, lengths = _stretches(y == extreme)
+        long = lengths >= CLIPPED_ROWS
+        if noise < 2 * quantum:
+            # Without noise, or with steps coarser than it, only a stretch that is entered at speed is clipped.
+            steep = [_entered_steeply(y, int(s), int(n)) for s, n in zip(starts[long], lengths[long], strict=True)]
+            clipped = int(np.sum(lengths[long][np.array(steep, dtype=bool)]))
+        else:
+            clipped = int(np.sum(lengths[long]))
+        if clipped >= max(CLIPPED_ROWS, CLIPPED_SHARE * y.size):
+            yield Finding(
+                "saturation",
+                name,
+                f"{role} {name} stays at its {word} value {_with_unit(run, name, float(extreme))} "
+                f"for {clipped} rows ({100 * clipped / y.size:.2g} %), cut off while moving: saturated; {remedy}",
+            )
+
+
+def _spikes(run: Measured, name: str) -> Iterator[Finding]:
+    y = run[name]
+    if y.size < 5:
+        return
+    up, down = np.diff(y)[:-1], np.diff(y)[1:]
+    reach = float(np.quantile(y, 0.995) - np.quantile(y, 0.005))
+    height = np.minimum(np.abs(up), np.abs(down))
+    limit = max(SPIKE_SIGMAS * noise_of(y), SPIKE_SHARE * reach)
+    out = (up * down < 0) & (height > limit)
+    # A signal may turn that fast everywhere; a spike stands alone between quiet neighbours.
+    near = np.abs(y[2:] - y[:-2])
+    out &= near < 0.5 * height
+    for n in run.inputs:
+        jump = np.abs(np.diff(run[n]))
+        # An input that jumps there and back may take a fast output with it.
+        pulsed = (jump > 0.2 * np.ptp(run[n])) & (np.ptp(run[n]) > 0)
+        out &= ~(pulsed[:-1] & pulsed[1:])
+    rows = np.flatnonzero(out) + 1
+    if not rows.size or rows.size > MOST_SPIKES * y.size:
+        return
+    worst = rows[int(np.argmax(height[rows - 1]))]
+    yield Finding(
+        "spikes",
+        name,
+        f"output {name} has {rows.size} spike{'s' if rows.size > 1 else ''}, first at row {rows[0]} "
+        f"({rows[0] * run.step:.4g} s), the largest of {_with_unit(run, name, float(height[worst - 1]))} at row "
+        f"{worst}: single wrong samples; replace them by their neighbours' mean",
+    )
+
+
+def _wraps(run: Measured, name: str) -> Iterator[Finding]:
+    y = run[name]
+    steps = np.diff(y)
+    reach, typical = float(np.ptp(y)), float(np.median(np.abs(steps)))
+    jumps = np.flatnonzero((np.abs(steps) > WRAP_SHARE * reach) & (np.abs(steps) > 10 * typical))
+    rows = []
+    for at in jumps.tolist():
+        if at < WRAP_SLOPE or at + WRAP_SLOPE + 1 >= y.size:
+            continue
+        before = float(y[at] - y[at - WRAP_SLOPE])
+        after = float(y[at + 1 + WRAP_SLOPE] - y[at + 1])
+        # Both slopes run against the jump: the quantity went on, its number began again.
+        stays = max(abs(before), abs(after)) < 0.5 * abs(steps[at])
+        if stays and before * steps[at] < 0 and after * steps[at] < 0:
+            rows.append(at + 1)
+    if not rows:
+        return
+    size = float(np.median(np.abs(steps[np.array(rows) - 1])))
+    turn = " (a turn)" if run.units.get(name) == "rad" and abs(size / (2 * math.pi) - 1) < 0.1 else ""
+    yield Finding(
+        "wrap",
+        name,
+        f"output {name} jumps by {_with_unit(run, name, size)}{turn} {_times(len(rows))} while moving the other "
+        f"way, first at row {rows[0]}: an encoder that wraps; unwrap it (numpy.unwrap) before loading",
+    )
+
+
+def spectral_lines(u: Floats) -> tuple[int, int]:
+    """Number of spectral lines that an input has, and the bin of the largest."""
+    x = u - np.mean(u)
+    phase = 2 * np.pi * np.arange(x.size) / x.size
+    window = sum(a * np.cos(k * phase) for k, a in enumerate(BLACKMAN_HARRIS))
+    size = np.abs(np.fft.rfft(x * window))
+    size[:2] = 0  # the mean's, through the window
+    strong = size > LINE * size.max()
+    # A single line fills LINE_BINS bins; a broad stretch holds as many lines as fit into it.
+    _, lengths = _stretches(strong)
+    return int(np.sum(np.maximum(1, np.rint(lengths / LINE_BINS)))), int(np.argmax(size))
+
+
+def _excitation(run: Measured, inputs: list[str]) -> Iterator[Finding]:
+    for name in inputs:
+        lines, at = spectral_lines(run[name])
+        if lines < 2 and at > 2:
+            omega = 2 * math.pi * at / (run.length * run.step)
+            yield Finding(
+                "excitation",
+                name,
+                f"input {name} is one sine at {omega:.3g} rad/s: persistently exciting of order 2, so it fixes two "
+                "numbers of an equation and no more; add frequencies (square, PRBS, multisine, chirp), or use this "
+                "run for validation",
+            )
+    for i, name in enumerate(inputs):
+        for other in inputs[:i]:
+            r = float(np.corrcoef(run[name], run[other])[0, 1])
+            if abs(r) > TOGETHER:
+                yield Finding(
+                    "excitation",
+                    name,
+                    f"inputs {other} and {name} move together (correlation {r:.4f}): an equation that reads both "
+                    "cannot tell their effects apart; drive them one after the other, or by different signals",
+                )
+
+
+def excitation_for(run: Measured, structure: Structure) -> Iterator[Finding]:
+    """Whether the inputs have lines enough for the free numbers of each equation.
+
+    In steady state a spectral line tells two numbers of every output that it reaches, a constant level one. What sticks
+    answers a line with others, so that lines do not count what it tells.
+    """
+    run = run.bridged()
+    for item in structure.equations:
+        if item.friction is not None:
+            continue
+        inputs = [s for s in item.signals if s in run.inputs]
+        # What is measured of the other outputs drives the equation, too.
+        if structure.coupling == "measured":
+            inputs += [s for s in item.signals if s != item.output and s in run.outputs]
+        else:
+            inputs = [s for s in structure.signals if s in run.inputs]
+        moving = [n for n in inputs if np.ptp(run[n]) > 0]
+        known = sum(2 * spectral_lines(run[n])[0] for n in moving)
+        known += sum(abs(float(np.mean(run[n]))) > LEVEL_SHARE * float(np.std(run[n])) for n in inputs)
+        free = len(item.order_names) + len(item.coefficient_names)
+        if free > known:
+            listed = ", ".join(inputs) or "no input"
+            yield Finding(
+                "excitation",
+                item.output,
+                f"the equation of {item.output} has {free} free numbers, but {listed} fixes {known} in steady "
+                "state: what the run tells beyond them comes from its start alone; add frequencies to the input, "
+                "or fix orders or coefficients",
+            )
+
+
+def _short(run: Measured, outputs: list[str]) -> Iterator[Finding]:
+    if run.length < FEW_ROWS:
+        yield Finding(
+            "short",
+            "",
+            f"the run has {run.length} rows: too few for orders and coefficients; record at least {FEW_ROWS}, "
+            "better thousands",
+        )
+        return
+    for name in outputs:
+        y = run[name]
+        swing = float(np.std(y))
+        level = np.zeros(y.size)
+        level[y > np.mean(y) + 0.2 * swing], level[y < np.mean(y) - 0.2 * swing] = 1.0, -1.0
+        sides = level[level != 0]
+        crossings = int(np.sum(np.diff(sides) != 0))
+        tail = y[-y.size // 5 :]
+        if crossings <= 2 and np.ptp(tail) > 0.1 * np.ptp(y):
+            yield Finding(
+                "short",
+                name,
+                f"output {name} passes its mean {_times(crossings)} in {run.duration:.4g} s and is still moving "
+                "at the end: the run is shorter than what dominates it; record several times its slowest period",
+            )
+
+
+def _offset(run: Measured, name: str) -> Iterator[Finding]:
+    if not is_rest(run[name]):
+        yield Finding(
+            "offset",
+            name,
+            f"output {name} starts at {_with_unit(run, name, float(run[name][0]))}, not at rest: initial terms will be "
+            "estimated; if this is only the sensor's zero, subtract it, and start the run before the input moves",
+        )
+
+
+def _drift(run: Measured, inputs: list[str], outputs: list[str]) -> Iterator[Finding]:
+    """A trend beside what first-order lags of the inputs, from fast to integrating, explain."""
+    m = min(DRIFT_M, run.length - 1)
+    if m < 4 * DRIFT_BLOCKS:
+        return
+    step = run.duration / m
+    means = {n: _core.pulse_means(run[n] - run[n][0], m, run.intersample.get(n) == "zoh") for n in (*inputs, *outputs)}
+    first = {n: _core.pulse_means(np.full(run.length, float(run[n][0])), m, True) for n in inputs}
+    times = np.geomspace(2 * step, run.duration / 8, DRIFT_LAGS)
+    series = [_core.filter_series([(1.0, 0.0)], [(float(t), 1.0), (1.0, 0.0)], m, step) for t in times]
+    columns = [_core.series_multiply(s, means[n] + first[n], m) for n in inputs for s in series]
+    columns += [means[n] + first[n] for n in inputs]
+    columns += [np.cumsum(means[n] + first[n]) for n in inputs]
+    t = np.linspace(-0.5, 0.5, m)
+    for name in outputs:
+        y = means[name]
+        free = [] if is_rest(run[name]) else [np.exp(-(t + 0.5) * run.duration / tau) for tau in times]
+        basis = np.stack([np.ones(m), *columns, *free])
+        scale = np.linalg.norm(basis, axis=1)
+        basis = basis[scale > 0] / scale[scale > 0][:, None]
+        # What the lags cannot tell from a trend is not called one: both sides are rid of them.
+        q = orthonormal(basis.T, 1e-8)
+        y_left, t_left = y - q @ (q.T @ y), t - q @ (q.T @ t)
+        if float(t_left @ t_left) < TREND_LEFT * float(t @ t):
+            continue
+        slope = float(t_left @ y_left) / float(t_left @ t_left)
+        left = y_left - slope * t_left
+        blocks = np.array_split(left * t_left, DRIFT_BLOCKS)
+        spread = math.sqrt(sum(float(np.sum(b)) ** 2 for b in blocks)) / float(t_left @ t_left)
+        size = float(np.std(y))
+        if abs(slope) > DRIFT_SHARE * size and abs(slope) > DRIFT_SIGMAS * spread:
+            yield Finding(
+                "drift",
+                name,
+                f"output {name} drifts by about {_with_unit(run, name, slope)} over the run "
+                f"({100 * abs(slope) / size:.0f} % of its deviation) beside what the inputs explain; let the "
+                "sensor settle, or subtract a line if it is known to be the sensor's",
+            )
+
+
+def _lagged(x: Floats, order: int) -> Floats:
+    """Rows x(t−1) … x(t−order) for t = order … N−1."""
+    return np.stack([x[order - k : x.size - k] for k in range(1, order + 1)])
+
+
+def _feedback(run: Measured, inputs: list[str], outputs: list[str]) -> Iterable[Finding]:
+    """Whether what is new in an output comes back in what is new in an input."""
+    rows = min(run.length, FEEDBACK_ROWS)
+    if rows < 20 * FEEDBACK_ORDER:
+        return []
+    pairs: list[tuple[float, Finding]] = []
+    order = FEEDBACK_ORDER
+    fed: list[tuple[str, Floats, Floats]] = []
+    for name in inputs:
+        u = run[name][:rows] - np.mean(run[name])
+        past_u = _lagged(u, order)
+        new_u = np.zeros(0) if _few_levels(u) else _innovation(u[order:], past_u)
+        # Switched between levels, or predictable from itself: made beforehand.
+        if new_u.size and np.median(np.abs(new_u)) > PREDICTED * np.std(u):
+            fed.append((name, past_u, new_u))
+    for (u_name, past_u, new_u), y_name in itertools.product(fed, outputs):
+        y = run[y_name][:rows] - np.mean(run[y_name])
+        new_y = _innovation(y[order:], np.concatenate([past_u, _lagged(y, order)]))
+        if np.median(np.abs(new_y)) < 0.1 * np.std(new_y):
+            continue  # hardly any noise: what is new are switches of the input
+        # Winsorised, so that a few switches do not decide.
+        a, b = (np.clip(x / _robust(x), -3, 3) for x in (new_y, new_u))
+        a, b = a - np.mean(a), b - np.mean(b)
+        lags = range(1, FEEDBACK_LAGS + 1)
+        r = np.array([float(np.sum(a[:-k] * b[k:])) for k in lags]) / (np.linalg.norm(a) * np.linalg.norm(b))
+        limit = NormalDist().inv_cdf(1 - FEEDBACK_LEVEL / FEEDBACK_LAGS / 2)
+        k = int(np.argmax(np.abs(r))) + 1
+        if abs(r[k - 1]) * math.sqrt(a.size) < limit:
+            continue
+        parts = [np.sum(p) for p in np.array_split(a[:-k] * b[k:], FEEDBACK_PARTS)]
+        if len({np.sign(p) for p in parts}) > 1:
+            continue
+        finding = Finding(
+            "feedback",
+            u_name,
+            f"input {u_name} answers what is new in output {y_name} {k} row{'s' if k > 1 else ''} later "
+            f"(correlation {r[k - 1]:.2g}): a closed loop, in which equation-error estimates are biased; use the "
+            "output error, and if you can a reference that moves the machine well",
+        )
+        pairs.append((abs(r[k - 1]), finding))
+    # One loop is one fact; the strongest pair tells it.
+    strongest: dict[str, Finding] = {}
+    for _, finding in sorted(pairs, key=lambda pair: -pair[0]):
+        strongest.setdefault(finding.signal, finding)
+    return strongest.values()
+
+
+def _innovation(x: Floats, past: Floats) -> Floats:
+    """What a linear prediction from the past leaves, as far as rows of it differ by more than a correlation shows."""
+    scale = np.linalg.norm(past, axis=1)
+    scaled = past / np.where(scale > 0, scale, 1.0)[:, None]
+    return np.asarray(x - scaled.T @ solved(scaled.T, x, ALIKE))
+
+
+def _robust(x: Floats) -> float:
+    return max(float(np.median(np.abs(x))) / 0.6745, 1e-300)
+
+
+@dataclass(frozen=True)
+class SignalFigures:
+    """Figures of one signal, in its SI unit.
+
+    Parameters
+    ----------
+    name, role, unit
+        Which signal.
+    first, low, high, mean, deviation
+        First value, extremes, mean and standard deviation.
+    noise
+        Standard deviation of the part that changes from sample to sample, from second differences.
+    quantum
+        Smallest change between two samples.
+    at_extremes
+        Share of samples at the lowest or highest value: saturation or a two-level signal.
+    constant
+        Whether all samples are equal.
+    at_rest
+        Whether the signal starts at zero within its noise.
+    """
+
+    name: str
+    role: str
+    unit: str
+    first: float
+    low: float
+    high: float
+    mean: float
+    deviation: float
+    noise: float
+    quantum: float
+    at_extremes: float
+    constant: bool
+    at_rest: bool
+
+
+@dataclass(frozen=True)
+class Inspection:
+    """A run in figures.
+
+    Parameters
+    ----------
+    run
+        Its name.
+    rows, step, duration
+        Its size, sampling step [s] and duration [s].
+    signals
+        Figures by signal, inputs first.
+    warnings
+        What to look at, in words.
+    """
+
+    run: str
+    rows: int
+    step: float
+    duration: float
+    signals: list[SignalFigures]
+    warnings: list[str]
+
+    def to_dict(self) -> dict[str, Any]:
+        """For JSON."""
+        return asdict(self)
+
+    def __str__(self) -> str:
+        width = max(len(name) for name in ("signal", *(s.name for s in self.signals))) + 2
+        heads = ("first", "low", "high", "mean", "sd", "noise", "quantum")
+        lines = [
+            f"run {self.run}: {self.rows} rows, step {self.step:g} s, {self.duration:g} s; "
+            f"carries up to {self.rows - 1} block pulses",
+            f"{'signal':<{width}}{'role':<8}{'unit':<8}" + "".join(f"{h:>11}" for h in heads),
+        ]
+        for s in self.signals:
+            figures = (s.first, s.low, s.high, s.mean, s.deviation, s.noise, s.quantum)
+            lines.append(f"{s.name:<{width}}{s.role:<8}{s.unit or '1':<8}" + "".join(f"{v:>11.4g}" for v in figures))
+        return "\n".join(lines + [f"warning: {w}" for w in self.warnings])
+
+
+def inspect_run(run: Measured) -> Inspection:
+    """Ranges, noise, quantisation and rest of every signal of a run.
+
+    Parameters
+    ----------
+    run
+        The run.
+
+    Returns
+    -------
+    Inspection
+        Prints as a table.
+    """
+    signals = [_figures(run, name) for name in run.signals]
+    warnings = list(run.warnings)
+    for s in signals:
+        if s.constant:
+            warnings.append(f"{s.name} is constant ({s.first:g}): a dead channel, or nothing happened")
+        elif s.role == "output" and not s.at_rest:
+            warnings.append(f"{s.name} does not start at rest (first value {s.first:.4g}): initial terms will be used")
+    return Inspection(run.name, run.length, run.step, run.duration, signals, list(dict.fromkeys(warnings)))
+
+
+def _figures(run: Measured, name: str) -> SignalFigures:
+    all_rows = run[name]
+    x = read(all_rows)
+    low, high, noise = float(x.min()), float(x.max()), noise_of(all_rows)
+    changes = np.abs(np.diff(x))
+    changes = changes[changes > 0]
+    deviation = float(x.std())
+    return SignalFigures(
+        name=name,
+        role="input" if name in run.inputs else "output",
+        unit=run.units.get(name, ""),
+        first=float(x[0]),
+        low=low,
+        high=high,
+        mean=float(x.mean()),
+        deviation=deviation,
+        noise=noise,
+        quantum=float(changes.min()) if changes.size else 0.0,
+        at_extremes=float(np.mean((x == low) | (x == high))),
+        constant=low == high,
+        at_rest=is_rest(x),
+    )

@@ -1,0 +1,104 @@
+"""Information criteria: how much a model explains, less a price for every number in it."""
+
+from __future__ import annotations
+
+import math
+from dataclasses import dataclass
+
+from ftlm.data.sampling import read
+from ftlm.errors import ModelError
+from ftlm.svg.html_page import Table
+from ftlm.utils.formatting import Cell, Exact
+from ftlm.utils.validation import whole_number
+from ftlm.validation.comparison import finite
+from ftlm.validation.residual_tests import Residuals
+
+
+@dataclass(frozen=True)
+class InformationCriteria:
+    """How much a model explains, less a price for every number in it; lower is better on the same runs.
+
+    Parameters
+    ----------
+    parameters
+        Numbers estimated: orders, coefficients, initial terms, one noise level an output.
+    samples
+        Residuals in all outputs and runs.
+    log_likelihood
+        Of the residuals as white normal noise.
+    aic, aicc, bic
+        Akaike's criterion, the same corrected for few samples (infinite where there are too few), Schwarz's.
+    """
+
+    parameters: int
+    samples: int
+    log_likelihood: float
+    aic: float
+    aicc: float
+    bic: float
+
+    def to_dict(self) -> dict[str, float | int | None]:
+        """For JSON."""
+        shown = {n: finite(getattr(self, n)) for n in ("log_likelihood", "aic", "aicc", "bic")}
+        return {"parameters": self.parameters, "samples": self.samples, **shown}
+
+    def __str__(self) -> str:
+        return (
+            f"AIC {self.aic:.6g}, AICc {self.aicc:.6g}, BIC {self.bic:.6g} "
+            f"({self.parameters} numbers estimated from {self.samples} samples)"
+        )
+
+
+def information_criteria(tests: Residuals, parameters: int) -> InformationCriteria:
+    """AIC, AICc and BIC of a model from its residuals; orders count as parameters like coefficients.
+
+    Parameters
+    ----------
+    tests
+        From :func:`ftlm.resid` on the runs that the model was identified from.
+    parameters
+        Free orders and free coefficients; initial terms and noise levels are added here.
+
+    Returns
+    -------
+    InformationCriteria
+        Comparable between models of the same outputs on the same runs. Coloured residuals make every difference look
+        surer than it is.
+
+    Raises
+    ------
+    ModelError
+        A number of parameters that is none.
+
+    Notes
+    -----
+    doi:10.1109/TAC.1974.1100705, doi:10.1093/biomet/76.2.297, doi:10.1214/aos/1176344136.
+    """
+    given = whole_number(parameters)
+    if given is None or given < 0:
+        raise ModelError(f"parameters = {parameters!r} is no number of parameters; give a whole number, at least 0")
+    counts = {name: sum(read(r).size for r in output.residuals) for name, output in tests.outputs.items()}
+    samples = sum(counts.values())
+    k = given + tests.initial_terms + len(tests.outputs)
+    likelihood = 0.0
+    for name, output in tests.outputs.items():
+        # A residual of exactly nothing has no finite likelihood.
+        level = 2 * math.log(output.rms) if 0 < output.rms < math.inf else math.copysign(math.inf, output.rms - 1)
+        likelihood -= 0.5 * counts[name] * (math.log(2 * math.pi) + 1 + level)
+    aic = 2 * k - 2 * likelihood
+    left = samples - k - 1
+    aicc = aic + 2 * k * (k + 1) / left if left > 0 else math.inf
+    return InformationCriteria(k, samples, likelihood, aic, aicc, k * math.log(samples) - 2 * likelihood)
+
+
+def information_table(information: InformationCriteria, *, title: str = "Information criteria") -> Table:
+    """Return AIC, AICc and BIC with what they count."""
+    criteria = (("AIC", information.aic), ("AICc", information.aicc), ("BIC", information.bic))
+    # Differences count, not sizes: all digits before the point.
+    rows: list[list[Cell]] = [[name, Exact(round(value, 1))] for name, value in criteria]
+    rows += [["numbers estimated", information.parameters], ["samples", information.samples]]
+    note = (
+        "Lower is better, among models of the same outputs on the same runs. Orders, coefficients, initial terms and "
+        "one noise level an output count as numbers."
+    )
+    return Table(title, ("criterion", "value"), rows, note=note)

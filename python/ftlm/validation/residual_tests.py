@@ -1,0 +1,669 @@
+"""Whether an input answers an output: what Sims's regression on past and future inputs finds in the residuals."""
+
+from __future__ import annotations
+
+import math
+from collections.abc import Mapping, Sequence
+from dataclasses import dataclass, field, replace
+from statistics import NormalDist
+from typing import Any
+
+import numpy as np
+from markupsafe import Markup
+from numpy.typing import NDArray
+
+from ftlm import _core
+from ftlm.data.run import Run, Runs, as_runs
+from ftlm.data.sampling import bridged
+from ftlm.errors import DataError, ModelError
+from ftlm.model.model import Solved, check_solved
+from ftlm.simulation.discretization import compared_values
+from ftlm.simulation.output_samples import Sampled, measured_samples
+from ftlm.svg.html_page import Table
+from ftlm.utils.formatting import Cell, symbol_html
+from ftlm.utils.linalg import dot, orthonormal, projections, triangle, turned_rows
+from ftlm.utils.statistics import (
+    LEVEL,
+    NORMAL_99,
+    autocorrelations,
+    autoregression,
+    chi_squared,
+    chi_squared_99,
+    is_constant,
+    ljung_box,
+    whitened,
+)
+from ftlm.utils.validation import Floats, whole_number
+from ftlm.validation.comparison import finite, free_runs
+
+#: Future samples of the input that are looked at: an answer within a few samples hides among many.
+AHEAD = (5, 25)
+#: Share of open loops that one of the two regressions is allowed to call closed.
+LEVEL_FEEDBACK = 0.01
+#: Past samples that stand by themselves; those before are averaged over ever longer blocks, each wider by this factor.
+DENSE = 25
+WIDER = 1.5
+#: Rows that are looked at: more of them tell the same.
+MOST_ROWS = 50_000
+#: Share of a column that the columns before it must leave.
+SPANNED = 1e-6
+
+
+@dataclass(frozen=True)
+class FeedbackTest:
+    """Whether later inputs tell something of a residual that earlier inputs do not.
+
+    Parameters
+    ----------
+    statistic, limit
+        Sum of squares that later inputs explain in units of the residual's variance, and the value that one open loop
+        in a hundred exceeds.
+    instant
+        Whether only the input of the same sample does: a controller that answers at once, or direct feed-through.
+    decided
+        Whether there were samples enough, and an input that moves.
+    """
+
+    statistic: float
+    limit: float
+    instant: bool
+    decided: bool = True
+
+    @property
+    def found(self) -> bool:
+        """Whether the input answers the output."""
+        return self.decided and self.statistic > self.limit
+
+    def to_dict(self) -> dict[str, Any]:
+        """For JSON."""
+        shown = {"statistic": finite(self.statistic), "limit": finite(self.limit)}
+        return {**shown, "found": self.found, "instant": self.instant, "decided": self.decided}
+
+
+def past_columns(signal: Floats, first: int, reach: int, *, dense: int = DENSE, wider: float = WIDER) -> list[Floats]:
+    """Samples of a signal from ``first`` to ``dense`` rows back, then means of ever longer blocks up to ``reach``.
+
+    What is before the first row counts as the first value, so a reach may be as long as the signal and no longer.
+    """
+    count = signal.size
+    padded = np.concatenate([np.full(count, signal[0]), signal])
+    moved = padded - signal[0]
+    sums = np.concatenate([[0.0], np.cumsum(moved)])
+    columns = [moved[count - lag : 2 * count - lag] for lag in range(first, min(dense, reach) + 1)]
+    start, width = dense + 1, max(2, dense // 4)
+    while start + width <= reach:
+        end = count - start + 1
+        columns.append((sums[end : end + count] - sums[end - width : end - width + count]) / width)
+        start, width = start + width, int(width * wider) + 1
+    return columns
+
+
+def feedback_test(
+    white: Sequence[Floats], signal: Sequence[Floats], others: Sequence[Sequence[Floats]], *, direct: bool
+) -> FeedbackTest:
+    """Regress residuals on past and future of an input: without feedback the future adds nothing (Sims, 1972).
+
+    An input that is made beforehand cannot know the noise, however wrong the model is: what a model leaves out follows
+    the past of the input, of which long memory is taken in.
+
+    Parameters
+    ----------
+    white
+        Residuals, a run each, through the filter that makes them white.
+    signal
+        The input, through the same filter.
+    others
+        Other inputs, whose past may explain the residuals. Their values of the same sample stay out: where one answers
+        at once, it makes whatever drives it look like an answer.
+    direct
+        Whether the model has direct feed-through from this input, so that its value of the same sample is no answer.
+    """
+    table = Regressors.of(white, signal, others)
+    at_once = None if table is None else table.statistic(1 if direct else 0)
+    if table is None or at_once is None:
+        return FeedbackTest(0.0, np.inf, instant=False, decided=False)
+    later = at_once if direct else table.statistic(1)
+    if later is not None and later[0] > later[1]:
+        return FeedbackTest(*later, instant=False)
+    return FeedbackTest(*at_once, instant=at_once[0] > at_once[1])
+
+
+@dataclass(frozen=True)
+class Regressors:
+    """Residuals beside what may explain them, turned so that all rows but as many as there are columns are 0.
+
+    A rotation of the rows leaves every inner product as it is, and with it every least squares.
+
+    Parameters
+    ----------
+    past
+        Earlier samples of the input and of the others, and a constant.
+    now
+        The input's sample of the same row, less its first of that run, as those of the past are.
+    future
+        The input's sample of the same row, then those after it.
+    residuals
+        What is to be explained.
+    rows
+        How many rows there were.
+    """
+
+    past: Floats
+    now: Floats
+    future: Floats
+    residuals: Floats
+    rows: int
+
+    @classmethod
+    def of(
+        cls, white: Sequence[Floats], signal: Sequence[Floats], others: Sequence[Sequence[Floats]]
+    ) -> Regressors | None:
+        """Of residuals and inputs, a run each; None where every run is too short."""
+        parts, rows, width = [], 0, 0
+        sizes = [e.size for e in white if e.size > DENSE + AHEAD[-1]]
+        reach = min(sizes, default=0) // 2
+        for run, (every, driving) in enumerate(zip(white, signal, strict=True)):
+            e, u = every[: MOST_ROWS - rows], driving[: MOST_ROWS - rows]
+            inner = slice(DENSE, e.size - AHEAD[-1])
+            if e.size <= max(DENSE + AHEAD[-1], reach):
+                continue
+            now, *columns = past_columns(u, 0, reach)
+            for other in others:
+                columns += past_columns(other[run][: e.size], 1, reach, dense=10, wider=2.0)
+            columns += [np.ones(e.size), now]
+            width = len(columns) - 1
+            later = [u[DENSE + k : e.size - AHEAD[-1] + k] for k in range(AHEAD[-1] + 1)]
+            parts.append([*(c[inner] for c in columns), *later, e[inner]])
+            rows += e.size
+            if rows >= MOST_ROWS:
+                break
+        if not parts:
+            return None
+        turned = triangle(np.concatenate([turned_rows(part) for part in parts]))
+        count = sum(part[-1].size for part in parts)
+        return cls(turned[:, :width], turned[:, width], turned[:, width + 1 : -1], turned[:, -1], count)
+
+    def statistic(self, first: int) -> tuple[float, float] | None:
+        """What the input from ``first`` samples ahead on, 0 or 1, explains, and its limit, of the better horizon."""
+        past = np.column_stack([self.past, self.now]) if first else self.past
+        future = self.future[:, first:]
+        if self.rows < 2 * (past.shape[1] + future.shape[1]):
+            return None
+        basis = orthonormal(past, SPANNED)
+        left = self.residuals - basis @ projections(basis, self.residuals)
+        own = np.linalg.norm(future, axis=0)
+        future = future - basis @ (basis.T @ future)
+        future = future - basis @ (basis.T @ future)
+        new = np.linalg.norm(future, axis=0) > SPANNED * np.where(own > 0, own, 1.0)
+        worst: tuple[float, float] | None = None
+        for horizon in AHEAD:
+            kept = future[:, : horizon + 1 - first][:, new[: horizon + 1 - first]]
+            if not kept.size:
+                continue
+            seen = orthonormal(kept, SPANNED)
+            explained, total = float(np.sum((seen.T @ left) ** 2)), dot(left, left)
+            rest = (total - explained) / (self.rows - basis.shape[1] - seen.shape[1])
+            if not rest > 0:
+                continue
+            found = explained / rest, chi_squared(seen.shape[1], LEVEL_FEEDBACK / len(AHEAD))
+            if worst is None or found[0] / found[1] > worst[0] / worst[1]:
+                worst = found
+        return worst
+
+
+#: Orders closer than this are one order.
+GRAIN = 1e-9
+#: Residuals below this share of the output's deviation are discretisation or quantisation, not a missing term.
+NEGLIGIBLE = 1e-3
+
+
+@dataclass(frozen=True)
+class CorrelationTest:
+    """Correlations of residuals and whether they could be chance.
+
+    Parameters
+    ----------
+    lags
+        Lags in samples; at a lag k > 0 the residual comes k samples after the other signal.
+    values
+        Correlation at each lag.
+    band
+        Half-width of the 99 % band of one correlation.
+    statistic, limit
+        What is judged, and the value that one true model in a hundred exceeds: for whiteness the Ljung-Box sum over
+        all positive lags, for independence the largest correlation at lags >= 0 against a band for all of them.
+    passed
+        Whether the statistic is within a limit that it could have exceeded; False where the residuals are not finite.
+    decided
+        Whether the test could fail at all. A correlation never exceeds 1: where its limit does, or where the input does
+        not move, nothing is shown, and the test has neither passed nor failed.
+    first
+        Least lag that is judged: 1 where an input answers the output within the sample, 0 else.
+    """
+
+    lags: NDArray[np.int64]
+    values: Floats
+    band: float
+    statistic: float
+    limit: float
+    passed: bool
+    decided: bool = True
+    first: int = 0
+
+    @property
+    def failed(self) -> bool:
+        """Whether the test was decided, and not passed."""
+        return self.decided and not self.passed
+
+    @property
+    def verdict(self) -> str:
+        """``"passed"``, ``"failed"`` or ``"undecided"``."""
+        return "undecided" if not self.decided else "passed" if self.passed else "failed"
+
+    @property
+    def outside(self) -> int:
+        """Number of correlations outside the band (lag 0 of an autocorrelation not counted); 1 % are expected."""
+        return int(np.sum((np.abs(self.values) > self.band) & (self.values != 1.0)))
+
+    @property
+    def largest(self) -> tuple[int, float]:
+        """Lag and value of the largest correlation that the statistic judges."""
+        judged = np.where((self.lags >= self.first) & (self.values != 1.0), np.abs(self.values), -1.0)
+        at = int(np.argmax(judged))
+        return int(self.lags[at]), float(self.values[at])
+
+    def to_dict(self) -> dict[str, Any]:
+        """For JSON."""
+        return {
+            "lags": self.lags.tolist(),
+            "values": list(map(finite, self.values.tolist())),
+            **{n: finite(getattr(self, n)) for n in ("band", "statistic", "limit")},
+            "passed": self.passed,
+            "decided": self.decided,
+        }
+
+
+@dataclass(frozen=True)
+class OutputResiduals:
+    """Residuals of one output over all runs.
+
+    Parameters
+    ----------
+    residuals
+        Measured minus simulated samples, one array a run, without its first and last sample; SI units. NaN where the
+        output was not read.
+    rms
+        Their root mean square over all runs.
+    nr
+        The same divided by the output's standard deviation.
+    whiteness
+        Autocorrelations.
+    inputs
+        Cross-correlations with each input, both through the filter that makes the residuals white.
+    loops
+        By input that its equation reads, whether LATER inputs tell something of a residual that earlier ones do not: a
+        closed loop, not a missing term.
+    """
+
+    residuals: list[Floats]
+    rms: float
+    nr: float
+    whiteness: CorrelationTest
+    inputs: dict[str, CorrelationTest]
+    loops: dict[str, FeedbackTest] = field(default_factory=dict)
+
+    @property
+    def feedback(self) -> tuple[str, ...]:
+        """Inputs that answer this output: the runs were made in a closed loop."""
+        return tuple(name for name, test in self.loops.items() if test.found)
+
+    @property
+    def judged(self) -> dict[str, CorrelationTest]:
+        """Tests of the inputs that move, since one that does not can do nothing; of all where none does."""
+        return {n: t for n, t in self.inputs.items() if t.decided or not math.isnan(t.limit)} or self.inputs
+
+    def to_dict(self) -> dict[str, Any]:
+        """For JSON."""
+        return {
+            "rms": finite(self.rms),
+            "nr": finite(self.nr),
+            "whiteness": self.whiteness.to_dict(),
+            "inputs": {n: t.to_dict() for n, t in self.inputs.items()},
+            "feedback": list(self.feedback),
+            "loops": {n: t.to_dict() for n, t in self.loops.items()},
+        }
+
+
+@dataclass(frozen=True)
+class Residuals:
+    """Residual tests of a model on runs.
+
+    Parameters
+    ----------
+    outputs
+        By output.
+    runs
+        Names of the runs.
+    step
+        Sampling step of each run [s].
+    refinement
+        Pulses a sample interval at which the free run was computed.
+    initial_terms
+        Number of initial terms that were fitted to these runs.
+    """
+
+    outputs: dict[str, OutputResiduals]
+    runs: tuple[str, ...]
+    step: tuple[float, ...]
+    refinement: int
+    initial_terms: int
+
+    @property
+    def white(self) -> dict[str, bool]:
+        """Whether the residuals of each output could be white noise."""
+        return {name: output.whiteness.passed for name, output in self.outputs.items()}
+
+    @property
+    def independent(self) -> dict[str, bool]:
+        """Whether the residuals of each output were found independent of all earlier inputs; not if it is undecided."""
+        return {name: all(t.passed for t in output.judged.values()) for name, output in self.outputs.items()}
+
+    @property
+    def tests(self) -> list[tuple[str, str, CorrelationTest]]:
+        """Every test with its output and its input, which is empty for whiteness."""
+        return [
+            (name, signal, test)
+            for name, output in self.outputs.items()
+            for signal, test in [("", output.whiteness), *output.inputs.items()]
+        ]
+
+    @property
+    def independence(self) -> dict[str, str]:
+        """``"yes"``, ``"no"`` or ``"undecided"`` for each output: whether its residuals are independent."""
+        return {
+            name: "no" if any(t.failed for t in output.inputs.values()) else "yes" if free else "undecided"
+            for (name, output), free in zip(self.outputs.items(), self.independent.values(), strict=True)
+        }
+
+    @property
+    def _judged(self) -> list[CorrelationTest]:
+        return [t for output in self.outputs.values() for t in (output.whiteness, *output.judged.values())]
+
+    @property
+    def passed(self) -> bool:
+        """Whether all residuals pass both tests; False where one is undecided, inputs that do not move apart."""
+        return all(test.passed for test in self._judged)
+
+    @property
+    def decided(self) -> bool:
+        """Whether every test could fail, inputs that do not move apart, or one has failed."""
+        return any(test.failed for test in self._judged) or all(test.decided for test in self._judged)
+
+    @property
+    def verdict(self) -> str:
+        """``"passed"``, ``"FAILED"`` where one test has, or ``"undecided"``."""
+        return "passed" if self.passed else "FAILED" if self.decided else "undecided"
+
+    def to_dict(self) -> dict[str, Any]:
+        """For JSON."""
+        return {
+            "passed": self.passed,
+            "decided": self.decided,
+            "runs": list(self.runs),
+            "refinement": self.refinement,
+            "outputs": {name: output.to_dict() for name, output in self.outputs.items()},
+        }
+
+    def __str__(self) -> str:
+        tests = [(f"{output} and {signal}" if signal else f"{output} alone", t) for output, signal, t in self.tests]
+        width = max(len(label) for label, _ in tests) + 2
+        lines = [
+            f"residual tests at 99 % on {', '.join(self.runs)}: {self.verdict}",
+            f"{'correlation of':<{width}}{'largest':>10}{'at lag':>8}{'band':>10}{'statistic':>12}{'limit':>10}",
+        ]
+        for label, test in tests:
+            lag, value = test.largest
+            lines.append(
+                f"{label:<{width}}{value:>10.3g}{lag:>8}{test.band:>10.3g}{test.statistic:>12.4g}{test.limit:>10.4g}"
+                f"   {test.verdict}"
+            )
+        lines += residual_sentences(self)
+        return "\n".join(lines)
+
+    def _repr_html_(self) -> str:
+        return residuals_html(self)
+
+
+#: Lags of the tests that every identification makes; the convention of the field.
+LAGS = 25
+
+
+def resid(model: Solved, runs: Run | Sequence[Run], *, lags: int = LAGS) -> Residuals:
+    """Test whether the residuals of a model's free run are white, and independent of the inputs.
+
+    Residuals are measured samples minus the free run at the same instants, with initial terms and offsets fitted to
+    each run, on a grid fine enough not to matter. Each run is taken about its own mean; runs are pooled.
+
+    Parameters
+    ----------
+    model
+        The model.
+    runs
+        One run or several with the same names and units, each of at least ``2 * lags + 3`` rows.
+    lags
+        Largest lag in samples; the default is the convention of the field.
+
+    Returns
+    -------
+    Residuals
+        ``.passed`` says both; prints as a table.
+
+    Raises
+    ------
+    DataError
+        Runs that do not fit the model, or are too short for these lags.
+    ModelError
+        A number of lags that is none, an equation that cannot be solved for its output.
+
+    Notes
+    -----
+    Whiteness: the 99 % band of one autocorrelation of white noise is 2.576/√N; the verdict is the sum of Ljung and Box
+    (doi:10.1093/biomet/65.2.297) over all lags against the 99 % quantile of χ². Independence: residuals and input pass
+    the filter that makes the residuals white, an autoregression of least Bayesian information criterion; raw
+    correlations of two slow signals are so wide by chance that a missing dead time hides in them (Box and Jenkins,
+    chapter 11). The filter is causal, so an input that follows the residuals stays later than they are. The variance of
+    one correlation of independent signals is Bartlett's Σρₑ(τ)ρᵤ(τ)/N (doi:10.2307/2983611), taken no smaller than for
+    white residuals; the verdict is the largest correlation at lags >= 0 against the band that holds for all of them
+    together with 99 % (Šidák). Loops: residuals regressed on past and future of each input, both through the
+    same filter; an input that was made beforehand cannot know the noise, however wrong the model (Sims, Money, income,
+    and causality, American Economic Review 62, 1972, 540-552). Where an input answers within a sample, lag 0 is not
+    judged. A limit above 1 decides nothing, nor does an input that does not move. Both tests are of
+    the free run: an equation error that passes proves nothing.
+    """
+    check_solved(model)
+    several = as_runs(runs)
+    count = whole_number(lags)
+    if count is None or count < 1:
+        raise ModelError(f"lags = {lags!r} is no number of lags; give a whole number, at least 1")
+    check_length(several, count)
+    for run in several:
+        run.require_outputs([o for o in model.outputs if o in run])
+    return tested_residuals(model, several, free_runs(model, several), lags=count)
+
+
+def check_length(runs: Runs, lags: int) -> None:
+    """Refuse runs that are too short for these lags."""
+    for run in runs:
+        if run.length < 2 * lags + 3:
+            raise DataError(
+                f"run {run.name!r} has {run.length} rows, correlations up to {lags} lags need {2 * lags + 3}; "
+                "give a longer run or fewer lags"
+            )
+
+
+def tested_residuals(model: Solved, runs: Runs, free: Sequence[Sampled], *, lags: int) -> Residuals:
+    """Both tests of the residuals of free runs at the inner samples of these runs; refuse runs that are too short."""
+    check_length(runs, lags)
+    residuals: dict[str, list[Floats]] = {o: [] for o in model.outputs}
+    for run, sampled in zip(runs, free, strict=True):
+        with np.errstate(invalid="ignore"):
+            missed = measured_samples(model, run, sampled.refinement) - sampled.outputs
+        for name, series in zip(model.outputs, missed, strict=True):
+            residuals[name].append(np.ascontiguousarray(series[1:-1]))
+    read = [s for s in model.structure.signals if s not in model.outputs and s in runs[0]]
+    inputs = list(dict.fromkeys([*runs[0].inputs, *read]))
+    signals = {
+        n: [np.ascontiguousarray(bridged(compared_values(run, model.structure, n))[1:-1]) for run in runs]
+        for n in inputs
+    }
+    outputs = {}
+    for item in model.equations:
+        name = item.output
+        measured = [compared_values(run, model.structure, name) for run in runs]
+        deviation = math.sqrt(float(np.mean([np.nanvar(y) for y in measured])))
+        gaps = [np.isnan(y[1:-1]) for y in measured]
+        direct = {t.signal for t in item.terms if t.order.constant >= item.order.constant - GRAIN}
+        commands = {s: s in direct for s in item.signals if s in runs[0].inputs}
+        outputs[name] = _tested(residuals[name], gaps, signals, lags, deviation, commands)
+    steps, terms = tuple(run.step for run in runs), sum(len(t) for s in free for t in s.initial.values())
+    return Residuals(outputs, tuple(run.name for run in runs), steps, max(s.refinement for s in free), terms)
+
+
+def _tested(
+    series: list[Floats],
+    gaps: list[NDArray[np.bool_]],
+    signals: Mapping[str, list[Floats]],
+    lags: int,
+    deviation: float,
+    commands: Mapping[str, bool],
+) -> OutputResiduals:
+    """Both tests of one output's residuals, and signs of a loop, of those that are there; all fail where not finite.
+
+    Commands are the inputs of the runs, each with whether the model has direct feed-through from it.
+    """
+    everything = np.concatenate([e[~gone] for e, gone in zip(series, gaps, strict=True)])
+    with np.errstate(over="ignore", invalid="ignore"):
+        rms = float(np.sqrt(np.mean(everything**2)))
+    nr = rms / deviation if deviation > 0 else math.inf
+    if not math.isfinite(rms):
+        lost, across = _lost(np.arange(lags + 1)), _lost(np.arange(-lags, lags + 1))
+        return OutputResiduals(series, math.inf, math.inf, lost, dict.fromkeys(signals, across))
+    series = [np.where(gone, np.nan, e) for e, gone in zip(series, gaps, strict=True)]
+    white_test = _whiteness(series, everything.size, lags)
+    # Through this filter the residuals are white, and the inputs lose what they share with them by chance alone.
+    colour = autoregression(series, lags)
+    white = whitened(series, colour)
+    through = {n: whitened(v, colour) for n, v in signals.items() if not is_constant(v)}
+    loops = {
+        name: feedback_test(white, through[name], [v for n, v in through.items() if n != name], direct=direct)
+        for name, direct in commands.items()
+        if name in through
+    }
+    inputs = {}
+    for name, values in signals.items():
+        # What answers within the sample is no sign of what the model lacks.
+        at_once = name in loops and loops[name].found and not commands[name]
+        inputs[name] = _independence(white, values, colour, lags, first=int(at_once))
+    return OutputResiduals(series, rms, nr, white_test, inputs, loops)
+
+
+def _lost(lags: NDArray[np.int64]) -> CorrelationTest:
+    """Return a test that nothing passes: there are no correlations."""
+    return CorrelationTest(lags, np.full(lags.size, math.nan), math.nan, math.inf, math.nan, passed=False)
+
+
+def _whiteness(series: list[Floats], count: int, lags: int) -> CorrelationTest:
+    """Ljung and Box's sum against its limit."""
+    limit = chi_squared_99(lags)
+    own, pairs = autocorrelations(series, lags)
+    statistic = ljung_box(own, pairs)
+    band = NORMAL_99 / math.sqrt(count)
+    return CorrelationTest(np.arange(lags + 1), own, band, statistic, limit, passed=statistic <= limit)
+
+
+def _independence(
+    white: list[Floats], signal: list[Floats], colour: Floats, lags: int, *, first: int
+) -> CorrelationTest:
+    """Largest correlation at lags from ``first`` on against the band that holds for all of them together."""
+    around = np.arange(-lags, lags + 1)
+    if is_constant(signal):
+        return CorrelationTest(around, np.zeros(around.size), math.nan, 0.0, math.nan, passed=False, decided=False)
+    cross, variance, _ = _core.correlation(white, whitened(signal, colour), lags)
+    spread, largest = math.sqrt(variance), float(np.max(np.abs(cross[lags + first :])))
+    limit = NormalDist().inv_cdf(1 - (1 - (1 - LEVEL) ** (1 / (lags + 1 - first))) / 2) * spread
+    decided = limit < 1.0
+    passed = decided and largest <= limit
+    return CorrelationTest(around, cross, NORMAL_99 * spread, largest, limit, passed, decided, first)
+
+
+def residual_sentences(tests: Residuals) -> list[str]:
+    """Every failed test in words, and signs of feedback."""
+    words = []
+    for name, output in tests.outputs.items():
+        if not math.isfinite(output.rms):
+            words.append(f"{name}: the free run leaves the range of numbers, so its residuals cannot be tested")
+            continue
+        white = output.whiteness
+        if not white.passed:
+            words.append(
+                f"{name}: residuals are not white (Ljung-Box {white.statistic:.3g} over {white.lags[-1]} lags, 99 % "
+                f"limit {white.limit:.3g}): the model leaves something out"
+            )
+        for signal, test in output.judged.items():
+            lag, value = test.largest
+            if not test.decided:
+                why = f"its limit is {test.limit:.3g}: too few samples for residuals of this colour; give a longer run"
+                if math.isnan(test.limit):
+                    why = f"{signal} does not move; give a run in which it does"
+                words.append(f"{name}: whether residuals follow {signal} is undecided: {why}")
+            elif not test.passed:
+                words.append(
+                    f"{name}: residuals still follow {signal} (correlation {value:.2g} at lag {lag}, 99 % limit "
+                    f"{test.limit:.2g}): not all of what {signal} does is in the model"
+                )
+        words += [loop_sentence(name, signal, output) for signal in output.feedback]
+    return words
+
+
+def loop_sentence(name: str, signal: str, output: OutputResiduals) -> str:
+    """What a closed loop found in residuals means for what was estimated."""
+    test = output.loops[signal]
+    how = f"{signal} answers what {name} did before" if not test.instant else f"{signal} answers {name} within a sample"
+    or_else = "" if not test.instant else f" (or {signal} feeds through to {name} directly: then add that term)"
+    found = f"{name}: {how} (statistic {test.statistic:.3g}, 99 % limit {test.limit:.3g}): a closed loop{or_else}"
+    if output.whiteness.passed:
+        return f"{found}; with white residuals output error has no bias from it, equation-error methods have"
+    return (
+        f"{found}, and residuals are not white: the noise that comes back with {signal} biases estimates, which their "
+        "intervals do not know; record what drives the loop and name it with reference=, or open the loop"
+    )
+
+
+def residual_warnings(tests: Residuals, *, floor: float = NEGLIGIBLE) -> list[str]:
+    """Failed residual tests in words, without those of outputs that are explained to within ``floor`` of their size.
+
+    A closed loop counts where residuals are not white: only then does it bias the output error.
+    """
+    kept = {name: output for name, output in tests.outputs.items() if not output.nr <= floor}
+    harmless = {n: replace(output, loops={}) if output.whiteness.passed else output for n, output in kept.items()}
+    return residual_sentences(replace(tests, outputs=harmless))
+
+
+def residual_table(tests: Residuals, *, title: str = "Residual tests") -> Table:
+    """Return every residual test with its statistic and limit."""
+    rows: list[list[Cell]] = []
+    for name, output in tests.outputs.items():
+        judged = [(Markup("whiteness"), output.whiteness)]
+        judged += [(Markup("independence of {}").format(symbol_html(n)), t) for n, t in output.inputs.items()]
+        rows += [[symbol_html(name), what, t.statistic, t.limit, t.verdict] for what, t in judged]
+    note = (
+        "Whiteness: Ljung-Box sum over all lags. Independence: largest correlation at lags from 0 on, residual and "
+        "input through the filter that whitens the residual. One true model in a hundred fails each. Undecided: the "
+        "test could not have failed."
+    )
+    return Table(title, ("output", "test", "statistic", "limit (99 %)", "verdict"), rows, note=note)
+
+
+def residuals_html(tests: Residuals) -> str:
+    """Return every residual test with its verdict."""
+    return str(residual_table(tests, title=f"Residual tests: {', '.join(tests.runs)}").to_html())
