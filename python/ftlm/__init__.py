@@ -1,8 +1,6 @@
 """Fractional-order models of flexible machines from measured data.
 
-Names are imported when they are first asked for: all of them together take longer than numpy does. Where each lives is
-the way of a measurement: data, files, solve, judge, fit, model, search, identification, selection, excitation, and
-beside it arm, rig, paper.
+Public names are imported on first use, because importing all of them takes longer than NumPy.
 """
 
 import importlib as _importlib
@@ -152,7 +150,7 @@ __all__ = [
     "simulate",
 ]
 
-#: Where each name lives.
+#: Module of each public name.
 _HOMES = {
     name: home
     for home, names in {
@@ -200,7 +198,7 @@ _HOMES = {
     }.items()
     for name in names.split()
 }
-#: Modules that are asked for as attributes.
+#: Public modules that are attributes of the package.
 _MODULES = frozenset(
     {
         "control",
@@ -218,7 +216,7 @@ _MODULES = frozenset(
 
 
 def __getattr__(name: str) -> object:
-    """A public name, or a module such as `ftlm.rig`, imported when it is first asked for."""
+    """Import a public name or module, such as `ftlm.rig`, on first use."""
     if name in _HOMES:
         value = getattr(_importlib.import_module(f"ftlm.{_HOMES[name]}"), name)
     elif name in _MODULES:

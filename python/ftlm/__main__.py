@@ -1,4 +1,4 @@
-"""``ftlm`` and ``python -m ftlm``: the command line, whose imports take a moment that may be interrupted as well."""
+"""Entry point of ``ftlm`` and ``python -m ftlm``; an interrupt during its imports ends it cleanly."""
 
 import os
 import signal
@@ -12,7 +12,7 @@ def _leave(*_: object) -> None:
     os._exit(130)
 
 
-# An exception in the middle of an import may become any other one on its way through libraries.
+# Libraries may convert a KeyboardInterrupt during an import to another exception.
 _OURS = (
     signal.getsignal(signal.SIGINT) is signal.default_int_handler
     and threading.current_thread() is threading.main_thread()

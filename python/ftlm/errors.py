@@ -1,4 +1,4 @@
-"""Every error ftlm raises: the thing, the first bad index, the count and the way out."""
+"""Exception classes. Messages name the object, the first bad index, the count and the remedy."""
 
 from __future__ import annotations
 
@@ -6,26 +6,26 @@ from typing import Any
 
 
 class FtlmError(Exception):
-    """Base of all errors that ftlm raises on purpose."""
+    """Base class of all exceptions of ftlm."""
 
 
 class DataError(FtlmError, ValueError):
-    """Data that cannot be used as given: a file, a column, a sample, a unit."""
+    """Unusable data: a file, a column, a sample, a unit."""
 
 
 class ModelError(FtlmError, ValueError):
-    """A model, an equation, an order or a lattice that cannot be used as given."""
+    """Unusable model, equation, order, order grid or option."""
 
 
 class ConvergenceError(FtlmError):
-    """An estimator that ended without an answer that can be trusted."""
+    """Estimation that ended without a reliable result."""
 
 
 class RigFault(FtlmError):  # noqa: N818 — a fault, as people at a rig say
-    """A fault of the rig, with its cause in words; `run` is what was recorded until then, if three rows were."""
+    """Fault of the rig; `run` holds the samples recorded until then, if there were at least three."""
 
     run: Any = None
 
 
 class InternalError(FtlmError):
-    """A fault in ftlm itself; please report it with the message."""
+    """Defect of ftlm itself; please report it with the message."""

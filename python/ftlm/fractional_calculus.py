@@ -1,4 +1,4 @@
-"""Fractional integrals and derivatives of signals, and the operational matrices of the literature."""
+"""Fractional integrals and derivatives of arrays, and Haar and block-pulse operational matrices."""
 
 from __future__ import annotations
 

@@ -1,4 +1,4 @@
-"""Progress of long work on standard error: a bar with rate and time left, shown only where a person can see it."""
+"""Progress of long computations on standard error: bars with rate and time left on terminals, cancellation."""
 
 from __future__ import annotations
 
@@ -13,24 +13,24 @@ from typing import Any
 from rich.progress import Progress as RichProgress
 from rich.progress import TaskID
 
-#: Work that ends sooner needs no bar.
+#: Work that ends sooner shows no bar.
 PATIENCE = 1.0
-#: Who waits longer than this [s] wants to know beforehand how long.
+#: Work that takes longer [s] is announced with its estimated duration.
 WONDER = 2.0
-#: Columns that a bar and its label keep, and from which on a terminal has room for the count of all candidates.
+#: Smallest width of a bar and of its label, and terminal width from which the count of candidates is shown [columns].
 LEAST_BAR, LEAST_LABEL, ROOMY = 10, 12, 100
 
 
 class Parts(int):
-    """A total that stands for a whole, of which a person wants to know the share, not the count."""
+    """Total that stands for a whole: the bar shows a percentage instead of a count."""
 
 
-#: Work without a count of its own is told in so many parts.
+#: Total of work without a natural count.
 PARTS = Parts(1000)
 
 
 def left_in_words(seconds: float) -> str:
-    """Time left as a person says it: what is behind tells it to a digit, not to a second."""
+    """Return the time left as text with one digit."""
     if seconds < 90:
         return f"about {rounded(seconds):g} s left"
     if seconds < 5400:
@@ -39,7 +39,7 @@ def left_in_words(seconds: float) -> str:
 
 
 def expected_in_words(least: float, most: float) -> str:
-    """How long work takes [s] as far as is known beforehand: about so long, between two times, or up to one."""
+    """Return an estimated duration [s] as text: about one value, a range, or an upper bound."""
     low, high = left_in_words(least).split(" ")[1:3], left_in_words(most).split(" ")[1:3]
     if low == high:
         return f"about {' '.join(high)}"
@@ -55,12 +55,12 @@ def rounded(value: float) -> float:
 
 
 class Course:
-    """The share of a whole that is done, of work whose parts do not know each other; it never goes back.
+    """Share of completed work with independent parts; it never decreases.
 
     Parameters
     ----------
     told
-        Called with (parts done, ``PARTS``); None for nobody.
+        Called with (parts done, ``TOTAL_PARTS``); None for no reports.
     """
 
     def __init__(self, told: Callable[[int, int], None] | None) -> None:
@@ -69,7 +69,7 @@ class Course:
         self._said = -1
 
     def at(self, share: float) -> None:
-        """So much of the whole is done."""
+        """Report that this share of the whole is done."""
         self.reached = max(self.reached, min(share, 1.0))
         parts = round(PARTS * self.reached)
         if self._told is not None and parts > self._said:
@@ -77,9 +77,9 @@ class Course:
             self._told(parts, PARTS)
 
     def until(self, share: float, sweep: float = 0.5) -> Callable[[int, int], None]:
-        """What a part that ends at this share of the whole is to call with (done, total).
+        """Return a callback (done, total) for a part of the work that ends at this share of the whole.
 
-        Where it begins to count anew, each sweep takes the same share of what is left.
+        If the part restarts its count, each pass takes the same share of the remainder.
         """
         begun, last = self.reached, 0.0
 
@@ -95,14 +95,14 @@ class Course:
 
 
 class _Bars:
-    """The bars of one job: rich draws one display at a time, and several threads may report to it."""
+    """Progress bars of one job on a shared display, updated from several threads."""
 
     def __init__(self) -> None:
         self._lock = threading.Lock()
         self._shown: RichProgress | None = None
 
     def start(self, total: int | None) -> TaskID:
-        """Add a bar, whose label comes with its first figures."""
+        """Add a bar; its label appears with the first figures."""
         from rich.console import Console  # noqa: PLC0415 — only a terminal needs it
         from rich.progress import BarColumn, Progress, TextColumn  # noqa: PLC0415
 
@@ -121,7 +121,7 @@ class _Bars:
             return self._shown.add_task("", total=total, counted="", pruned="", left="")
 
     def update(self, task: TaskID, **state: Any) -> None:
-        """Move a bar; its label is cut where bar and figures need the line."""
+        """Update a bar; its label is truncated to the width of the line."""
         with self._lock:
             if self._shown is not None:
                 figures = (str(state.get(name, "")) for name in ("counted", "pruned", "left"))
@@ -137,7 +137,7 @@ class _Bars:
             return 0 if self._shown is None else self._shown.console.width
 
     def drop(self, task: TaskID) -> None:
-        """Remove a bar, and with the last one the display."""
+        """Remove a bar, and the display with the last one."""
         with self._lock:
             if self._shown is None:
                 return
@@ -150,12 +150,12 @@ class _Bars:
 
 
 class Progress:
-    """Context manager whose instances are called with (done, total), or (done, total, pruned).
+    """Progress bar, a context manager to be called with (done, total) or (done, total, pruned).
 
     Parameters
     ----------
     label
-        What is going on.
+        Description of the work.
     quiet
         Whether to show nothing.
     """
@@ -171,7 +171,7 @@ class Progress:
         return self
 
     def __call__(self, done: int, total: int, pruned: int | None = None) -> None:
-        """Show that ``done`` of ``total`` candidates are dealt with, ``pruned`` of them before their end."""
+        """Show ``done`` of ``total`` candidates, ``pruned`` of them excluded early."""
         if self._quiet or time.monotonic() - self._start < PATIENCE or total == 0:
             return
         if self._task is None:
@@ -191,13 +191,13 @@ class Progress:
             self._stop()
 
     def beside(self) -> Progress:
-        """Another bar on the same display, for work that another thread does at the same time."""
+        """Return another bar on the same display, for work in another thread."""
         other = Progress(self._label, quiet=self._quiet)
         other._bars = self._bars
         return other
 
     def so_far(self, done: int, known: int) -> None:
-        """Show how much is done of work that grows as it is done: nobody knows its end, so none is shown."""
+        """Show progress of work whose total is not known."""
         passed = time.monotonic() - self._start
         if self._quiet or passed < PATIENCE:
             return
@@ -208,21 +208,21 @@ class Progress:
 
     @property
     def quiet(self) -> bool:
-        """Whether nobody sees it."""
+        """Whether nothing is shown."""
         return self._quiet
 
     def expect(self, what: str, least: float, most: float | None = None) -> None:
-        """Say beforehand about how long it takes, or between which times [s], where that is long enough to wonder."""
+        """Announce the estimated duration, or its range [s], of long work."""
         most = least if most is None else most
         if not self._quiet and most >= WONDER:
             print(f"{what} takes {expected_in_words(least, most)}; Ctrl-C ends it", file=sys.stderr)
 
     def name(self, label: str) -> None:
-        """Name what comes next on the bar alone."""
+        """Set the label of the bar."""
         self._label = label
 
     def say(self, label: str) -> None:
-        """Name what comes next."""
+        """Set the label of the bar and print it."""
         self.name(label)
         if not self._quiet:
             print(label, file=sys.stderr)
@@ -240,14 +240,14 @@ class Progress:
 
 
 class Stoppable(Progress):
-    """Passes on what another thread reports, and ends that thread's work once it shall stop.
+    """Progress forwarded from another thread, with cancellation of that thread's work.
 
     Parameters
     ----------
     told
-        Who is told.
+        Receiver of the reports.
     stop
-        Set to end the work with KeyboardInterrupt at its next report: signals reach the main thread alone.
+        Event that ends the work with KeyboardInterrupt at its next report; signals reach the main thread only.
     """
 
     def __init__(self, told: Callable[[int, int], None] | None, stop: threading.Event) -> None:
@@ -256,7 +256,7 @@ class Stoppable(Progress):
         self._ended = stop
 
     def __call__(self, done: int, total: int, pruned: int | None = None) -> None:
-        """Report, or end."""
+        """Forward a report, or raise KeyboardInterrupt."""
         if self._ended.is_set():
             raise KeyboardInterrupt
         if isinstance(self._told, Progress):

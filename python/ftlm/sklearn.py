@@ -1,4 +1,4 @@
-"""An estimator for scikit-learn: structures fitted to rows in time, free runs as predictions."""
+"""FractionalRegressor: scikit-learn estimator of fractional-order models."""
 
 from __future__ import annotations
 
@@ -23,7 +23,7 @@ except ImportError:
 
 
 class FractionalRegressor(_base.MultiOutputMixin, _base.RegressorMixin, _base.BaseEstimator):  # type: ignore[misc, name-defined]
-    """A fractional-order model as an estimator of scikit-learn: rows are instants, a prediction is a free run.
+    """scikit-learn estimator of a fractional-order model; a prediction is a simulation.
 
     Parameters
     ----------
@@ -75,7 +75,7 @@ class FractionalRegressor(_base.MultiOutputMixin, _base.RegressorMixin, _base.Ba
         self.threads = threads
 
     def fit(self, X: Any, y: Any) -> FractionalRegressor:
-        """Identify the structure from rows in time.
+        """Identify the structure from rows ordered in time.
 
         Parameters
         ----------
@@ -107,7 +107,7 @@ class FractionalRegressor(_base.MultiOutputMixin, _base.RegressorMixin, _base.Ba
         return self
 
     def predict(self, X: Any) -> Floats:
-        """Free run on rows of inputs, shape (n,) or (n, outputs) as y was."""
+        """Simulate rows of inputs; returns shape (n,) or (n, outputs), as y had."""
         _validation.check_is_fitted(self)
         X = _validation.validate_data(self, X, reset=False, dtype=np.float64)
         before = 0
@@ -123,7 +123,7 @@ class FractionalRegressor(_base.MultiOutputMixin, _base.RegressorMixin, _base.Ba
         return out[:, 0] if self._flat else out
 
     def _structure(self, inputs: int, outputs: int) -> Structure:
-        """The structure with the orders that are asked for."""
+        """Return the structure with the requested orders."""
         if not isinstance(self.structure, (str, Structure)):
             raise ModelError(
                 f"structure is {type(self.structure).__name__}; give an equation in words or a structure, or 'auto'"

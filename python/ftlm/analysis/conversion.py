@@ -1,4 +1,4 @@
-"""Models as text for other tools: python-control, MATLAB with FOMCON, JSON."""
+"""Conversion of models to and from other tools: python-control, MATLAB with FOMCON, JSON."""
 
 from __future__ import annotations
 
@@ -22,13 +22,13 @@ from ftlm.utils.validation import Floats
 
 
 def _comment(text: str, mark: str) -> str:
-    """Text as comment lines: nothing in a name can begin a line of code."""
+    """Return a text as comment lines, so that no name can start a line of code."""
     lines = re.split(r"[\r\n\u2028\u2029\x0b\x0c\x85]+", text)
     return "\n".join(f"{mark} {''.join(c if c.isprintable() else '?' for c in line)}" for line in lines)
 
 
 def json_text(model: Solved) -> str:
-    """The transfer functions of a model as JSON, exact in powers and coefficients.
+    """Return the transfer functions of a model as JSON, exact in powers and coefficients.
 
     Parameters
     ----------
@@ -62,7 +62,7 @@ def json_text(model: Solved) -> str:
 
 
 def matlab_text(model: Solved) -> str:
-    """A MATLAB script: the transfer functions as vectors, and as FOMCON's ``fotf`` objects where FOMCON is there.
+    """Return a MATLAB script with the transfer functions as vectors, and as FOMCON ``fotf`` objects if available.
 
     Parameters
     ----------
@@ -113,7 +113,7 @@ def matlab_text(model: Solved) -> str:
 
 
 def control_text(model: Solved, *, band: tuple[float, float], order: int = 5) -> str:
-    """A Python script that makes the python-control system, without ftlm.
+    """Return a Python script that builds the python-control system without ftlm.
 
     Parameters
     ----------
@@ -155,7 +155,7 @@ def control_text(model: Solved, *, band: tuple[float, float], order: int = 5) ->
 def export_text(
     model: Solved, to: Literal["control", "matlab", "json"], *, band: tuple[float, float] | None = None, order: int = 5
 ) -> str:
-    """A model as text for another tool; refuses another one, and no band where one is needed."""
+    """Return a model as text for another tool; raise ModelError for an unknown tool or a missing band."""
     if to == "json":
         return json_text(model)
     if to == "matlab":
@@ -167,7 +167,7 @@ def export_text(
     return control_text(model, band=band, order=order)
 
 
-#: Share of the largest number that went into it below which a Markov parameter is rounding.
+#: Size of a Markov parameter, relative to its factors, below which it is rounding error.
 ROUNDING = 1e-12
 _LABEL = re.compile(r"([A-Za-z]+)\[(\d+)\]")
 
@@ -197,7 +197,7 @@ def structure_of(system: Any, inputs: Sequence[str] | None = None, outputs: Sequ
 
 
 def _written(output: str, inputs: Sequence[str], bottom: Floats, tops: Sequence[Floats]) -> str:
-    """An equation in words: D^n y = … from a denominator and a numerator an input, highest powers first."""
+    """Return an equation D^n y = … as text, from a denominator and one numerator per input, highest powers first."""
     order = bottom.size - 1
     if not 0 < order <= MAX_ORDER:
         raise ModelError(f"{output} is of order {order}; an equation has an order from 1 to {MAX_ORDER:g}")
@@ -213,7 +213,7 @@ def _written(output: str, inputs: Sequence[str], bottom: Floats, tops: Sequence[
 
 
 def _of_fractions(tops: Any, bottoms: Any) -> list[tuple[Floats, list[Floats]]]:
-    """A common monic denominator of each output, and the numerators over it."""
+    """Return a common monic denominator of each output, and the numerators over it."""
     found = []
     for top, bottom in zip(tops, bottoms, strict=True):
         own = [np.trim_zeros(np.atleast_1d(np.asarray(d, dtype=float)), "f") for d in bottom]
@@ -239,7 +239,7 @@ def _product(factors: Sequence[Floats]) -> Floats:
 
 
 def _of_states(a: Floats, b: Floats, c: Floats, d: Floats) -> list[tuple[Floats, list[Floats]]]:
-    """By Leverrier's recursion: C adj(sI - A) B + D det(sI - A), what rounding left above the first answer dropped."""
+    """Return C adj(sI - A) B + D det(sI - A) by Leverrier's recursion, without leading rounding errors."""
     count = a.shape[0]
     bottom, powers = [1.0], [np.eye(count)]
     for k in range(1, count + 1):
@@ -264,7 +264,7 @@ def _of_states(a: Floats, b: Floats, c: Floats, d: Floats) -> list[tuple[Floats,
 
 
 def _names(what: str, given: Sequence[str] | None, labels: Sequence[str] | None, count: int) -> list[str]:
-    """Names of signals: as given, or the system's own, u[0] as u0, or as u where it is the only one."""
+    """Return signal names: given ones, or the labels of the system with u[0] as u0, or as u if it is the only one."""
     if given is not None:
         names = [given] if isinstance(given, str) else list(given)
         if len(names) != count:

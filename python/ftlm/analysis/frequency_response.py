@@ -1,4 +1,4 @@
-"""A model in the frequency domain: transfer functions, exact response, its uncertainty, steps."""
+"""Frequency response: transfer functions, exact response, its standard deviation, step response."""
 
 from __future__ import annotations
 
@@ -23,16 +23,16 @@ from ftlm.utils.validation import Complex, Floats, check_choice
 
 #: A sum of coefficient * s^power, by power.
 Polynomial: TypeAlias = dict[float, float]
-#: Powers closer than this are one power.
+#: Difference below which two powers of s count as equal.
 GRAIN = 1e-9
-#: A coefficient that cancels to this share of what was added is rounding.
+#: Size of a sum of coefficients, relative to its summands, below which it is rounding error.
 CANCELLED = 1e-13
 #: Relative step of the numerical derivatives of the delta method.
 DELTA = 1e-6
 
 
 def check_unlimited(model: Solved, what: str) -> None:
-    """Refuse saturations and dead zones where only what is linear is known."""
+    """Raise ModelError for a saturation or a dead zone in a linear analysis."""
     for limit in model.structure.limits:
         raise ModelError(
             f"{limit.signal} passes a {WORDS[limit.law]} before it acts, which {what} does not know; use free runs "
@@ -41,7 +41,7 @@ def check_unlimited(model: Solved, what: str) -> None:
 
 
 def response_inputs(model: Solved, *, coupled: bool) -> tuple[str, ...]:
-    """Signals that drive the response: all that are not modelled; where each equation is alone, modelled ones, too."""
+    """Input signals of the response: all but the outputs; of uncoupled equations, other outputs too."""
     if coupled:
         return tuple(s for s in model.structure.signals if s not in model.outputs)
     read = [t.signal for e in model.equations for t in e.terms if t.signal != e.output]
@@ -62,7 +62,7 @@ def _times(a: Polynomial, b: Polynomial) -> Polynomial:
 
 
 def row_of(item: Equation, names: Sequence[str]) -> tuple[list[Polynomial], dict[str, Polynomial]]:
-    """D^alpha y - own and coupled terms, by output; every other signal's terms."""
+    """Return polynomials of D^alpha y minus own and coupled terms, by output, and those of every other signal."""
     check_linear([item], "a frequency response")
     left: list[Polynomial] = [{} for _ in names]
     right: dict[str, Polynomial] = {}
@@ -77,7 +77,7 @@ def row_of(item: Equation, names: Sequence[str]) -> tuple[list[Polynomial], dict
 
 
 def determinant(matrix: list[list[Polynomial]]) -> Polynomial:
-    """Sum over permutations: exact in the powers, and there are never more than a few outputs."""
+    """Determinant by permutations: exact in the powers, for a few outputs."""
     n = len(matrix)
     out: Polynomial = {}
     size: Polynomial = {}
@@ -95,16 +95,16 @@ def determinant(matrix: list[list[Polynomial]]) -> Polynomial:
 
 @dataclass(frozen=True)
 class TransferFunctions:
-    """Every input to every output as a quotient of sums of coefficient * s^power, exact in powers and coefficients.
+    """Transfer functions from every input to every output, exact in powers and coefficients.
 
     Parameters
     ----------
     outputs, inputs
         Names.
     denominator
-        (coefficient, power) pairs, highest power first, of the outputs that hang together: one for each output.
+        (coefficient, power) pairs by output, highest power first; coupled outputs share it.
     numerators
-        The same by output and input; empty where an input does not reach an output.
+        The same by output and input; empty if an input has no effect on an output.
     delay
         Delay of each input [s].
     """
@@ -117,7 +117,7 @@ class TransferFunctions:
 
 
 def systems(model: Solved, *, coupled: bool) -> list[tuple[str, ...]]:
-    """Outputs whose equations are solved together."""
+    """Groups of outputs whose equations are solved together."""
     return [model.outputs] if coupled else [(o,) for o in model.outputs]
 
 
@@ -129,8 +129,8 @@ def transfer_functions(model: Solved, *, coupling: str = "simulated") -> Transfe
     model
         The model.
     coupling
-        ``"simulated"``: the equations together, driven by what is not modelled. ``"measured"``: each equation alone,
-        the other outputs among its inputs.
+        ``"simulated"``: coupled equations, with all signals but the outputs as inputs. ``"measured"``: each equation
+        alone, with the other outputs among its inputs.
 
     Returns
     -------
@@ -167,13 +167,13 @@ def _written(polynomial: Polynomial) -> tuple[tuple[float, float], ...]:
 
 
 def is_coupled(coupling: str) -> bool:
-    """Whether all equations act together; refuses what is no coupling."""
+    """Whether all equations are coupled; raises ModelError for an unknown coupling."""
     check_choice("coupling", coupling, ("simulated", "measured"))
     return coupling == "simulated"
 
 
 def frequency_response(model: Solved, w: ArrayLike, *, coupling: str = "simulated", sensor: bool = True) -> Complex:
-    """Exact frequency response, orders as they are.
+    """Exact frequency response with fractional orders.
 
     Parameters
     ----------
@@ -182,17 +182,17 @@ def frequency_response(model: Solved, w: ArrayLike, *, coupling: str = "simulate
     w
         Angular frequencies [rad/s], shape (W,), finite, >= 0.
     coupling
-        ``"simulated"``: the equations together, from the signals that are not modelled. ``"measured"``: each equation
-        alone, the other outputs among its inputs (in the order of ``model.structure.signals``).
+        ``"simulated"``: coupled equations, with all signals but the outputs as inputs. ``"measured"``: each equation
+        alone, with the other outputs among its inputs (in the order of ``model.structure.signals``).
     sensor
-        Whether signals are those that are measured: an output passes the sensor filter that it is measured through,
-        and the response to an input that passed it is that much larger.
+        Whether signals are measured ones: filtered outputs pass the sensor filter, and the response to a filtered input
+        is divided by the filter.
 
     Returns
     -------
     ndarray of complex, shape (outputs, inputs, W)
-        In SI units of output over input. Infinite where the model has a pole at that frequency. A Coulomb signal
-        counts as an input; what it does to the angle is not linear and not in here.
+        In SI units of output over input; infinite at a pole. A Coulomb signal counts as an input; its nonlinear effect
+        on the angle is not included.
 
     Raises
     ------
@@ -259,12 +259,12 @@ def value_at(polynomial: Polynomial, s: NDArray[Any]) -> Complex:
 
 
 def response_deviation(model: Solved, w: ArrayLike, *, coupling: str = "simulated") -> tuple[Floats, Floats]:
-    """Standard deviations of the frequency response from those of the model's numbers, by the delta method.
+    """Standard deviations of the frequency response, from the covariance of the model by the delta method.
 
     Parameters
     ----------
     model
-        With the covariance of an output-error fit (``model.estimate``).
+        Model with the covariance of an output-error fit (``model.estimate``).
     w, coupling
         See :func:`frequency_response`.
 
@@ -303,7 +303,7 @@ def response_deviation(model: Solved, w: ArrayLike, *, coupling: str = "simulate
 
 
 def model_numbers(model: Solved) -> Floats:
-    """Every number of a model in one vector: of each equation alpha, then order and coefficient of each term."""
+    """All numbers of a model as a vector: alpha of each equation, then order and coefficient of each term."""
     numbers: list[float] = []
     for item in model.equations:
         numbers += [item.order.constant, *(v for t in item.terms for v in (t.order.constant, float(t.fixed or 0.0)))]
@@ -311,7 +311,7 @@ def model_numbers(model: Solved) -> Floats:
 
 
 def with_numbers(model: Solved, numbers: Floats) -> Solved:
-    """Return the model with other numbers in the order of :func:`model_numbers`."""
+    """Return the model with other numbers, in the order of :func:`parameter_vector`."""
     at = iter(numbers.tolist())
     equations = []
     for item in model.equations:
@@ -325,23 +325,23 @@ def with_numbers(model: Solved, numbers: Floats) -> Solved:
 
 
 def _unchecked(item: Equation, order: Order, terms: tuple[Term, ...]) -> Equation:
-    """An equation whose orders may lie a hair outside of what a person may write, as a derivative at an edge needs."""
+    """Return an equation without range checks of its orders, for derivatives at an end of the range."""
     new = copy.copy(item)
     vars(new).update(order=order, terms=terms)
     return new
 
 
 def step_response(model: Solved, time: ArrayLike, *, tolerance: float = 1e-6) -> Floats:
-    """Response of every output to a unit step of every input that is not modelled, from rest.
+    """Response of every output to a unit step of every input, from rest.
 
     Parameters
     ----------
     model
-        The model; its equations act together.
+        The model; its equations are coupled.
     time
-        Regular instants from 0 [s], shape (N,), N >= 3.
+        Uniform time points from 0 [s], shape (N,), N >= 3.
     tolerance
-        Of the free run; see :func:`ftlm.simulate`.
+        Tolerance of the simulation; see :func:`ftlm.simulate`.
 
     Returns
     -------

@@ -1,4 +1,4 @@
-"""Poles of a model, and whether it is stable."""
+"""Poles, zeros, stability, modes and steady-state gain of a model."""
 
 from __future__ import annotations
 
@@ -29,18 +29,18 @@ from ftlm.utils.formatting import with_error
 from ftlm.utils.statistics import NORMAL_95
 from ftlm.utils.validation import Complex, Floats
 
-#: Largest degree of the polynomial in s^q whose roots double precision gives.
+#: Maximum degree of a polynomial in s^q with accurate roots in double precision.
 LARGEST_DEGREE = 100
-#: Smallest common base of orders that is looked for.
+#: Minimum common base of orders.
 SMALLEST_BASE = 0.01
-#: Beyond these frequencies the lowest and the highest power decide to within this share.
+#: Relative size of all other terms at which the lowest or the highest power dominates.
 DECIDED = 1e-3
-#: Largest turn between two points of the Nyquist curve [rad], and most points.
+#: Maximum angle between two points of the Nyquist curve, and maximum number of points.
 LARGEST_TURN = 0.2
 MOST_POINTS = 200_000
-#: Logarithm of the frequency that stands for those beyond the range of numbers.
+#: Logarithm of the frequency used in case of overflow.
 FARTHEST_LOG = 600.0
-#: A Nyquist curve that comes this close to 0, in units of its own terms, has a pole on the axis as far as one can tell.
+#: Distance of the Nyquist curve from 0, relative to its terms, below which a pole is on the axis.
 ON_AXIS = 1e-9
 
 
@@ -218,9 +218,9 @@ def stability(model: Solved, *, coupling: str = "simulated") -> Stability:
 
 
 def right_zeros(polynomial: Polynomial, angle: float = math.pi / 2) -> tuple[float, bool]:
-    """Number of zeros right of the imaginary axis by the argument principle, and whether one lies on the axis.
+    """Number of zeros right of the imaginary axis by the argument principle, and whether one is on the axis.
 
-    Or, with another angle [rad], of those whose argument is smaller: on the surface of ln s it may exceed pi.
+    Another angle [rad] counts the zeros with a smaller argument; on the surface of ln s it may exceed pi.
     """
     lowest, highest = min(polynomial), max(polynomial)
     if highest - lowest < GRAIN:
@@ -229,7 +229,7 @@ def right_zeros(polynomial: Polynomial, angle: float = math.pi / 2) -> tuple[flo
     values = np.array(list(polynomial.values()))
 
     def shares(at: float, omega: float) -> float:
-        """What all other terms weigh beside the term of one power."""
+        """Size of all other terms relative to the term of one power."""
         sizes = np.abs(values) * omega ** (powers - at)
         return float((np.sum(sizes) - abs(polynomial[at])) / abs(polynomial[at]))
 
@@ -245,7 +245,7 @@ def right_zeros(polynomial: Polynomial, angle: float = math.pi / 2) -> tuple[flo
     log_omega = np.linspace(math.log(low), math.log(high), 2001)
 
     def curve(logs: Floats) -> tuple[Complex, Floats]:
-        """D(jω) divided by the sum of its terms' sizes, which changes no angle, and that sum."""
+        """D(jω) divided by the sum of the sizes of its terms, and that sum."""
         exponents = np.outer(powers, logs) + np.log(np.abs(values))[:, None]
         shift = exponents.max(axis=0)
         sizes = np.exp(exponents - shift)
@@ -272,41 +272,42 @@ def right_zeros(polynomial: Polynomial, angle: float = math.pi / 2) -> tuple[flo
     return float(max(round(count), 0)), False
 
 
-#: A zero this close to the negative axis [rad], or within its own uncertainty of it, relaxes: it swings no more there.
+#: Angle from the negative axis, also bounded by its uncertainty, below which a zero is a relaxation.
 NEAR_REAL = 0.02 * math.pi
-#: Logarithms of frequencies that are numbers.
+#: Maximum absolute ln of a frequency without overflow.
 RANGE = 700.0
-#: Orders as they are printed: below half of their last digit one is 0.
+#: Half of the last printed digit of an order; smaller orders count as 0.
 SEEN_ORDER = 5e-5
-#: Zeros up to here are a relaxation where no pole is there at all: D^0.5 y = -a y has its own at arg s = 2 pi.
+#: Maximum argument of zeros that give relaxations of a model without poles: D^0.5 y = -a y has one at arg s = 2 pi.
 SHEETS = 2.0 * math.pi
-#: Steps of approximate orders whose polynomials tell where zeros are to be sought.
+#: Increments of rounded orders whose polynomials give the seeds of Newton's method.
 BASES = (0.25, 0.2, 0.1, 0.08, 0.05, 0.04, 0.03, 0.025, 0.02)
 LARGEST_SEED_DEGREE = 90
-#: Newton's steps, and the longest of them in ln s.
+#: Maximum number of Newton iterations, and maximum step in ln s.
 NEWTON, LONGEST = 60, 0.5
-#: A zero is one where the terms cancel to this share of their sum; two closer than this in ln s are one.
+#: Relative residual of the terms at a zero, and distance in ln s below which two zeros count as equal.
 CANCELS, SAME = 1e-10, 1e-7
-#: Step of the numerical derivatives, as a share: powers are kept to nine decimals, which is a ten-thousandth of it.
+#: Relative step of numerical derivatives. Powers are rounded to nine decimals, a ten-thousandth of it.
 STEP = 1e-5
 
 
 @dataclass(frozen=True)
 class Mode:
-    """One way in which a model moves by itself.
+    """Mode of a model: an oscillatory pole pair or a relaxation.
 
     Parameters
     ----------
     pole
-        Where it is in the plane of s [rad/s]: the upper one of two that are conjugate. Of a relaxation -1/T.
+        Pole [rad/s]: the upper one of a conjugate pair, or -1/T of a relaxation.
     frequency
         Natural frequency abs(pole) [rad/s].
     damping
-        Damping ratio -cos(arg pole): 1 for a relaxation, negative for what grows.
+        Damping ratio -cos(arg pole): 1 for a relaxation, negative for an unstable mode.
     time_constant
-        1/abs(Re pole) of a swing, 1/abs(pole) of a relaxation [s].
-    swings
-        Whether it swings; what relaxes does so exponentially for whole orders, as a power of time for others.
+        1/abs(Re pole) of an oscillation, 1/abs(pole) of a relaxation [s].
+    oscillatory
+        Whether it is a complex pole pair. A relaxation is exponential for integer orders and a power of time for
+        others.
     frequency_error, damping_error, time_constant_error
         Standard errors from the covariance of the model; None where it has none.
     """
@@ -322,7 +323,7 @@ class Mode:
 
     @property
     def grows(self) -> bool:
-        """Whether it grows instead of dying away."""
+        """Whether the mode is unstable."""
         return self.damping < 0
 
     def __str__(self) -> str:
@@ -337,7 +338,7 @@ class Mode:
 
 
 def modes(model: Solved, *, coupling: str = "simulated") -> tuple[Mode, ...]:
-    """Modes of a model, slowest first: its poles, whatever its orders, as frequency, damping and time constant.
+    """Return the modes of a model for any orders, slowest first: frequency, damping and time constant of its poles.
 
     Parameters
     ----------
@@ -349,20 +350,20 @@ def modes(model: Solved, *, coupling: str = "simulated") -> tuple[Mode, ...]:
     Returns
     -------
     tuple of Mode
-        Of each pair of conjugate poles one; those at the origin are left out. Standard errors are to first order from
-        the covariance of the fit.
+        One mode per conjugate pair; poles at the origin are excluded. Standard errors are to first order from the
+        covariance of the fit.
 
     Raises
     ------
     ModelError
-        Another coupling, or friction, with which no poles say what a body does.
+        An unknown coupling, or friction, for which poles are not defined.
 
     Notes
     -----
     Poles are the zeros of D(s), a sum of c s^p, with abs(arg s) < pi. Orders need no common base: Newton's method in
-    ln s starts from the roots of D with rounded orders. A zero on the negative axis, or as close to it as its
-    uncertainty tells, is a relaxation. A model of orders below 1 may have no pole at all, and relaxes as a power of
-    time: then the zeros up to arg s = 2 pi give its time constants, as (c_0/c_p)^(-1/p) does for D^p y = -c_0/c_p y.
+    ln s starts from the roots of D with rounded orders. A zero on the negative axis, or within its uncertainty of it,
+    is a relaxation. A model with orders below 1 may have no pole and relax as a power of time. Then the zeros up to
+    arg s = 2 pi give its time constants, as (c_0/c_p)^(-1/p) does for D^p y = -c_0/c_p y.
     """
     check_solved(model)
     coupled = is_coupled(coupling)
@@ -376,7 +377,7 @@ def modes(model: Solved, *, coupling: str = "simulated") -> tuple[Mode, ...]:
 
 
 def _mode(w: complex, spread: tuple[float, float, float] | None) -> Mode:
-    """A zero in ln s with the standard deviations of its parts as a mode."""
+    """Return the mode of a zero in ln s, with the standard deviations of its parts."""
     size, angle = math.exp(w.real), w.imag
     # Of a pole that hardly anything tells nobody may say that it is real, let alone that it dies away.
     sure = min(NORMAL_95 * (0.0 if spread is None or not math.isfinite(spread[1]) else spread[1]), NEAR_REAL)
@@ -397,7 +398,7 @@ def _mode(w: complex, spread: tuple[float, float, float] | None) -> Mode:
 
 
 def _nearest(polynomial: Polynomial) -> list[complex]:
-    """Zeros beyond the negative axis up to two turns, or to the first one."""
+    """Return zeros beyond the negative axis up to two turns, or up to the first one."""
     powers = np.array(list(polynomial))
     gap = float(np.min(np.diff(np.sort(powers)), initial=math.inf))
     zeros = zeros_of(polynomial, max(SHEETS, math.pi / gap) + NEAR_REAL)
@@ -406,7 +407,7 @@ def _nearest(polynomial: Polynomial) -> list[complex]:
 
 
 def zeros_of(polynomial: Polynomial, reach: float = math.pi + NEAR_REAL) -> list[complex]:
-    """Zeros of a sum of c s^p as ln s, slowest first, 0 <= Im <= reach; those at the origin are left out."""
+    """Zeros of a sum of c s^p as ln s, slowest first, 0 <= Im <= reach; those at the origin are excluded."""
     powers = np.array(list(polynomial))
     lowest, highest = float(powers.min()), float(powers.max())
     if highest - lowest < GRAIN:
@@ -434,7 +435,7 @@ def zeros_of(polynomial: Polynomial, reach: float = math.pi + NEAR_REAL) -> list
 
 
 def _seeds(polynomial: Polynomial, base: float, reach: float) -> Complex:
-    """Zeros of the same sum with orders rounded to a base, as ln s."""
+    """Zeros of the sum with orders rounded to a base, as ln s."""
     rounded: Polynomial = {}
     for power, value in polynomial.items():
         near = round(round(power / base) * base, 9)
@@ -449,7 +450,7 @@ def _seeds(polynomial: Polynomial, base: float, reach: float) -> Complex:
 
 
 def _balanced(powers: Floats, values: Floats, reach: float) -> Complex:
-    """Where two terms alone cancel, as ln s: far out, where orders that are close part, nothing else does."""
+    """Zeros of the sum of each pair of terms, as ln s, for distant zeros with close orders."""
     out = []
     for i, j in itertools.combinations(range(powers.size), 2):
         apart = powers[j] - powers[i]
@@ -461,7 +462,7 @@ def _balanced(powers: Floats, values: Floats, reach: float) -> Complex:
 
 
 def _descended(w: Complex, powers: Floats, values: Floats) -> list[complex]:
-    """Where Newton's method leads from these seeds, of those that reach a zero."""
+    """Zeros reached by Newton's method from these seeds."""
     if not w.size:
         return []
     for _ in range(NEWTON):
@@ -476,7 +477,7 @@ def _descended(w: Complex, powers: Floats, values: Floats) -> list[complex]:
 
 
 def _terms(w: Complex, powers: Floats, values: Floats) -> tuple[Complex, Floats]:
-    """Terms of the sum at each ln s, divided by the size of the largest, and the logarithm of that."""
+    """Terms of the sum at each ln s, divided by the size of the largest, and the logarithm of that size."""
     exponents = np.outer(powers, w)
     largest = np.max(exponents.real + np.log(np.abs(values))[:, None], axis=0)
     return np.asarray(values[:, None] * np.exp(exponents - largest)), largest
@@ -515,22 +516,22 @@ def _spreads(model: Solved, at: int, zeros: Complex, *, coupled: bool) -> Sequen
 
 @dataclass(frozen=True)
 class SteadyState:
-    """What an output does in the end under a unit step of an input.
+    """Steady state of an output under a unit step of an input.
 
     Parameters
     ----------
     output, input
         Names.
     gain
-        Where the output comes to rest; 0 where it returns, infinite where it runs on.
+        Final value of the output: 0 if it returns, infinite if it diverges.
     error
         Standard error of the rate; None without a covariance.
     order
-        Order with which it runs on: 0 for none, 1 for an integrator, below 0 where it returns to 0.
+        Order of growth: 0 for none, 1 for an integrator, below 0 if the output returns to 0.
     rate
-        Coefficient of t^order/Gamma(order + 1) in the end; the gain where the order is 0.
+        Final coefficient of t^order/Gamma(order + 1); the gain if the order is 0.
     order_error
-        Standard error of the order, 0 where it was given; None without a covariance.
+        Standard error of the order, 0 for a fixed order; None without a covariance.
     """
 
     output: str
@@ -543,7 +544,7 @@ class SteadyState:
 
 
 def steady_states(model: Solved) -> tuple[SteadyState, ...]:
-    """Steady state of every output under every input that reaches it, the equations together.
+    """Return the steady state of every output for every input that affects it, with coupled equations.
 
     Parameters
     ----------
@@ -581,7 +582,7 @@ def steady_states(model: Solved) -> tuple[SteadyState, ...]:
 
 
 def _final(model: Solved) -> dict[tuple[str, str], tuple[float, float]]:
-    """Order and coefficient of what is left of every response in the end."""
+    """Order and coefficient of the final behavior of every response."""
     transfer = transfer_functions(model)
     sensor = model.structure.sensor_filter
     out = {}

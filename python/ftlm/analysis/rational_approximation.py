@@ -1,4 +1,4 @@
-"""Linear systems of whole order that stand for fractional ones within a band (Oustaloup)."""
+"""Rational state-space approximation of fractional models within a frequency band (Oustaloup)."""
 
 from __future__ import annotations
 
@@ -20,29 +20,29 @@ from ftlm.model.model import Solved
 from ftlm.simulation.discretization import check_linear
 from ftlm.utils.validation import Floats, real_number, shown, whole_number
 
-#: Errors of the approximation beyond which a warning is due: gain [dB], phase [degrees].
+#: Maximum errors of the approximation without a warning.
 GAIN_DB, PHASE_DEGREES = 1.0, 5.0
-#: Frequencies at which the approximation is compared with the model.
+#: Number of frequencies at which the approximation is compared with the model.
 COMPARED = 200
-#: Filters reach this many times beyond the band on both sides: near their ends their phase is off.
+#: Factor by which filters extend beyond the band on both sides, because their phase is inaccurate near their ends.
 REACH = 100.0
-#: A pole closer to the imaginary axis than this share of the band's lower end is on it.
+#: Distance of a pole from the imaginary axis, relative to the lower end of the band, below which it is on the axis.
 AT_ORIGIN = 1e-3
-#: Largest order of Oustaloup's filter: zeros and poles a hair apart say nothing new.
+#: Maximum order of Oustaloup's filter. Beyond it neighboring zeros and poles nearly cancel.
 LARGEST_ORDER = 50
 #: Order of the Padé approximation of a delay.
 PADE = 4
 
 
 def identifier(name: str) -> str:
-    """A name that MATLAB, Python and python-control take."""
+    """Return a name that is valid in MATLAB, Python and python-control."""
     plain = re.sub(r"[^A-Za-z0-9_]+", "_", name).strip("_")[:60]
     return plain if plain and plain[0].isalpha() else f"x_{plain}"
 
 
 @dataclass(frozen=True)
 class Approximation:
-    """A linear system of whole order that stands for a fractional one within a band.
+    """Rational state-space approximation of a fractional model within a frequency band.
 
     Parameters
     ----------
@@ -51,7 +51,7 @@ class Approximation:
     outputs, inputs
         Names.
     band
-        Where the approximation is meant to hold [rad/s].
+        Frequency band of the approximation [rad/s].
     order
         Order of Oustaloup's filter: one operator has 2 order + 1 poles.
     gain_error, phase_error
@@ -59,7 +59,7 @@ class Approximation:
     stable
         Whether the approximation is stable.
     warnings
-        What not to do with it, in words.
+        Limits of its use.
     """
 
     a: Floats
@@ -114,7 +114,7 @@ def oustaloup(power: float, band: tuple[float, float], order: int) -> tuple[Floa
 
 
 class _Builder:
-    """Collects states; every piece reads the inputs u, the outputs y, or states."""
+    """Collector of states; each element reads inputs u, outputs y, or states."""
 
     def __init__(self, inputs: int, outputs: int) -> None:
         self.a: list[dict[int, float]] = []
@@ -141,7 +141,7 @@ def _dense(rows: Sequence[Mapping[int, float]], width: int) -> Floats:
     return matrix
 
 
-#: A signal inside the approximation: what it reads of states, inputs and outputs.
+#: Signal inside the approximation: its coefficients of states, inputs and outputs.
 _Signal = tuple[dict[int, float], dict[int, float], dict[int, float]]
 
 
@@ -160,7 +160,7 @@ def _sum(signals: Iterable[_Signal]) -> _Signal:
 
 
 def _filtered(builder: _Builder, signal: _Signal, power: float, band: tuple[float, float], order: int) -> _Signal:
-    """Oustaloup's filter for s^power of a signal, one state a pole."""
+    """Apply Oustaloup's filter for s^power to a signal, with one state per pole."""
     roots, residues, gain = oustaloup(power, band, order)
     states, u, y = _scaled(signal, gain)
     for pole, residue in zip(roots.tolist(), residues.tolist(), strict=True):
@@ -172,7 +172,7 @@ def _filtered(builder: _Builder, signal: _Signal, power: float, band: tuple[floa
 
 
 def _delayed(builder: _Builder, source: int, delay: float) -> _Signal:
-    """Padé's approximation of a delayed input, in observer form."""
+    """Apply Padé's approximation of a delay to an input, in observer form."""
     # Coefficients of sum (2n-k)! n! / ((2n)! k! (n-k)!) x^k, x = -s tau above and + below.
     f, n = math.factorial, PADE
     c = [f(2 * n - k) * f(n) / (f(2 * n) * f(k) * f(n - k)) for k in range(n + 1)]
@@ -190,31 +190,31 @@ def _delayed(builder: _Builder, source: int, delay: float) -> _Signal:
 
 
 def approximate(model: Solved, *, band: tuple[float, float], order: int = 5) -> Approximation:
-    """Approximate a model by a system of whole order in state space.
+    """Approximate a model by a rational state-space system.
 
     Parameters
     ----------
     model
-        The model; its equations act together, driven by what is not modelled.
+        The model; its equations are coupled, with all signals but the outputs as inputs.
     band
-        Frequencies (low, high) [rad/s] within which the approximation is to hold, 0 < low < high.
+        Frequency band (low, high) of the approximation [rad/s], 0 < low < high.
     order
         Of Oustaloup's filter, 1 to 50: each distinct integral of fractional order gets 2 order + 1 poles.
 
     Returns
     -------
     Approximation
-        With its errors over the band.
+        State-space system with its errors over the band.
 
     Raises
     ------
     ModelError
-        A band or an order that is none, or equations that cannot be solved for their outputs.
+        Invalid band or order, or equations that cannot be solved for their outputs.
 
     Notes
     -----
-    Filters reach two decades beyond the band on both sides, since Oustaloup's phase is poor near its ends. Whole
-    orders are exact; delays get Padé's approximation of order 4; the sensor filter is left out.
+    Filters extend two decades beyond the band on both sides, since Oustaloup's phase is poor near its ends. Integer
+    orders are exact. Delays have Padé's approximation of order 4. The sensor filter is excluded.
     """
     try:
         low, high = (real_number("band", b) for b in band)
@@ -271,7 +271,7 @@ def approximate(model: Solved, *, band: tuple[float, float], order: int = 5) -> 
 
 
 def _judged(model: Solved, system: Approximation) -> Approximation:
-    """Say how far off an approximation is, and how much of what it says of stability holds."""
+    """Return the approximation with its errors and warnings on its stability."""
     low, high = system.band
     omega = np.geomspace(low, high, COMPARED)
     exact = frequency_response(model, omega, sensor=False)
@@ -304,7 +304,7 @@ def _judged(model: Solved, system: Approximation) -> Approximation:
 
 
 def to_control(model: Solved, *, band: tuple[float, float], order: int = 5) -> Any:
-    """Return a python-control system that stands for a model within a band.
+    """Return a python-control system that approximates a model within a band.
 
     Parameters
     ----------

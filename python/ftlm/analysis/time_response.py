@@ -1,4 +1,4 @@
-"""Answers of a model to a unit step and to a unit impulse, with what its covariance says of them."""
+"""Step and impulse responses of a model, with standard deviation."""
 
 from __future__ import annotations
 
@@ -13,18 +13,18 @@ from ftlm.errors import FtlmError
 from ftlm.model.model import Solved, check_solved
 from ftlm.utils.validation import Floats
 
-#: Instants of a picture.
+#: Default number of time points.
 INSTANTS = 401
-#: The difference quotient steps this share of a standard deviation along each direction of the covariance: far above
-#: what refinement leaves (1e-6), and so short that a number keeps its sign where it is known at all.
+#: Step of the difference quotient along each direction of the covariance, in standard deviations. It is far above the
+#: refinement tolerance (1e-6), and small enough for a significant parameter to keep its sign.
 SHARE = 0.1
-#: Directions whose variance is below this share of the largest, in units of each number's own, add nothing.
+#: Variance of a direction, relative to the largest in normalized units, below which it is neglected.
 LEAST = 1e-12
 
 
 @dataclass(frozen=True)
 class Response:
-    """What every output does after a unit step, or a unit impulse, of every input.
+    """Responses of every output to a unit step, or a unit impulse, of every input.
 
     Parameters
     ----------
@@ -33,12 +33,12 @@ class Response:
     outputs, inputs
         Names.
     time
-        Instants [s], shape (N,). An impulse has the middle of each interval of the step: there the mean of its answer
-        over the interval stands, which is finite where orders below 1 make the answer itself infinite at 0.
+        Time points [s], shape (N,). For an impulse they are the centers of the intervals, and values are means over the
+        intervals, which stay finite if orders below 1 make the response infinite at 0.
     values
         Shape (outputs, inputs, N).
     deviation
-        Standard deviation of the values from the covariance of the model, to first order; None where there is none.
+        Standard deviation of the values from the covariance of the model, to first order; None without a covariance.
     """
 
     kind: str
@@ -50,14 +50,14 @@ class Response:
 
 
 def response(model: Solved, time: ArrayLike | None = None, *, kind: str = "step") -> Response:
-    """Answer of a model to unit steps or impulses, from rest, its equations together.
+    """Response of a model to unit steps or impulses, from rest, with coupled equations.
 
     Parameters
     ----------
     model
         The model.
     time
-        Regular instants from 0 [s], at least 3; by default until it has settled.
+        Uniform time points from 0 [s], at least 3; by default up to the settling time.
     kind
         ``"step"`` or ``"impulse"``.
 
@@ -85,7 +85,7 @@ def response(model: Solved, time: ArrayLike | None = None, *, kind: str = "step"
 
 
 def _deviation(model: Solved, time: Floats, *, impulse: bool) -> Floats | None:
-    """Root of the summed squares of what one standard deviation along each direction of the covariance changes."""
+    """Standard deviation from changes of one standard deviation along each direction of the covariance."""
     covariance = None if model.estimate is None else model.estimate.covariance
     if covariance is None or model.structure.has_friction:
         return None

@@ -1,1 +1,1 @@
-"""The local page: files in a browser, each read and each fit in a process of its own, nothing but 127.0.0.1."""
+"""Local web application: a browser session on 127.0.0.1 with one process per file read and per fit."""

@@ -1,4 +1,4 @@
-"""What a person asks of a file on the page, done by ftlm's own functions, and the Python lines that do the same."""
+"""Form fields as a fit request, its execution, the equivalent Python script, and suggested structures."""
 
 from __future__ import annotations
 
@@ -24,74 +24,74 @@ from ftlm.structure_selection.select import select
 from ftlm.utils.resources import by_output_error, expected
 from ftlm.utils.validation import check_threads
 
-#: Structures that have a name of their own, as calls of Python.
+#: Structures with a name of their own, as Python calls.
 NAMED: dict[str, Callable[[], Structure]] = {
     "flexible_link(stage=1)": lambda: flexible_link(stage=1),
     "flexible_link(stage=2)": lambda: flexible_link(stage=2),
 }
-#: How a model is come to: fit the structure, choose what of it earns its place, one of several, or from nothing.
+#: Origin of the structure: fit as given, selected inside one, selected among several, or automatic.
 WAYS = ("fit", "inside", "offered", "auto")
 METHODS = ("output-error", "instrumental-variables", "multi-innovation", "least-squares")
 OFFSETS = ("none", "constant", "ramp", "auto")
 LOSSES = ("squares", "huber")
-#: What is done while structures are tried.
+#: Progress phase of a structure selection.
 CHOOSING = "choosing a structure"
-#: A line of a script, as long as those of the house.
+#: Longest line of a script.
 LINE = 100
 
 
 class Told(Protocol):
-    """Whom work tells how far it is."""
+    """Receiver of progress reports."""
 
     def phase(self, words: str) -> None:
-        """Say what comes next."""
+        """Announce the next phase."""
 
     def __call__(self, done: int, total: int) -> None:
-        """Say how far it is."""
+        """Report ``done`` of ``total`` parts."""
 
 
 @dataclass(frozen=True)
 class Reading:
-    """A file and the arguments of `ftlm.load` that make it a run.
+    """File with the arguments of `ftlm.load` that turn it into a run.
 
     Parameters
     ----------
     file
-        Its name, in the folder in which the work is done.
+        File name in the working folder.
     options
-        As `ftlm.open_file` says them, a layout as a dictionary.
+        Options as `ftlm.open_file` returns them, the layout as a dictionary.
     """
 
     file: str
     options: dict[str, Any] = field(default_factory=dict)
 
     def run(self) -> Run:
-        """Load it."""
+        """Load the run."""
         return load(self.file, **self.options)
 
     def script(self, name: str) -> list[str]:
-        """The lines that load it."""
+        """Script lines that load the run."""
         return call(name, "ftlm.load", [quoted(self.file)], self.options)
 
 
 @dataclass(frozen=True)
 class Recipe:
-    """All that makes a model: nothing else decides a number of it.
+    """Complete definition of a fit: runs, structure and options.
 
     Parameters
     ----------
     estimation
-        The run that is fitted to.
+        Run that the model is fitted to.
     validation
-        A run that is not; None where there is none, or where a part of the first is kept for that.
+        Validation run; None without one, or if a part of the first run is used for validation.
     share
-        Part of the run, at its end, that is kept for validation, from 0 (none) to 0.8.
+        Share of the run, at its end, that is used for validation, from 0 (none) to 0.8.
     structure
-        An equation in words, or one of :data:`NAMED`; of ``"offered"`` several, ``"auto"`` has none.
+        Equations, or keys of :data:`NAMED_STRUCTURES`: several for ``"offered"``, none for ``"auto"``.
     way
-        One of :data:`WAYS`.
+        One of :data:`SELECTION_MODES`.
     method, offset, loss
-        As of :func:`ftlm.identify`; "" for its own defaults.
+        Arguments of :func:`ftlm.identify`; "" for its defaults.
     """
 
     estimation: Reading
@@ -105,18 +105,18 @@ class Recipe:
 
     @classmethod
     def of(cls, told: Mapping[str, Any]) -> Recipe:
-        """From what :meth:`to_dict` made."""
+        """Build a request from the dictionary of :meth:`to_dict`."""
         other = told["validation"]
         parts = {**told, "structure": tuple(told["structure"]), "estimation": Reading(**told["estimation"])}
         return cls(**{**parts, "validation": None if other is None else Reading(**other)})
 
     def to_dict(self) -> dict[str, Any]:
-        """For JSON."""
+        """Return the request as a dictionary for JSON."""
         return asdict(self)
 
     @property
     def words(self) -> str:
-        """What is asked for, in a line."""
+        """Structure of the request in one line."""
         return {
             "fit": "; ".join(self.structure),
             "inside": f"chosen inside {'; '.join(self.structure)}",
@@ -125,39 +125,39 @@ class Recipe:
         }[self.way]
 
     def settings(self) -> dict[str, Any]:
-        """Arguments of the fit besides runs and structure."""
+        """Arguments of the fit other than runs and structure."""
         given = {"method": self.method, "offset": self.offset, "loss": self.loss}
         return {name: value for name, value in given.items() if value}
 
     def structures(self) -> list[Structure]:
-        """The structures that are named.
+        """Structures of the request.
 
         Raises
         ------
         ModelError
-            One that is none, in ftlm's own words.
+            An invalid equation.
         """
         return [structure_of(text) for text in self.structure]
 
     @property
     def is_choice(self) -> bool:
-        """Whether structures are tried, which takes long enough to go on with another time."""
+        """Whether a structure is selected, which takes long enough to need a checkpoint."""
         return self.way != "fit"
 
     def made(self, told: Told, store: str | None = None) -> Made:
-        """Make the model.
+        """Fit the model.
 
         Parameters
         ----------
         told
-            Told how far it is.
+            Receiver of progress reports.
         store
-            File that keeps the fits of a choice, in which one that was stopped goes on.
+            Checkpoint file of a structure selection; a stopped selection continues from it.
 
         Raises
         ------
         DataError, ModelError, ConvergenceError
-            As of :func:`ftlm.load`, :func:`ftlm.identify`, :func:`ftlm.select`.
+            As :func:`ftlm.load`, :func:`ftlm.identify`, :func:`ftlm.select`.
         """
         wanted = self.structures()
         told.phase("reading")
@@ -169,14 +169,14 @@ class Recipe:
         else:
             candidates = "auto" if self.way == "auto" else wanted[0] if self.way == "inside" else wanted
             choice = select(own, candidates, progress=told, store=store)
-            # Chosen from rest, where its run starts so; another run may not.
+            # The selection started from rest, as its run does. Another run may not.
             told.phase("fitting what was chosen")
             result = identify(own, choice.winner.structure, progress=told)
         told.phase("validating")
         return Made(result, own, other, None if other is None else result.validate(other), choice, self._script(cut))
 
     def _takes(self, run: Run, structure: Structure) -> str:
-        """About how long a fit takes, where that is long enough to wonder."""
+        """Time estimate of a fit as text; empty for a short fit."""
         numbers = len(structure.order_names) + len(structure.coefficient_names) + len(structure.free_inputs)
         seconds = expected(by_output_error(run.length * len(structure.outputs), numbers), check_threads(None))
         if seconds < WONDER or self.method not in ("", METHODS[0]):
@@ -184,7 +184,7 @@ class Recipe:
         return f", {left_in_words(seconds).removesuffix(' left')} in all"
 
     def _runs(self) -> tuple[Run, Run | None, float | None]:
-        """The run that is fitted to, the one that is not, and where one was cut from the other [s]."""
+        """Estimation run, validation run, and the time at which one run was split [s]."""
         run = self.estimation.run()
         if self.validation is not None:
             return run, self.validation.run(), None
@@ -194,7 +194,7 @@ class Recipe:
         return run.slice(None, cut), run.slice(cut, None), cut
 
     def _script(self, cut: float | None) -> str:
-        """The Python lines that do all of it."""
+        """Python script of the whole fit."""
         stem = Path(self.estimation.file).stem
         lines = [f'"""A model of {docstring(self.estimation.file)}, as the page of ftlm {__version__} made it."""', ""]
         lines += ["import ftlm", ""]
@@ -224,7 +224,7 @@ class Recipe:
 
 @dataclass(frozen=True)
 class Made:
-    """A model with its runs, and the script that makes it again."""
+    """Model of a fit with its runs and the script that reproduces it."""
 
     result: Identification
     run: Run
@@ -235,12 +235,12 @@ class Made:
 
 
 def structure_of(text: str) -> Structure:
-    """The structure that a text names."""
+    """Return the structure of an equation or of a key of :data:`NAMED_STRUCTURES`."""
     return NAMED[text]() if text in NAMED else equation(text)
 
 
 def checked_structures(recipe: Recipe) -> list[Structure]:
-    """The structures of a recipe; what does not belong together is refused, before any work."""
+    """Return the structures of a request; raise for options that contradict each other."""
     for name, value, known in (
         ("way", recipe.way, WAYS),
         ("method", recipe.method, ("", *METHODS)),
@@ -264,17 +264,17 @@ def checked_structures(recipe: Recipe) -> list[Structure]:
 
 
 def cut_at(rows: int, step: float, share: float) -> float:
-    """Where a run is cut [s] so that this share of its rows lies behind."""
+    """Time [s] at which a run is split so that this share of its samples comes after it."""
     return float(f"{round(rows * (1.0 - share)) * step:.9g}")
 
 
 def written(structure: str) -> str:
-    """A structure as Python writes it."""
+    """Python expression of a structure."""
     return f"ftlm.{structure}" if structure in NAMED else f"ftlm.equation({quoted(structure)})"
 
 
 def call(target: str, function: str, values: list[str], named: Mapping[str, Any]) -> list[str]:
-    """A call in Python, a line an argument where one line is too long."""
+    """Python call; one line per argument if one line is too long."""
     parts = [*values, *(f"{name}={literal(value)}" for name, value in named.items())]
     line = f"{target} = {function}({', '.join(parts)})"
     if len(line) <= LINE:
@@ -283,7 +283,7 @@ def call(target: str, function: str, values: list[str], named: Mapping[str, Any]
 
 
 def literal(value: Any) -> str:
-    """A value of JSON as Python writes it."""
+    """Python expression of a JSON value."""
     if isinstance(value, str):
         return quoted(value)
     if isinstance(value, Mapping):
@@ -292,36 +292,36 @@ def literal(value: Any) -> str:
 
 
 def quoted(text: str) -> str:
-    """A text as Python writes it, within double quotes and without what a terminal would obey."""
+    """Python string literal in double quotes, without control characters of a terminal."""
     if text.isprintable():
         return json.dumps(text, ensure_ascii=False)
     return repr(text).encode("ascii", "backslashreplace").decode()
 
 
 def docstring(text: str) -> str:
-    """A name as it may stand within a docstring."""
+    """Return a file name reduced to characters that are safe inside a docstring."""
     return "".join(c if c.isalnum() or c in " ._-()" else "?" for c in text)[:100]
 
 
-#: Fields of a file's layout that hold whole numbers, and those that hold words.
+#: Form fields of a file's layout with integer values, and those with text values.
 NUMBERS, WORDS = ("skip", "header"), ("encoding", "separator", "decimal", "thousands", "dates", "sheet")
 ROLES = ("", "time", "input", "output")
 MOST_SIGNALS = 500
 
 
 def asked_of(said: Mapping[str, Any]) -> dict[str, Any]:
-    """Turn fields into arguments; an empty field says nothing.
+    """Convert form fields to arguments; an empty field is omitted.
 
     Parameters
     ----------
     said
         ``columns``: a list of name, role, signal and unit; ``step``, ``resample``, ``from``, ``to``: text of numbers;
-        ``time_unit``, ``missing`` and those of the layout: words.
+        ``time_unit``, ``missing`` and the fields of the layout: text.
 
     Raises
     ------
     DataError
-        A field that is none of these, or holds no number where one belongs.
+        An unknown field, or a field without the number that it needs.
     """
     asked: dict[str, Any] = {}
     for name in ("step", "resample"):
@@ -341,7 +341,7 @@ def asked_of(said: Mapping[str, Any]) -> dict[str, Any]:
 
 
 def _roles(columns: Any) -> dict[str, Any]:
-    """Time, inputs, outputs and units; nothing where no column is told."""
+    """Time, inputs, outputs and units; empty without a list of columns."""
     if columns is None:
         return {}
     if not isinstance(columns, list) or len(columns) > MOST_SIGNALS:
@@ -369,7 +369,7 @@ def _roles(columns: Any) -> dict[str, Any]:
 
 
 def number(name: str, text: str) -> float:
-    """A number of a field."""
+    """Return the number of a form field."""
     try:
         return float(text)
     except ValueError:
@@ -377,7 +377,7 @@ def number(name: str, text: str) -> float:
 
 
 def _whole(name: str, text: str) -> int:
-    """A whole number of a field."""
+    """Return the number of lines in a form field."""
     if not (text.isascii() and text.isdigit() and len(text) < 10):
         raise DataError(f"{name}: {text[:40]!r} is no number of lines; write one such as 2")
     return int(text)
@@ -392,12 +392,12 @@ def _text(said: Mapping[str, Any], name: str) -> str:
     return str(value).strip() if name not in ("name",) else str(value)
 
 
-#: Outputs and inputs beyond which nobody reads a list of offers.
+#: Outputs and inputs for which structures are suggested; longer lists are not readable.
 MOST = 6
 
 
 def offers(inputs: Sequence[str], outputs: Sequence[str]) -> list[dict[str, str]]:
-    """Structures for each output: what they are called, what they are for, the equation, and of which output."""
+    """Structures suggested for each output: name, purpose, equation, output."""
     made: list[dict[str, str]] = []
     driven = list(inputs)[:MOST]
     for output in list(outputs)[:MOST]:

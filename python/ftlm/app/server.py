@@ -1,4 +1,4 @@
-"""The page's door: which requests are answered, and how; everything else is refused before its body is read."""
+"""HTTP server on 127.0.0.1: routes, request checks, token, timeouts."""
 
 from __future__ import annotations
 
@@ -30,14 +30,14 @@ Scope = MutableMapping[str, Any]
 Receive = Callable[[], Awaitable[MutableMapping[str, Any]]]
 Send = Callable[[MutableMapping[str, Any]], Awaitable[None]]
 
-#: Bytes of a request that is no file.
+#: Longest body of a request that uploads no file.
 MOST_WORDS = 64 << 10
-#: The page runs its own script and style, asks its own server, and is shown in nobody's frame.
+#: Allows only the page's own script, style and server, and no embedding in frames.
 POLICY = (
     "default-src 'none'; script-src 'self'; style-src 'self'; connect-src 'self'; img-src data:; base-uri 'none'; "
     "form-action 'none'; frame-ancestors 'none'"
 )
-#: A report is a page of its own: its scripts run where they reach nothing of this one.
+#: Reports are sandboxed: their scripts cannot access the application.
 REPORT_POLICY = "sandbox allow-scripts; frame-ancestors 'none'"
 ALWAYS = {
     "content-security-policy": POLICY,
@@ -53,18 +53,18 @@ HTML, JSON, TEXT = "text/html; charset=utf-8", "application/json", "text/plain; 
 
 @dataclass(frozen=True)
 class Answer:
-    """What is sent back.
+    """HTTP response.
 
     Parameters
     ----------
     status
-        Of HTTP.
+        HTTP status code.
     body
         Text or bytes.
-    kind
-        Its type.
-    more
-        Further headers.
+    content_type
+        Media type of the body.
+    extra_headers
+        Additional headers.
     """
 
     status: int
@@ -74,7 +74,7 @@ class Answer:
 
 
 class RefusedError(Exception):
-    """A request that is refused: status of HTTP and why."""
+    """Refusal of a request, with HTTP status and reason."""
 
     def __init__(self, status: int, why: str) -> None:
         super().__init__(why)
@@ -83,7 +83,7 @@ class RefusedError(Exception):
 
 @dataclass
 class Request:
-    """A request whose head was read and found good."""
+    """Request with a valid head."""
 
     method: str
     path: list[str]
@@ -92,7 +92,7 @@ class Request:
     receive: Receive
 
     async def chunks(self) -> AsyncIterator[bytes]:
-        """Its body in pieces; one that is cut off is refused."""
+        """Yield the body in chunks; raise for a truncated body."""
         while True:
             message = await self.receive()
             if message["type"] == "http.disconnect":
@@ -103,7 +103,7 @@ class Request:
                 return
 
     async def words(self) -> dict[str, Any]:
-        """Its body as a JSON object."""
+        """Return the body as a JSON object."""
         body = b""
         async for chunk in self.chunks():
             body += chunk
@@ -119,18 +119,18 @@ class Request:
 
 
 class Door:
-    """The page as an ASGI application.
+    """ASGI application of the page.
 
     Parameters
     ----------
     desk
-        What lies on it.
+        Session to serve.
     token
-        What its address holds.
+        Secret part of the address.
     hosts
-        Names and ports by which a browser may ask for it.
+        Accepted host names with ports.
     key
-        What a first address holds that is good for one visit; it leads to the lasting one.
+        Secret of the one-time address that redirects to the permanent one.
     """
 
     def __init__(self, desk: Desk, token: str, hosts: tuple[str, ...], key: str = "") -> None:
@@ -165,7 +165,7 @@ class Door:
         await send({"type": "http.response.body", "body": b"" if scope["method"] == "HEAD" else body})
 
     def _checked(self, scope: Scope, receive: Receive) -> Request:
-        """Refuse strangers by the head of the request alone."""
+        """Check the head of a request and parse it."""
         headers: dict[str, str] = {}
         for name, value in scope["headers"]:
             key = name.decode("latin-1").lower()
@@ -193,7 +193,7 @@ class Door:
         return Request(method, path[1:], {k: v[0] for k, v in query.items()}, headers, receive)
 
     def _first(self, key: str) -> None:
-        """Let the browser that was started in, once: others may have read its command line."""
+        """Redirect the first visitor with the one-time key. The key is visible in the command line of the browser."""
         good = bool(self._key) and secrets.compare_digest(key.encode("utf-8", "replace"), self._key.encode())
         if not good:
             raise RefusedError(404, "this address was good once; the one that lasts is in the terminal of ftlm app")
@@ -201,7 +201,7 @@ class Door:
         raise _LetInError(303, "")
 
     async def _answered(self, request: Request) -> Answer:
-        """Find who answers."""
+        """Return the response of the route."""
         method = "GET" if request.method == "HEAD" else request.method
         match method, request.path:
             case "GET", []:
@@ -240,7 +240,7 @@ class Door:
         raise RefusedError(405 if known else 404, "there is nothing here" if not known else "not in this way")
 
     def _wrong(self, wanted: Mapping[str, Any]) -> str:
-        """What is wrong with what is asked for; nothing where it could be made."""
+        """Return the error message of a fit request, or "" if it is valid."""
         try:
             self._desk.recipe(wanted)
         except FtlmError as error:
@@ -300,7 +300,7 @@ class Door:
         raise RefusedError(405 if what in ([], ["stop"], ["resume"]) else 404, "not in this way")
 
     def _download(self, key: str, what: str, stem: str) -> Answer:
-        """A file of a model; its path is of this program, never of a request."""
+        """Return a file of a model. Its path never comes from the request."""
         model = self._desk.models[key]
         ending, kind = {
             "report": ("report.html", HTML),
@@ -325,48 +325,48 @@ class Door:
 
 
 class _LetInError(RefusedError):
-    """Who came by the first address, or without the last stroke of the lasting one, is sent on."""
+    """Redirect to the permanent address."""
 
 
-#: Seconds that a client may take for a request's head, between two pieces of its body, and for a part of an answer.
+#: Time that a client may take for a request head, between two parts of a body, and to read a part of an answer.
 PATIENCE = 20.0
 
 
 def patient() -> type[H11Protocol]:
-    """Make the connections of uvicorn that are looked at twice in the time of :data:`PATIENCE`.
+    """Return a connection class of uvicorn that checks its client twice per :data:`CLIENT_TIMEOUT_S`.
 
-    Its own limit holds for connections that have been answered and then are silent altogether.
+    The keep-alive limit of uvicorn only covers connections that are idle after an answer.
     """
     import h11  # noqa: PLC0415 — an extra
     from uvicorn.protocols.http.h11_impl import H11Protocol  # noqa: PLC0415 — an extra
 
     class Connection(H11Protocol):
-        """One that looks after itself."""
+        """HTTP connection that closes itself after a timeout."""
 
         _since = 0.0
         _unread = 0
         _next: asyncio.TimerHandle | None = None
 
         def connection_made(self, transport: asyncio.Transport) -> None:  # type: ignore[override]
-            """Begin to wait."""
+            """Start the timeout."""
             super().connection_made(transport)
             self._since = self.loop.time()
             self._again()
 
         def data_received(self, data: bytes) -> None:
-            """Take a piece: of a body it is a sign of life, of a head only the last one is."""
+            """Restart the timeout at each part of a body, and at the end of a head."""
             before = self.conn.their_state
             super().data_received(data)
             if self.conn.their_state is not before or before is h11.SEND_BODY:
                 self._since = self.loop.time()
 
         def on_response_complete(self) -> None:
-            """Wait for the next head from here on."""
+            """Restart the timeout for the next request head."""
             super().on_response_complete()
             self._since = self.loop.time()
 
         def connection_lost(self, exc: Exception | None) -> None:
-            """Wait no longer."""
+            """Cancel the timeout."""
             if self._next is not None:
                 self._next.cancel()
             super().connection_lost(exc)
@@ -375,7 +375,7 @@ def patient() -> type[H11Protocol]:
             self._next = self.loop.call_later(PATIENCE / 2, self._look)
 
         def _look(self) -> None:
-            """End what is silent for too long, and what does not read what it is sent."""
+            """Abort the connection if the client sends nothing or does not read its answer."""
             unread, before = self.transport.get_write_buffer_size(), self._unread
             self._unread = unread
             if unread < before or (unread and not before):
@@ -390,30 +390,32 @@ def patient() -> type[H11Protocol]:
     return Connection
 
 
-#: Where the page is if nobody says otherwise, and whoever else takes part of a request at a time.
+#: Default address and port, limit of connections, and chunk size of files read from disk.
 PORT, ADDRESS = 8347, "127.0.0.1"
 MOST_CONNECTIONS = 100
 CHUNK = 1 << 20
 
 
 def check_installed() -> None:
-    """Refuse where what serves pages is missing."""
+    """Raise if the server package is not installed."""
     if importlib.util.find_spec("uvicorn") is None:
         raise ModelError("ftlm app needs uvicorn; run: pip install 'ftlm[app]'")
 
 
 def listening(port: int | None) -> tuple[socket.socket, str]:
-    """A socket that listens on this machine alone, and what is to be said of its port.
+    """Open a socket on the loopback address; return it with a note about its port.
 
     Parameters
     ----------
     port
-        Which; None for the usual one, or any other where that is taken.
+        Port; None for the default, or for any free one if the default is taken.
 
     Raises
     ------
+    ModelError
+        A port out of range.
     DataError
-        The port is taken, not allowed, or none.
+        A port that is taken or not allowed.
     """
     if port is not None and not 0 <= port <= 65535:
         raise ModelError(f"--port {port} is none; take one from 1024 to 65535, or 0 for any")
@@ -436,23 +438,23 @@ def listening(port: int | None) -> tuple[socket.socket, str]:
 
 
 def serve(files: Sequence[str] = (), *, port: int | None = None, browser: bool = True) -> None:
-    """Serve the page until Ctrl-C.
+    """Serve the application until Ctrl-C.
 
     Parameters
     ----------
     files
-        To open at once.
+        Files to open at the start.
     port
-        Of 127.0.0.1.
+        Port on 127.0.0.1.
     browser
         Whether to open a browser.
 
     Raises
     ------
     DataError
-        A file that is not there, a port that is taken.
+        A file that does not exist, or a port that is taken.
     ModelError
-        What serves pages is not installed.
+        The server package is not installed.
     """
     check_installed()
     paths = [Path(file) for file in files]
@@ -505,14 +507,14 @@ async def _serve(sock: socket.socket, paths: Sequence[Path], browser: bool) -> N
         await server.serve(sockets=[sock])
         del opener
     finally:
-        # Ctrl-C cancels what is awaited next, which must not be the end of the work.
+        # Ctrl-C cancels the next await, which must not skip the cleanup.
         with contextlib.suppress(asyncio.CancelledError):
             await asyncio.sleep(0)
         await desk.close()
 
 
 async def _pieces(path: Path) -> AsyncIterator[bytes]:
-    """A file of this machine, in pieces."""
+    """Yield the chunks of a file on this machine."""
     with open(path, "rb") as stream:
         while piece := stream.read(CHUNK):
             yield piece

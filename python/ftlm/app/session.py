@@ -1,4 +1,4 @@
-"""What lies on the page: files in a private folder, models waiting, running and made, and their bounds."""
+"""Browser session: files in a private folder, models in a queue, and the limits of both."""
 
 from __future__ import annotations
 
@@ -22,37 +22,37 @@ from ftlm.progress import left_in_words
 from ftlm.structure.structure import Structure
 from ftlm.utils.validation import nearest, real_number
 
-#: Bytes of one file and of all, files, models kept, models that wait, and seconds that opening a file may take.
+#: Limits: bytes of one file and of all files, number of files, of models and of queued models, time to open a file.
 MOST_BYTES, MOST_BYTES_IN_ALL = 256 << 20, 1 << 30
 MOST_FILES, MOST_MODELS, MOST_WAITING = 20, 40, 8
 SECONDS_TO_OPEN = 600.0
-#: Seconds after which a page is told that a file is still being read.
+#: Time after which the page is told that a file is still being read.
 PATIENCE = 2.0
-#: Files that are opened at a time.
+#: Files that are opened at the same time.
 MOST_OPENING = 2
-#: Bytes of a file's name.
+#: Longest file name [bytes].
 MOST_LETTERS = 200
-#: What one system refuses in names; the others take it.
+#: Characters that Windows refuses in file names.
 _REFUSED = ':*?"<>|' if os.name == "nt" else ""
 WAITING, RUNNING, MADE, FAILED, STOPPED = "waiting", "running", "made", "failed", "stopped"
 
 
 @dataclass
 class File:
-    """A file on the page.
+    """File of the session.
 
     Parameters
     ----------
     key, name, size
-        What the page calls it, its name in the folder, its bytes.
-    asked
-        What a person said of it, as arguments of `ftlm.open_file`.
-    told
-        What it is; None while it is read, or where it cannot be.
+        Identifier on the page, name in the folder, size in bytes.
+    user_options
+        Options set by the user, as arguments of `ftlm.open_file`.
+    preview
+        Description of the file; None while it is read or if it cannot be read.
     error
-        Why it cannot be.
+        Reason why it cannot be read.
     version
-        Counts its changes.
+        Number of changes.
     """
 
     key: str
@@ -66,36 +66,36 @@ class File:
 
     @property
     def is_run(self) -> bool:
-        """Whether a model can be made of it."""
+        """Whether the file can be loaded as a run."""
         return self.told is not None and not self.told["problem"]
 
     @property
     def reading(self) -> Reading:
-        """How it becomes a run, everything said."""
+        """File and arguments of `ftlm.load`, all options included."""
         assert self.told is not None
         return Reading(self.name, self.told["options"])
 
 
 @dataclass
 class Model:
-    """A model on the page.
+    """Model of the session.
 
     Parameters
     ----------
     key, number, recipe
-        What the page calls it, the how-manieth it is, what makes it.
+        Identifier on the page, serial number, fit request.
     state
         ``"waiting"``, ``"running"``, ``"made"``, ``"failed"`` or ``"stopped"``.
-    phase, share, begun, begun_phase, left, took
-        What is done now, how far it is, since when all and this, what is left in words, what it took [s].
+    phase, share, started_at, phase_started_at, left, took
+        Current phase, finished share of it, start times of the fit and of the phase, time left as text, duration [s].
     told
-        What the page shows of it.
+        Content of the page about the model.
     error
-        Why there is none.
+        Reason why there is no model.
     version
-        Counts its changes of state.
+        Number of changes of state.
     files
-        Keys of the files that it is made of.
+        Keys of the files of its runs.
     """
 
     key: str
@@ -116,17 +116,17 @@ class Model:
 
     @property
     def is_busy(self) -> bool:
-        """Whether it waits or runs."""
+        """Whether the model is queued or running."""
         return self.state in (WAITING, RUNNING)
 
 
 class Desk:
-    """Everything of one page; it is used by one thread alone, that of the server.
+    """State of one browser session; only the server's thread may use it.
 
     Parameters
     ----------
     folder
-        A folder of one's own, which :meth:`close` removes; made where none is given.
+        Private folder, which :meth:`close` removes; by default a new temporary folder.
     """
 
     def __init__(self, folder: Path | None = None) -> None:
@@ -141,7 +141,7 @@ class Desk:
     # ------------------------------------------------------------------------------------------------------------ files
 
     def check_room(self, name: str, size: int | None) -> str:
-        """Return what a file will be called, or refuse it: too large, or one too many."""
+        """Return the name under which a file will be stored; refuse a file beyond the limits."""
         if len(self.files) >= MOST_FILES:
             raise DataError(f"{MOST_FILES} files are open, as many as there may be; remove one")
         if size is not None:
@@ -167,12 +167,12 @@ class Desk:
         return free
 
     async def take(self, name: str, size: int | None, chunks: AsyncIterator[bytes]) -> File:
-        """Keep a file that comes in pieces, and begin to open it; most are open when this returns.
+        """Store a file that arrives in chunks, and start to open it. Most files are open on return.
 
         Raises
         ------
         DataError
-            It is too large, said beforehand or not; or one too many.
+            The file exceeds a size limit, declared or not, or there are too many files.
         """
         free = self.check_room(name, size)
         path, written = self.folder / free, 0
@@ -196,14 +196,14 @@ class Desk:
         return file
 
     def _begun(self, work: Coroutine[Any, Any, None]) -> asyncio.Task[None]:
-        """Begin work that goes on by itself, and keep hold of it."""
+        """Start a background job and keep a reference to it."""
         job = asyncio.create_task(work)
         self._jobs.add(job)
         job.add_done_callback(self._jobs.discard)
         return job
 
     async def open(self, file: File) -> None:
-        """Say what a file is, by what is asked of it; an earlier reading of it that goes on is ended."""
+        """Read the preview of a file with the user's options; an earlier reading is stopped."""
         if file.task is not None:
             file.task.stop()
         asked = {"do": "open", "file": file.name, "options": file.asked}
@@ -219,12 +219,12 @@ class Desk:
         file.version += 1
 
     def remove_file(self, key: str) -> None:
-        """Forget a file; models made of it stay.
+        """Remove a file; models identified from it stay.
 
         Raises
         ------
         DataError
-            A model that waits or runs still needs it.
+            A queued or running model needs the file.
         """
         file = self.files[key]
         if any(m.is_busy and file.name in _names(m.recipe) for m in self.models.values()):
@@ -238,12 +238,12 @@ class Desk:
     # ----------------------------------------------------------------------------------------------------------- models
 
     def recipe(self, told: Mapping[str, Any]) -> Recipe:
-        """What a person asks for.
+        """Return the fit request of the page's form.
 
         Raises
         ------
         DataError, ModelError
-            A file that is not there, being read or no run yet; words that are not known; an equation that is none.
+            A file that is absent, still being read or no run; an unknown option; an invalid equation.
         """
         other = str(told.get("validation") or "")
         share = real_number("share", told.get("share", 0))
@@ -279,12 +279,12 @@ class Desk:
         return file.reading
 
     def start(self, recipe: Recipe) -> Model:
-        """Make a model as soon as those before it are made.
+        """Queue a model.
 
         Raises
         ------
         DataError
-            As many models are kept, or wait, as may be.
+            Too many models, or too many in the queue.
         """
         if len(self.models) >= MOST_MODELS:
             raise DataError(f"{MOST_MODELS} models are kept, as many as there may be; remove one")
@@ -301,12 +301,12 @@ class Desk:
             raise DataError(f"{MOST_WAITING} models wait already; stop one, or wait")
 
     def resume(self, key: str) -> Model:
-        """Go on with a model that was stopped: a choice where it was, a fit from its start.
+        """Continue a stopped model: a structure selection from its checkpoint, a fit from the beginning.
 
         Raises
         ------
         DataError
-            A file of it was removed, or as many models wait as may.
+            One of its files was removed, or the queue is full.
         """
         model = self.models[key]
         if model.state not in (STOPPED, FAILED):
@@ -348,7 +348,7 @@ class Desk:
             model.version += 1
 
     def stop(self, key: str) -> None:
-        """End a model that waits or runs; what is made stays."""
+        """Stop a queued or running model; finished files stay."""
         model = self.models[key]
         if model.is_busy:
             model.state = STOPPED
@@ -357,7 +357,7 @@ class Desk:
                 model.task.stop()
 
     def remove_model(self, key: str) -> None:
-        """Forget a model."""
+        """Remove a model and its files."""
         self.stop(key)
         del self.models[key]
         for suffix in (".json", ".html", ".ftlm"):
@@ -367,13 +367,13 @@ class Desk:
     # ------------------------------------------------------------------------------------------------------------- both
 
     def without_paths(self, words: str) -> str:
-        """Words in which no folder of this machine is named."""
+        """Return a message without folders of this machine."""
         for folder in {str(self.folder), str(self.folder.resolve())}:
             words = words.replace(f"{folder}/", "").replace(f"{folder}\\", "").replace(folder, "the page's folder")
         return words
 
     async def close(self) -> None:
-        """End all work and remove the folder."""
+        """Stop all work and remove the folder."""
         for file in self.files.values():
             if file.task is not None:
                 file.task.stop()
@@ -387,7 +387,7 @@ class Desk:
 
 
 def _check_signals(structure: Structure, reading: Reading) -> None:
-    """Refuse a signal that a run does not have, before a process is started for it."""
+    """Raise if the run lacks a signal of the structure, before a process is started."""
     there = [name for role in ("outputs", "inputs") for name in reading.options.get(role, {})]
     for name in structure.signals:
         if name not in there:
@@ -402,7 +402,7 @@ def _names(recipe: Recipe) -> set[str]:
 
 
 def _note(model: Model, said: Mapping[str, Any]) -> None:
-    """Keep what a process says of its progress."""
+    """Store a progress report of a task process in its model."""
     if "phase" in said:
         model.phase, model.share, model.left = str(said["phase"]), None, ""
         model.begun_phase = time.monotonic()
@@ -420,7 +420,7 @@ def _note(model: Model, said: Mapping[str, Any]) -> None:
 
 
 def safe_name(name: str) -> str:
-    """A file's name without folders, and without what no file system takes."""
+    """Return a file name without folders and without characters that a file system refuses."""
     last = re.split(r"[/\\]", name)[-1]
     bare = "".join(c if c.isprintable() and c not in _REFUSED else "_" for c in last).strip(" .") or "file"
     stem, dot, suffix = bare.rpartition(".")

@@ -1,4 +1,4 @@
-"""A process that does one task: started, listened to line by line, ended at once."""
+"""Parent side of a task process: start it, read its messages line by line, and kill it."""
 
 from __future__ import annotations
 
@@ -14,25 +14,25 @@ from typing import Any
 
 from ftlm.errors import DataError
 
-#: The longest line that a task may answer [bytes]: a page of charts takes some hundred kilobytes.
+#: Longest line of a task's answer. A page of charts takes some hundred kilobytes.
 LONGEST = 64 << 20
 
 
 class TaskError(DataError):
-    """A task that ended without an answer, in words for the page."""
+    """Task that ended without an answer; the message is for the page."""
 
 
 class Task:
-    """One task in a process of its own.
+    """Task in a process of its own.
 
     Parameters
     ----------
     asked
-        What :mod:`ftlm.app.work` is to do.
+        Task for :mod:`ftlm.app.work`, as JSON.
     folder
-        Where.
+        Working directory of the process.
     told
-        Called with each report.
+        Called with each progress report.
     """
 
     def __init__(self, asked: Mapping[str, Any], folder: Path, told: Callable[[Mapping[str, Any]], None]) -> None:
@@ -43,17 +43,17 @@ class Task:
         self._ended = False
 
     async def answer(self, seconds: float | None = None) -> dict[str, Any]:
-        """Do it.
+        """Run the task and return its answer.
 
         Parameters
         ----------
         seconds
-            How long it may take; None for as long as it takes.
+            Time limit [s]; None for no limit.
 
         Raises
         ------
         TaskError
-            It refused in words, crashed, was ended, or took too long.
+            The task reported an error, crashed, was stopped or exceeded the time limit.
         """
         if self._ended:
             raise TaskError("stopped")
@@ -83,7 +83,7 @@ class Task:
             await process.wait()
 
     async def _listened(self, process: asyncio.subprocess.Process) -> dict[str, Any]:
-        """The answer of a process, its reports passed on."""
+        """Return the answer of the process and forward its reports."""
         assert process.stdin is not None
         assert process.stdout is not None
         with contextlib.suppress(ConnectionError):
@@ -107,12 +107,12 @@ class Task:
             self._told(said)
 
     def stop(self) -> None:
-        """End it at once; its answer is then an error."""
+        """Kill the task; :meth:`answer` then raises."""
         self._ended = True
         self._kill()
 
     def _kill(self) -> None:
-        """End the process and what it started."""
+        """Kill the process and its children."""
         process = self._process
         if process is None or process.returncode is not None:
             return
@@ -124,7 +124,7 @@ class Task:
 
 
 def _ending(code: int) -> str:
-    """How a process ended that gave no answer."""
+    """Describe the exit of a process that gave no answer."""
     if code >= 0:
         return f"the process that worked on it ended with code {code}, without an answer; try a smaller file"
     try:

@@ -1,4 +1,4 @@
-"""The page and its parts as HTML: everything that a file or a person says is escaped by the templates."""
+"""HTML of the page, of its files and of its models; the templates escape all text from files and users."""
 
 from __future__ import annotations
 
@@ -26,7 +26,7 @@ from ftlm.svg.line_chart import chart_css
 from ftlm.utils.formatting import number
 from ftlm.validation.comparison import finite
 
-#: Ways of Python to say something, and those of the page.
+#: Label of the form field of each Python argument.
 _FIELDS = {
     "step": "Step",
     "resample": "Put on the step",
@@ -42,7 +42,7 @@ _FIELDS = {
     "sheet": "Sheet",
     "slice": "From” and “To",
 }
-#: An argument of Python with its value, or with a word in capitals that stands for one.
+#: Python argument with its value, or with a placeholder in capitals.
 _ARGUMENT = re.compile(
     r"\b(resample|time_unit|missing|step|time|slice)=(?:'([\w-]+)'|(\d[\w.+-]*\w|\d)|[A-Z]+\b)?|layout=dict\((\w+)=[^)]*\)"
 )
@@ -54,7 +54,7 @@ _ORDER = {"trust": 0, "with care": 1, "do not use": 2}
 
 
 def _field(found: re.Match[str]) -> str:
-    """What the page calls an argument, with its value."""
+    """Label of the form field of an argument, with its value."""
     name, value = found[1] or found[4], found[2] or found[3]
     shown = "the role “time”" if name == "time" else f"the field “{_FIELDS.get(name, name)}”"
     return f"{shown} {value}" if value else shown
@@ -79,25 +79,25 @@ def _rendered(template: str, **told: Any) -> str:
 
 @cache
 def script() -> str:
-    """The page's script, behind that of its charts."""
+    """Return the script of the page, after that of its charts."""
     return f"{chart_script()}\n{_read('app.js')}"
 
 
 @cache
 def style() -> str:
-    """The look of the reports, and what the page has beyond it."""
+    """Return the style of reports and of the page."""
     return f"{look()}\n{chart_css()}\n{_read('app.css')}"
 
 
 def page_words(text: str) -> str:
-    """Words of ftlm's errors, with what the page has in place of Python's arguments."""
+    """Return an error message with form labels in place of Python arguments."""
     for pattern, words in _PLAIN:
         text = pattern.sub(words, text)
     return _ARGUMENT.sub(_field, text)
 
 
 def page(desk: Desk) -> str:
-    """The whole page as it is now."""
+    """Return the whole page in its current state."""
     parts = {
         "files": Markup("").join(Markup(file(f)) for f in desk.files.values()),  # escaped by its template
         "models": Markup("").join(Markup(model(m)) for m in reversed(desk.models.values())),
@@ -116,7 +116,7 @@ def page(desk: Desk) -> str:
 
 
 def file(shown: File) -> str:
-    """A file with its columns and what was assumed of it."""
+    """Return a file with its columns and assumptions."""
     told = shown.told
     chosen = {} if told is None else told["options"]
     facts = {
@@ -142,12 +142,12 @@ def file(shown: File) -> str:
 
 
 def model(shown: Model) -> str:
-    """A model, in whatever state it is."""
+    """Return a model in any state."""
     return _rendered("model.html.j2", model=shown, told=shown.told, recipe=shown.recipe)
 
 
 def comparison(desk: Desk) -> str:
-    """Models side by side, those to be trusted first."""
+    """Return a table of the models, the most trustworthy first."""
     made = [m for m in desk.models.values() if m.state == MADE and m.told is not None]
     made.sort(key=lambda m: (_ORDER.get((m.told or {})["verdict"]["level"], 3), -_worst(m)))
     outputs = list(dict.fromkeys(f["output"] for m in made for f in (m.told or {})["fits"]))
@@ -156,13 +156,13 @@ def comparison(desk: Desk) -> str:
 
 
 def _worst(shown: Model) -> float:
-    """The worst fit of a model, on validation where it has one."""
+    """Worst fit of a model, on validation data if there are any."""
     fits = [f["estimation"] if f["validation"] is None else f["validation"] for f in (shown.told or {})["fits"]]
     return min((-1e300 if f is None else float(f) for f in fits), default=-1e300)
 
 
 def state(desk: Desk) -> dict[str, Any]:
-    """What changes, for a page that asks again and again."""
+    """Return versions and progress of files and models, for polling by the page."""
     return {
         "files": {f.key: f.version for f in desk.files.values()},
         "models": {
@@ -178,13 +178,13 @@ def state(desk: Desk) -> dict[str, Any]:
     }
 
 
-#: Points of a line on the page, and pictures of a model or a run.
+#: Points per line of a chart, and charts per model or run.
 POINTS = 1500
 MOST = 12
 
 
 def shown(made: Made) -> dict[str, Any]:
-    """All that the page shows of a model, markup of escaped parts."""
+    """Return the page content of a model; markup consists of escaped parts."""
     result, checked = made.result, made.checked
     judged = result.verdict(checked)
     warnings, left = first_warnings(list(dict.fromkeys([*result.warnings, *(checked.warnings if checked else ())])))
@@ -221,12 +221,12 @@ def shown(made: Made) -> dict[str, Any]:
 
 
 def drawn(figures: list[Figure]) -> list[dict[str, str]]:
-    """Figures for screens wide and narrow."""
+    """Return the markup of figures for wide and narrow screens."""
     return [
         {"title": f.title, "wide": str(f.svg), "narrow": str(f.narrow), "caption": f.caption} for f in figures[:MOST]
     ]
 
 
 def pictures(run: Run) -> list[dict[str, str]]:
-    """A run's signals over time, outputs first."""
+    """Return charts of a run's signals over time, outputs first."""
     return drawn(list(run.plot(*[*run.outputs, *run.inputs][:MOST])))

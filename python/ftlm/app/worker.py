@@ -1,9 +1,9 @@
-"""Opens a file or makes a model in a process of its own, which a hostile file or a long fit may take with it.
+"""Worker process that opens a file or fits a model, isolated from hostile files and long fits.
 
 Run as ``python -P -m ftlm.app.work`` in the folder of the files. The first line of standard input is the task, a JSON
 object: ``{"do": "open", "file": …, "options": …}`` or ``{"do": "model", "recipe": …, "store": …, "model": …,
-"report": …}``; where it ends, so does this process. Standard output has a JSON object a line: ``{"phase": words}``,
-``{"done": …, "total": …}`` and at last ``{"answer": …}`` or ``{"error": words}``.
+"report": …}``. The process ends when standard input ends. Standard output has one JSON object per line:
+``{"phase": words}``, ``{"done": …, "total": …}`` and finally ``{"answer": …}`` or ``{"error": words}``.
 """
 
 from __future__ import annotations
@@ -23,7 +23,7 @@ from ftlm.errors import FtlmError
 from ftlm.io.preview import OpenedFile, open_file
 from ftlm.progress import Progress
 
-#: Memory that opening a file may take [bytes], and seconds between two reports of progress.
+#: Memory limit of the process [bytes], and time between two progress reports.
 MEMORY_LIMIT = 6 << 30
 PAUSE = 0.1
 #: Columns of a file that the page shows.
@@ -31,7 +31,7 @@ MOST_COLUMNS = 200
 
 
 class Reports(Progress):
-    """Passes on what work says of itself, a line a report; several threads may tell it."""
+    """Progress reports on standard output, one line each; thread-safe."""
 
     def __init__(self, stream: TextIO) -> None:
         super().__init__("", quiet=True)
@@ -47,11 +47,11 @@ class Reports(Progress):
             self._stream.flush()
 
     def phase(self, words: str) -> None:
-        """Say what comes next."""
+        """Announce the next phase."""
         self.send(phase=words)
 
     def __call__(self, done: int, total: int, pruned: int | None = None) -> None:
-        """Say how far it is, now and then."""
+        """Report progress at most once per interval."""
         now = time.monotonic()
         if now - self._last >= PAUSE or done >= total:
             self._last = now
@@ -59,7 +59,7 @@ class Reports(Progress):
 
 
 def main() -> None:
-    """Do the task of standard input."""
+    """Run the task of standard input."""
     # What anything prints must not stand between the answers.
     stream = os.fdopen(os.dup(sys.stdout.fileno()), "w", encoding="utf-8")
     os.dup2(os.open(os.devnull, os.O_WRONLY), sys.stdout.fileno())
@@ -80,13 +80,13 @@ def main() -> None:
 
 
 def _end_with_parent() -> None:
-    """End at once where nobody is left to listen."""
+    """Exit when the parent process ends."""
     sys.stdin.read()
     os._exit(1)
 
 
 def _limit_memory() -> None:
-    """Bound this process's memory where the system can."""
+    """Set the memory limit of this process if the system supports it."""
     try:
         resource: Any = importlib.import_module("resource")
     except ImportError:
@@ -100,7 +100,7 @@ def _limit_memory() -> None:
 
 
 def opened(task: Mapping[str, Any]) -> dict[str, Any]:
-    """What a file is, as the page shows it."""
+    """Return the preview of a file for the page."""
     found = open_file(task["file"], **task["options"])
     told = found.to_dict()
     return {
@@ -124,16 +124,16 @@ def _signals(found: OpenedFile) -> tuple[list[str], list[str]]:
 
 
 def _seen(found: OpenedFile) -> dict[str, Any]:
-    """The run of a file: its picture, and what to know before a model is made of it."""
+    """Return charts and advice of a file's run."""
     if found.problem:
         return {"figures": [], "advice": [], "length": 0}
-    # The rows that were shown are those that are fitted: read once more, everything said.
+    # The file is read again with all options fixed, so that the fit uses the rows of the preview.
     run = found.load()
     return {"figures": pictures(run), "advice": [a.sentence for a in run.advice()], "length": run.length}
 
 
 def modelled(task: Mapping[str, Any], reports: Reports) -> dict[str, Any]:
-    """A model, its files and what the page shows of it."""
+    """Fit a model, write its files, and return its summary for the page."""
     made = Recipe.of(task["recipe"]).made(reports, task["store"])
     reports.phase("writing the report")
     made.result.model.save(task["model"])

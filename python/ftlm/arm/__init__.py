@@ -1,1 +1,1 @@
-"""The two-link arm's physics."""
+"""Physics of the flexible two-link arm."""

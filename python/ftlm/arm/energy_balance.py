@@ -1,4 +1,4 @@
-"""Energies (7)-(9) and generalised forces (10)-(11) of a run of one stage, and where their power goes."""
+"""Energies (7)-(9), generalized forces (10)-(11) and the power balance of a run of one joint of the arm."""
 
 from __future__ import annotations
 
@@ -15,30 +15,31 @@ from ftlm.errors import DataError, ModelError
 from ftlm.fractional_calculus import fractional_derivative
 from ftlm.utils.validation import Floats
 
-#: A force of order nu is a sum over relaxations at rates from this share of 1/T to so many times 1/h; slower ones are a
-#: spring, faster ones a dashpot, exactly.
+#: Range of the relaxation rates whose sum gives a force of order nu: this factor times 1/T to this factor times 1/h.
+#: Slower relaxations equal a spring and faster ones a dashpot.
 SLOWEST, FASTEST = 1e-3, 1e3
-#: Distance of two rates in their logarithm: the sum is then the integral to 1e-6.
+#: Difference in ln(rate) of neighboring relaxations. The sum then equals the integral to 1e-6.
 APART = 0.5
-#: An angle is at rest where it starts within this share of its largest value, its first difference within that of the
-#: largest one, or, in few samples, of the second: from rest t^alpha has 1/3 of it with alpha = 2, and 0.55 with 1.5.
+#: An angle counts as at rest if its first value is within this fraction of its largest one, and its first increment
+#: within a fraction of the largest increment or, in short runs, of the second one. From rest t^alpha has a ratio of
+#: first to second increment of 1/3 for alpha = 2 and of 0.55 for alpha = 1.5.
 STARTS, MOVES_OFF, SPEEDS_UP = 0.01, 0.1, 2 / 3
-#: Rows that differences of third order need.
+#: Minimum number of samples for differences of third order.
 FEWEST = 4
 
 
 @dataclass(frozen=True)
 class Power:
-    """Power of one force c D^nu theta on its own angle, and what becomes of it, each of shape (N,).
+    """Power of a force c D^nu theta on its own angle, and its stored and dissipated parts, each of shape (N,).
 
     Parameters
     ----------
     supplied
         c D^nu theta times the rate of theta [W].
     stored
-        What of it can come back [J]: all of a spring's (nu = 0), nothing of a dashpot's (nu = 1).
+        Recoverable energy [J]: all of it for a spring (nu = 0), 0 for a dashpot (nu = 1).
     lost
-        What cannot [W], never negative.
+        Dissipated power [W], never negative.
     """
 
     supplied: Floats
@@ -48,7 +49,7 @@ class Power:
 
 @dataclass(frozen=True)
 class Energies:
-    """Energies and generalised forces of a run of one stage at its N samples, each of shape (N,).
+    """Energies and generalized forces of one joint of the arm at the N samples of a run, each of shape (N,).
 
     Parameters
     ----------
@@ -59,11 +60,11 @@ class Energies:
     hub_kinetic, link_kinetic
         Kinetic energies (8); with gamma_1 = mu_2 = 1 in J.
     hub_force, link_force
-        Non-conservative generalised forces (10), (11) [N m].
+        Non-conservative generalized forces (10), (11) [N m].
     motor
         Power of the motor's torque on its hub [W].
     inertia
-        Power that the inertial terms of (14) and (15) take [W]: with whole orders the rate of (9).
+        Power of the inertial terms of (14) and (15) [W]. For integer orders it is the time derivative of (9).
     elastic, hub_friction, link_friction
         Of the link's elasticity K_s D^beta_2, of the friction B_1 D^gamma_1 of the hub, and B_2 D^mu_2 of the link.
     """
@@ -87,17 +88,17 @@ class Energies:
 
     @property
     def lagrangian(self) -> Floats:
-        """L = Tr - V, of which (12) and (13) are made."""
+        """Lagrangian L = Tr - V of (12) and (13)."""
         return self.kinetic - self.potential
 
 
 def energies(
     run: Run, *, stage: int = 1, parameters: LinkParameters | None = None, orders: Mapping[str, float] | None = None
 ) -> Energies:
-    """Energies and generalised forces of a run of one stage by (7)-(11), and the balance of their power.
+    """Return energies and generalized forces of one joint by (7)-(11), and their power balance.
 
-    Multiplied by the rates of their angles, (14) and (15) say where the motor's power goes: into inertia, into the
-    link's elasticity, and into both frictions. A force of fractional order stores a part of what it takes and loses
+    Equations (14) and (15), multiplied by the rates of their angles, split the power of the motor into inertia,
+    elasticity of the link, and both frictions. A force of fractional order stores a part of the power and dissipates
     the rest: c D^nu theta is a sum of relaxing springs (its diffusive representation), whose energies add up.
 
     Parameters
@@ -175,7 +176,7 @@ def energies(
 
 
 def _check_rest(run: str, name: str, angle: Floats) -> None:
-    """Every derivative here is one of rest: what was there before would be taken for a blow at the first sample."""
+    """Raise DataError unless an angle starts at rest; prior motion would act as an impulse at the first sample."""
     moves = np.diff(angle)
     way_out = (
         "energies are those of a run from rest, with angles from 0: slice it where it rests, and take that angle off"
@@ -187,10 +188,10 @@ def _check_rest(run: str, name: str, angle: Floats) -> None:
 
 
 def power(angle: Floats, coefficient: float, order: float, step: float) -> Power:
-    """Power of c D^nu theta on theta, from rest: what it stores and what it loses.
+    """Return the power of c D^nu theta on theta from rest, split into stored energy and dissipated power.
 
     D^nu theta = sin(pi nu)/pi times the integral over w from 0 of w^(nu-1) z_w, where z_w' = -w z_w + theta'. Every z_w
-    is a spring behind a dashpot: it stores z_w^2/2 and loses w z_w^2.
+    is a spring in series with a dashpot: it stores z_w^2/2 and dissipates w z_w^2.
 
     Parameters
     ----------

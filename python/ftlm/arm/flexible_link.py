@@ -19,7 +19,7 @@ from ftlm.utils.validation import shown
 
 @dataclass(frozen=True)
 class LinkParameters:
-    """Physical parameters of one stage.
+    """Physical parameters of one joint of the arm.
 
     Parameters
     ----------
@@ -88,17 +88,17 @@ INTEGER_ORDERS = {"gamma": 1.0, "beta": 0.0, "mu": 1.0}
 
 
 def whole_order(name: str) -> float:
-    """The manual's integer order of an order's name, such as gamma1."""
+    """Return the integer order of the manual for an order name such as gamma1."""
     return INTEGER_ORDERS.get(name.rstrip("0123456789"), 2.0)
 
 
 #: Orders of the cross-stage terms: torques of the other stage act through its angles and its current as they are.
 CROSS_ORDER = 0.0
-#: A link is second order or a little less.
+#: Range of the highest order of an equation: a link is of second order or slightly below.
 HIGHEST = (1.2, 2.0)
-#: Values beside the whole orders of a link's physics: damping on the rate or a little below, stiffness on the angle.
+#: Typical orders near the integer ones: damping on the rate or slightly below, stiffness on the angle.
 NATURAL = {"alpha": (2.0,), "gamma": (0.9, 1.0), "beta": (0.0, 0.15), "mu": (0.8, 1.0)}
-#: Where the orders of a link's elasticity and of its damping lie (low, high, step) where no other equation tells them.
+#: Ranges (low, high, increment) of the elasticity and damping orders if no other equation identifies them.
 APART = {"beta": (0.0, 0.5, 0.05), "mu": (0.5, 1.95, 0.05)}
 #: Orders by the letter of the coefficient whose term they differentiate, as in (22)-(25).
 ORDER_OF = {"a": "beta", "b": "gamma", "d": "mu"}
@@ -107,12 +107,12 @@ InputOrder: TypeAlias = Literal["published", "derived"]
 CrossStage: TypeAlias = Literal["torques", "inertial"] | bool
 Rubs: TypeAlias = Literal["coulomb", "stribeck"] | bool
 Law: TypeAlias = Literal["orders", "coefficients", "velocities"]
-#: What is known of the arm.
+#: Names of the physical laws that can be imposed.
 LAWS = ("orders", "coefficients", "velocities")
 
 
 def _hints(form: Form) -> Hints:
-    """What no order law changes: where the orders of either stage lie, what they are called, and what ratios exceed."""
+    """Hints for estimation: ranges and names of the orders, and lower bounds of the inertia ratios."""
     return Hints(
         HIGHEST,
         {f"{order}{n}": values for order, values in NATURAL.items() for n in range(1, 5)},
@@ -124,7 +124,7 @@ def _hints(form: Form) -> Hints:
 
 
 def _form(form: Form | None, input_order: InputOrder | None) -> tuple[Form, InputOrder]:
-    """The form that is asked for: naming an order of the current names the form that has one."""
+    """Return the requested form; an input order implies the published form."""
     if form is None:
         form = "lagrange" if input_order is None else "published"
     if form not in ("lagrange", "published"):
@@ -143,7 +143,7 @@ def _form(form: Form | None, input_order: InputOrder | None) -> tuple[Form, Inpu
 def order_law(
     stage: int, input_order: InputOrder | None = None, *, form: Form | None = None, velocities: bool = False
 ) -> dict[str, Order]:
-    """Every order of a stage's two equations as a function of the five free ones.
+    """Return every order of the two equations of a joint as a function of the five free orders.
 
     Parameters
     ----------
@@ -210,7 +210,7 @@ def flexible_link(
     sensor_filter: SensorFilter | Literal["stock"] | None = None,
     offset: Literal["none", "constant", "ramp"] = "none",
 ) -> Structure:
-    """Make the physics of a flexible link: two equations a stage, of its hub and of its deflection.
+    """Return the structure of a flexible link: two equations for each joint, of its hub and of its deflection.
 
     Parameters
     ----------
@@ -399,7 +399,7 @@ def flexible_link(
 def _stage(
     stage: int, form: Form, law: Mapping[str, Order], laws: Sequence[str], friction: bool
 ) -> tuple[Equation, Equation]:
-    """Equations of the hub and of the deflection."""
+    """Return the equations of the hub and of the deflection of one joint."""
     h, d = 2 * stage - 1, 2 * stage
     hub, deflection, current = f"theta{stage}1", f"theta{stage}2", f"I{stage}"
     tied = "orders" in laws
@@ -429,13 +429,13 @@ def _stage(
 
 
 def _added(item: Equation, terms: Sequence[Term]) -> Equation:
-    """An equation with more terms, before those of friction."""
+    """Return an equation with further terms inserted before its friction terms."""
     rubs = tuple(t for t in item.terms if t.signal.startswith("coulomb_"))
     return replace(item, terms=(*item.terms[: len(item.terms) - len(rubs)], *terms, *rubs))
 
 
 def _twisted(made: tuple[Equation, Equation], stage: int) -> tuple[Equation, Equation]:
-    """Torques of the other stage: its angles and its current as they are."""
+    """Add the torques of the other joint: terms in its angles and its current, of order 0."""
     other, first = 3 - stage, 2 * stage - 1
     signals = (f"theta{other}1", f"theta{other}2", f"I{other}")
     hub, deflection = (
@@ -446,7 +446,7 @@ def _twisted(made: tuple[Equation, Equation], stage: int) -> tuple[Equation, Equ
 
 
 def _pushed(made: tuple[Equation, Equation], stage: int, laws: Sequence[str], both: bool) -> tuple[Equation, Equation]:
-    """Inertia of the other stage, by the energies of the planar arm with the absolute rates of (8) in them.
+    """Add the inertial terms of the other joint, from the energies of the planar arm with the absolute rates of (8).
 
     T = (J_11 w_1^2 + J_12 w_2^2 + J_21 w_3^2 + J_22 w_4^2)/2 + H w_2 w_4 with w_1 = D theta_11, w_2 = w_1 + D theta_12,
     w_3 = w_2 + D theta_21, w_4 = w_3 + D theta_22, J_12 with all masses beyond link 1 at its tip and H the product of
@@ -468,7 +468,7 @@ def _pushed(made: tuple[Equation, Equation], stage: int, laws: Sequence[str], bo
 
 
 def _followed(item: Equation, stage: int, *, other: bool) -> Equation:
-    """Hub angles in the measured deflection."""
+    """Add hub angles to the equation of the measured deflection."""
     signals = (f"theta{stage}1", f"theta{3 - stage}1")[: 1 + other]
     return _added(item, [Term(s, Order(), f"{c}{2 * stage}") for c, s in zip("ef", signals, strict=False)])
 
@@ -483,9 +483,10 @@ def link_model(
     input_order: InputOrder | None = None,
     coupling: Literal["simulated", "measured"] = "simulated",
 ) -> Model:
-    """Make the arm with everything known: by default the integer-order model of the maker's manual.
+    """Return a model of the arm with known parameters, by default the integer-order model of the manufacturer's manual.
 
-    With whole orders the forms are one model. With fractional ones the published form bends the link the wrong way.
+    With integer orders both forms are the same model. With fractional orders the deflection of the published form has
+    the wrong sign.
 
     Parameters
     ----------

@@ -1,4 +1,4 @@
-"""The command line: results to standard output, progress to standard error, exit codes that scripts can read."""
+"""Command line: results on standard output, progress on standard error, exit codes for scripts."""
 
 from ftlm.cli.main import app, main
 

@@ -1,4 +1,4 @@
-"""Commands that look first: at a file (`open`), at a run (`inspect`), at the installation (`doctor`)."""
+"""Commands for data: open, inspect, doctor, record."""
 
 from __future__ import annotations
 
@@ -28,7 +28,7 @@ from ftlm.structure.parser import equation
 from ftlm.utils.validation import available_threads
 from ftlm.validation.data_advice import inspect_run
 
-#: What reads which files, and the extra that installs it.
+#: Reader packages with their file types and the extra that installs them.
 _READERS = {
     "scipy": (".mat files", "mat"),
     "h5py": (".mat files of version 7.3 and HDF5", "hdf5"),
@@ -44,13 +44,13 @@ def open_(
     reading: ReadingOptions,
     as_json: Json = False,
 ) -> None:
-    """Say what a file is: columns, units, roles, step, what was assumed and what says otherwise, what to type next."""
+    """Preview a file: columns, units, roles, step, assumptions with contrary evidence, next command."""
     show(reading.opened(file), as_json=as_json)
 
 
 @command
 def inspect(*, files: Files, reading: ReadingOptions, as_json: Json = False) -> None:
-    """Show what a run holds: ranges, noise, quantisation, rest, and what to do about it before identification."""
+    """Print ranges, noise, quantization and rest of runs, and advice before identification."""
     inspected = [(inspect_run(run), run.advice()) for run in reading.runs(files)]
     if as_json:
         data = [{**figures.to_dict(), "advice": advice.to_dict()} for figures, advice in inspected]
@@ -61,7 +61,7 @@ def inspect(*, files: Files, reading: ReadingOptions, as_json: Json = False) -> 
 
 @command
 def doctor(*, as_json: Json = False) -> None:
-    """Show versions, cores, vector unit, and whether the rig's driver is there."""
+    """Print versions, cores, vector unit, and whether the rig's driver is installed."""
     about: dict[str, Any] = {
         "ftlm": _core.__version__,
         "core": _core.__version__,
@@ -92,7 +92,7 @@ def _installed(package: str) -> str | None:
 
 @dataclass(frozen=True)
 class LiveOptions:
-    """What is identified while the run is recorded."""
+    """Options of the identification during a recording."""
 
     live: Annotated[Text, Option(metavar="STRUCTURE", help="Identify meanwhile: flexible-link:1, :2, an equation.")] = (
         None
@@ -104,7 +104,7 @@ class LiveOptions:
     k0: Annotated[Number, Option(help="Prior covariance of --live; default 1.")] = None
 
     def stream(self, rig: str, parameters: str, rate: float, limit: float) -> Streaming | None:
-        """The identification, for a rig's samples a second and longest run [s]; None where none is asked for."""
+        """Return the streaming estimator for a rate [Hz] and a longest run [s]; None if not requested."""
         if self.live is None:
             given = {"--order": bool(self.orders), "--p": self.p is not None, "--k0": self.k0 is not None}
             useless = [option for option, is_given in given.items() if is_given]
@@ -167,7 +167,7 @@ def record(
     force: Force = False,
     as_json: Json = False,
 ) -> None:
-    """Drive a rig, simulated by default, and record a run that every other command reads."""
+    """Run an experiment on a rig, simulated by default, and record it as a run."""
     currents = several("--amplitude", amplitude, 1, 2)
     low, high = several("--band", band, 2)
     shift = None if offset is None else several("--offset", offset, 2)
@@ -217,7 +217,7 @@ def record(
 
 
 def each_second(stream: Streaming | None, rate: float, progress: Progress) -> Callable[[int, int], None]:
-    """Moves the bar, and prints the live estimate once a second of the run."""
+    """Return a callback that updates the bar and prints the live estimate once per second of the run."""
     due = 1.0
 
     def shown(done: int, total: int) -> None:

@@ -1,4 +1,4 @@
-"""The commands that design on a model: control and shape."""
+"""Commands for designs: controllers, input shapers, optimal inputs."""
 
 from __future__ import annotations
 
@@ -31,7 +31,7 @@ from ftlm.plot import matplotlib_figures as design_plots
 from ftlm.progress import Progress
 from ftlm.utils.files import COMMAND, check_free, write_atomically
 
-#: Options that one design has and the other has not.
+#: Options of one design only.
 OF_PID = ("crossover", "phase_margin")
 OF_LQG = ("allowed", "effort", "drift", "noise", "measured", "band", "poles")
 
@@ -79,7 +79,7 @@ def control(
     force: Force = False,
     as_json: Json = False,
 ) -> None:
-    """Design a controller on a model: margins, what its intervals leave of them, and what a machine runs, as a file."""
+    """Design a controller on a model: margins, their ranges over the model's uncertainty, controller file."""
     given = dict(locals())
     check_free(out, plan, force=force, words=COMMAND)
     check_ending(out, ".json")
@@ -160,7 +160,7 @@ def shape(
     force: Force = False,
     as_json: Json = False,
 ) -> None:
-    """Make an input shaper from the poles of a model: a reference split so that their vibrations cancel."""
+    """Design an input shaper from the poles of a model."""
     check_free(out, force=force, words=COMMAND)
     check_ending(out, ".csv")
     made = designs.input_shaper(load_model(model), kind, modes_shaped=modes, coupling=coupling)
@@ -176,7 +176,7 @@ def shape(
 
 
 def _written(planned: designs.PlannedMove, rate: float, path: str, *, force: bool) -> None:
-    """A planned move as rows."""
+    """Write a trajectory as csv rows."""
     time = np.arange(len(planned.path)) / rate
     rows = np.column_stack([time, planned.reference, planned.command, planned.path, *planned.outputs.values()])
     _table(rows, ("time_s", "reference", "command", "path", *planned.outputs), path, force=force)
@@ -223,7 +223,7 @@ def design_input(
     force: Force = False,
     as_json: Json = False,
 ) -> None:
-    """Lay out the next experiment: the input that tells a model's numbers best within the limits of the machine."""
+    """Design the input that determines the parameters best within the limits of the machine."""
     check_free(out, picture, force=force, words=COMMAND)
     check_ending(out, ".csv", ", as a run for a rig does")
     figure_kind(picture)
@@ -255,7 +255,7 @@ def design_input(
 
 
 def _sizes(option: str, given: list[str] | None) -> float | dict[str, float] | None:
-    """One number for all inputs, or numbers by name."""
+    """Return one number for all inputs, or numbers by name."""
     if given and len(given) == 1 and "=" not in given[0]:
         try:
             return float(given[0])

@@ -1,4 +1,4 @@
-"""Commands that find a model in runs: identify, search, resume, status."""
+"""Commands for estimation: identify, identify-frequency, search, resume, status, select, consistency."""
 
 from __future__ import annotations
 
@@ -65,7 +65,7 @@ StoreFile = Annotated[str, Argument(metavar="STORE", help="A file written with -
 
 
 def fit_seconds(runs: Sequence[Run], structure: Structure, threads: int | None, fits: int = 1) -> float:
-    """About how long fits by output error of all their numbers take here, the runs shared out among them [s]."""
+    """Time estimate [s] of output-error fits of all parameters, the runs distributed among the fits."""
     samples = sum(run.length for run in runs) * len(structure.outputs)
     numbers = len(structure.order_names) + len(structure.coefficient_names) + len(structure.free_inputs)
     return expected(fits * by_output_error(samples // max(fits, 1), numbers), check_threads(threads))
@@ -106,7 +106,7 @@ def identify(
     verbose: Verbose = False,
     as_json: Json = False,
 ) -> None:
-    """Identify a model: whether to trust it, its equations, numbers, gain and modes, its fit, and warnings in words."""
+    """Identify a model: verdict, equations, parameters, gain and modes, fit, warnings."""
     check_free(out, report, force=force, words=COMMAND)
     shape.structure(structure)
     begin = None if start is None else load_model(start)
@@ -210,7 +210,7 @@ def search(
 
 
 def check_named(lattice: Lattice, structure: Structure) -> None:
-    """Refuse values of an order that is not free in any equation."""
+    """Raise for an order of the grid that is not free in any equation."""
     for name in lattice.orders:
         if name not in {"alpha", *structure.order_names}:
             free = ", ".join(structure.order_names) or "none"
@@ -218,12 +218,12 @@ def check_named(lattice: Lattice, structure: Structure) -> None:
 
 
 def lattice_of(lattice: Lattice, part: Structure) -> Lattice:
-    """What a lattice says of the orders of one part."""
+    """Return the part of an order grid that concerns one structure."""
     return replace(lattice, orders={n: v for n, v in lattice.orders.items() if n == "alpha" or n in part.order_names})
 
 
 def show_searches(results: Mapping[str, SearchResult], *, as_json: bool) -> None:
-    """Searches by output, for people or as JSON."""
+    """Print search results by output as text or JSON."""
     if as_json:
         show_json({name: result.to_dict() for name, result in results.items()})
     else:
@@ -232,7 +232,7 @@ def show_searches(results: Mapping[str, SearchResult], *, as_json: bool) -> None
 
 @contextlib.contextmanager
 def resumable(path: str | None, how: str | None = None) -> Iterator[None]:
-    """Say after Ctrl-C how to go on with a store, if there is one."""
+    """Print after Ctrl-C how to resume from the checkpoint, if there is one."""
     try:
         yield
     except KeyboardInterrupt:
@@ -243,7 +243,7 @@ def resumable(path: str | None, how: str | None = None) -> Iterator[None]:
 
 
 def show_notes(store: Store) -> None:
-    """What was mended in a store."""
+    """Print the repairs of a checkpoint file."""
     for note in store.notes:
         print(f"ftlm: {store.path}: {note}", file=sys.stderr)
 
@@ -258,7 +258,7 @@ def resume(
     threads: Threads = None,
     as_json: Json = False,
 ) -> None:
-    """Go on with the searches of a store, and show them; it needs no other file."""
+    """Resume the searches of a checkpoint file and print them; no other file is needed."""
     results = {}
     with resumable(store), Store(store, salvage=salvage) as kept:
         show_notes(kept)
@@ -273,7 +273,7 @@ def resume(
 
 @command
 def status(*, store: StoreFile, as_json: Json = False) -> None:
-    """Show how far the searches of a store are; it may be in use."""
+    """Print the progress of the searches of a checkpoint file, which may be in use."""
     states = search_status(store)
     if as_json:
         show_json({name: state.to_dict() for name, state in states.items()})
@@ -283,7 +283,7 @@ def status(*, store: StoreFile, as_json: Json = False) -> None:
 
 @dataclass(frozen=True)
 class ResponseOptions:
-    """How files of frequency responses are read; None is an option that is not given."""
+    """Options for reading frequency responses; None for an option that is not given."""
 
     columns: Annotated[
         Texts,
@@ -316,7 +316,7 @@ class ResponseOptions:
     sheet: Sheet = None
 
     def load(self, file: str) -> FrequencyData:
-        """The record of one file."""
+        """Load one file."""
         columns: dict[str, Any] | None = pairs("--column", self.columns) or None
         return load_frequency(
             file,
@@ -354,7 +354,7 @@ def identify_frequency(
     verbose: Verbose = False,
     as_json: Json = False,
 ) -> None:
-    """Identify a model from a frequency response or an impedance: orders and coefficients with 95 % intervals."""
+    """Identify a model from a frequency response or impedance, with 95 % intervals."""
     check_free(out, report, force=force, words=COMMAND)
     if structure.startswith(("flexible-link", "arm:")) or structure == "auto":
         raise ModelError(f"--structure {structure!r}: a frequency response takes an equation in words")
@@ -384,7 +384,7 @@ def identify_frequency(
         say("\n".join(f"warning: {w}" for w in result.warnings))
 
 
-#: A choice from a list, and one inside structures, took between these multiples of what one fit of each of them takes.
+#: Range of a selection's duration relative to one fit per structure: from a list, and stepwise.
 LISTED, GROWN = (1.0, 8.0), (1.5, 20.0)
 
 
@@ -411,7 +411,7 @@ def select(
     force: Force = False,
     as_json: Json = False,
 ) -> None:
-    """Choose the terms and orders that earn their place on what they were not fitted to."""
+    """Select terms and orders that improve the score on validation data."""
     check_free(out, report, force=force, words=COMMAND)
     if "auto" in structures and len(structures) > 1:
         raise ModelError("--structure auto is searched by itself; leave the others out, or give them without it")
@@ -464,7 +464,7 @@ def agreement(
     force: Force = False,
     as_json: Json = False,
 ) -> None:
-    """Identify parts of a run each by itself, and tell which numbers of which parts are not one model's."""
+    """Identify segments of a run separately, and list the parameters that differ significantly."""
     check_free(report, force=force, words=COMMAND)
     shape.structure(structure)
     runs = reading.runs(files)

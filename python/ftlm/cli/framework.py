@@ -1,4 +1,4 @@
-"""Words of the command line that hold several things: NAME=VALUE, FROM:TO, numbers joined by a colon."""
+"""Compound option values: NAME=VALUE, FROM:TO, numbers joined by a colon."""
 
 from __future__ import annotations
 
@@ -25,7 +25,7 @@ from ftlm.utils.files import write_atomically
 from ftlm.utils.formatting import columns, wrapped
 from ftlm.utils.resources import between, expected
 
-#: What the command line calls an argument of Python.
+#: Option of each Python argument, for messages.
 OPTIONS = {
     "method": "--method",
     "coefficients": "--coefficients",
@@ -108,20 +108,20 @@ OPTIONS = {
     "dates": "--dates",
     "sheet": "--sheet",
 }
-#: ``force=True (--force)``, where the option stands beside the argument already.
+#: Python argument followed by its option, such as ``force=True (--force)``.
 _BESIDE = re.compile(r"\b\w+=\S* \((--[a-z-]+)\)")
-#: What a run is cut by, whose ends a command takes joined by a colon.
+#: Call of ``slice``, whose ends an option takes joined by a colon.
 _CUT = re.compile(r"\bslice\((\S+), (?:None|(\S+?))\)")
-#: What Python says of a layout, whose keys are options of their own.
+#: Layout argument of Python, whose keys are options.
 _LAYOUT = re.compile(r"layout=dict\(([^()]*)\)")
 _COMMANDS = re.compile(r" \(commands: [^)]*\)")
-#: ``-u m=3`` is a name that a user gave, not an argument.
+#: Python argument; ``-u m=3`` is a signal name of the user.
 _ARGUMENT = re.compile(r"(--?[\w-]+ )?(?<![^\s(])(" + "|".join(OPTIONS) + r")=(?:'([^']*)'|([\w.+-]+))?(?![\w{])")
 _BARE = re.compile(r"\b(innovation_length|prior_covariance|time_unit)\b(?!=)")
 
 
 def in_options(text: str) -> str:
-    """Return a message in which the options of the command line stand for the arguments of Python."""
+    """Replace Python arguments in a message by options of the command line."""
     text = text.replace("inputs={name: column}", "-u NAME=COLUMN").replace("outputs={name: column}", "-y NAME=COLUMN")
     text = text.replace("columns={part: column}", "--column PART=COLUMN")
     text = _LAYOUT.sub(lambda found: found[1].replace(", ", " "), text).replace("layout=: ", "")
@@ -140,7 +140,7 @@ def _as_option(found: re.Match[str]) -> str:
 
 
 def pairs(option: str, given: list[str] | None) -> dict[str, str]:
-    """NAME=VALUE options as a dictionary; a bare NAME stands for NAME=NAME."""
+    """Parse NAME=VALUE options; a bare NAME stands for NAME=NAME."""
     values: dict[str, str] = {}
     for item in given or []:
         name, equals, value = item.partition("=")
@@ -159,7 +159,7 @@ def pairs(option: str, given: list[str] | None) -> dict[str, str]:
 
 
 def numbers(option: str, given: list[str] | None) -> dict[str, float]:
-    """NAME=NUMBER options as a dictionary."""
+    """Parse NAME=NUMBER options."""
     values = {}
     for name, value in pairs(option, given).items():
         try:
@@ -170,7 +170,7 @@ def numbers(option: str, given: list[str] | None) -> dict[str, float]:
 
 
 def ranges(option: str, given: list[str] | None) -> dict[str, float | tuple[float, float]]:
-    """INPUT=NUMBER options, or INPUT=LEAST:LARGEST where the number is to be estimated."""
+    """Parse INPUT=NUMBER options, or INPUT=LEAST:LARGEST for a number to estimate."""
     what, example = ("seconds", "0:0.02") if option == "--delay" else ("a number", "0.5:1.5")
     values: dict[str, float | tuple[float, float]] = {}
     for name, value in pairs(option, given).items():
@@ -182,7 +182,7 @@ def ranges(option: str, given: list[str] | None) -> dict[str, float | tuple[floa
 
 
 def interval(text: str, option: str, example: str) -> tuple[float | None, float | None]:
-    """FROM:TO, either end optional."""
+    """Parse FROM:TO with optional ends."""
     parts = text.split(":")
     try:
         if len(parts) != 2:
@@ -194,7 +194,7 @@ def interval(text: str, option: str, example: str) -> tuple[float | None, float 
 
 
 def several(option: str, text: str, *counts: int) -> list[float]:
-    """As many numbers joined by a colon as may be."""
+    """Parse numbers joined by a colon; raise unless there are as many as allowed."""
     values = joined(text)
     if len(values) not in counts:
         raise ModelError(f"{option} {text!r} is not {' or '.join(str(c) for c in counts)} numbers joined by a colon")
@@ -202,18 +202,18 @@ def several(option: str, text: str, *counts: int) -> list[float]:
 
 
 def joined(text: str) -> list[float]:
-    """Numbers joined by a colon; none where one cannot be read."""
+    """Parse numbers joined by a colon; empty if one is invalid."""
     try:
         return [float(part) for part in text.split(":")]
     except ValueError:
         return []
 
 
-#: Options that people take for others, from other programs or from the names of ftlm's functions.
+#: Options of other programs, or argument names, with the options that are meant.
 MEANT = {"--equation": "--structure"}
-#: So many gaps between its cells make a line the row of a table.
+#: Gaps between cells from which a line counts as a table row, and patterns of gaps and list entries.
 ROW, _GAPS, _ENTRY = 3, re.compile(" {2,}"), re.compile(r" *(?:[\w ]+\S {2,}|! |-> |\* |warning: |note: |assumed: )")
-#: Types as a person names them.
+#: Type names in help texts.
 KINDS = {
     "<str>": "TEXT",
     "<list[str]>": "TEXT",
@@ -227,7 +227,7 @@ EXIT_INTERNAL, EXIT_USAGE, EXIT_DATA, EXIT_VALIDATION, EXIT_RIG, EXIT_INTERRUPTE
 
 
 class Command(TyperCommand):
-    """A command that knows which of its options another name was meant for, and names kinds of values in words."""
+    """Command that suggests the right option for a common alias, and names types in plain words."""
 
     def __init__(self, *given: Any, **named: Any) -> None:
         super().__init__(*given, **named)
@@ -239,7 +239,7 @@ class Command(TyperCommand):
             )
 
     def parse_args(self, ctx: Any, args: list[str]) -> list[str]:
-        """Options as usual; one that is another's name ends in a sentence."""
+        """Parse options; raise for an alias with the option that is meant."""
         known = {name for parameter in self.params for name in parameter.opts}
         for given in (a.partition("=")[0] for a in args):
             if given not in known and MEANT.get(given) in known:
@@ -248,15 +248,15 @@ class Command(TyperCommand):
 
 
 def _kind(kind: Callable[..., str], *, ctx: Any, argument: bool) -> str:
-    """What an option takes, in words."""
+    """Type of an option's value in plain words."""
     return "" if argument else KINDS.get(kind(ctx=ctx), kind(ctx=ctx))
 
 
 def command(work: Callable[..., None]) -> Callable[..., None]:
-    """Make a function a command.
+    """Turn a function into a command.
 
-    A parameter that is a dataclass stands for its fields: each is an option of the command, in that place, and the
-    function receives the record. An error becomes one line on standard error and an exit code.
+    A dataclass parameter expands to its fields: each becomes an option at that place, and the function receives the
+    dataclass. Errors become one line on standard error and an exit code.
     """
     records: dict[str, type[Any]] = {}
     options: list[inspect.Parameter] = []
@@ -303,7 +303,7 @@ def command(work: Callable[..., None]) -> Callable[..., None]:
 
 
 def _options_of(record: type[Any]) -> list[inspect.Parameter]:
-    """The fields of a record as parameters of a function."""
+    """Return the fields of a dataclass as parameters of a function."""
     hints = get_type_hints(record, include_extras=True)
     return [
         inspect.Parameter(f.name, inspect.Parameter.KEYWORD_ONLY, default=f.default, annotation=hints[f.name])
@@ -312,7 +312,7 @@ def _options_of(record: type[Any]) -> list[inspect.Parameter]:
 
 
 def exit_code(error: FtlmError) -> int:
-    """Exit code of an error: 1 internal, 2 usage, 3 data refused, 5 rig."""
+    """Exit code of an error: 1 internal, 2 usage, 3 data, 5 rig."""
     if isinstance(error, InternalError):
         return EXIT_INTERNAL
     if isinstance(error, ModelError):
@@ -321,7 +321,7 @@ def exit_code(error: FtlmError) -> int:
 
 
 def show(result: Any, *, as_json: bool) -> None:
-    """Print a result, for people or as JSON."""
+    """Print a result as text or JSON."""
     if as_json:
         show_json(result.to_dict())
     else:
@@ -329,9 +329,9 @@ def show(result: Any, *, as_json: bool) -> None:
 
 
 def say(text: str, end: str = "\n") -> None:
-    """Print what people read, in lines that a terminal does not break within words.
+    """Print text, wrapped between words at the width of the terminal.
 
-    Rows of tables and commands to be copied stay as they are.
+    Table rows and commands to copy are not wrapped.
     """
     text = in_options(text)
     if sys.stdout.isatty():
@@ -340,7 +340,7 @@ def say(text: str, end: str = "\n") -> None:
 
 
 def broken_line(line: str) -> list[str]:
-    """A line as a terminal takes it: itself, or several where it is longer."""
+    """Return a line wrapped to the width of the terminal."""
     lead = line[: len(line) - len(line.lstrip())]
     if len(line) <= columns() or line.startswith("next: ") or len(_GAPS.findall(line.strip())) >= ROW:
         return [line]
@@ -350,32 +350,32 @@ def broken_line(line: str) -> list[str]:
 
 
 def show_json(document: Any) -> None:
-    """Print a document of plain values and NumPy's."""
+    """Print a document of Python and NumPy values as JSON."""
     print(json.dumps(document, indent=1, ensure_ascii=False, allow_nan=False, default=_plain))
 
 
 def tell(sentence: str, *, as_json: bool, **facts: Any) -> None:
-    """Print what was done, as a sentence or as one line of JSON."""
+    """Print an outcome as a sentence or as one line of JSON."""
     print(json.dumps(facts, ensure_ascii=False) if as_json else sentence)
 
 
 def _plain(value: Any) -> Any:
-    """NumPy scalars and arrays as JSON knows them."""
+    """Convert NumPy scalars and arrays for JSON."""
     return value.tolist() if hasattr(value, "tolist") else str(value)
 
 
-#: Kinds of figures.
+#: File extensions of figures.
 FIGURES = ("png", "pdf", "svg")
 
 
 def check_ending(path: str | None, ending: str, why: str = "") -> None:
-    """Refuse a name with another ending; none is no file to write."""
+    """Raise for a file name with another extension; None is skipped."""
     if path is not None and Path(path).suffix.lower() != ending:
         raise ModelError(f"{path} does not end in {ending}{why}; name it so")
 
 
 def figure_kind(path: str | None) -> str:
-    """The kind of a figure by its name's ending; a name without one of them is refused, none is no figure."""
+    """Return the format of a figure from its file extension; "" for None."""
     kind = "" if path is None else Path(path).suffix.removeprefix(".").lower()
     if path is not None and kind not in FIGURES:
         raise ModelError(f"{path} ends in {kind or 'nothing'!r}; write .png, .pdf or .svg")
@@ -383,28 +383,28 @@ def figure_kind(path: str | None) -> str:
 
 
 def write_figure(figure: Any, path: str, *, force: bool) -> None:
-    """Write a figure of matplotlib."""
+    """Write a matplotlib figure."""
     data = io.BytesIO()
     figure.savefig(data, format=figure_kind(path), dpi=200)
     write_atomically(path, data.getvalue(), force=force)
 
 
 def say_written(*paths: str | None) -> None:
-    """Print what was written; none is nothing."""
+    """Print the paths of written files; None is skipped."""
     for path in paths:
         if path is not None:
             print(in_options(f"written: {path}"))
 
 
-#: What the machine that base/pace.py knows takes to read a byte and to judge a sample of an output [s], and between
-#: which multiples of it that came out: numbers in few digits are more of them, free runs of lasting motion are refined.
+#: Time to read a byte and to simulate a sample of an output on the reference machine [s], and range of the actual
+#: durations. Numbers with few digits need more time per byte, and oscillating simulations are refined.
 OF_BYTE, OF_SAMPLE, CAME_TO = 8e-8, 4e-6, (0.4, 4.0)
-#: A controller's design, and judging one sample of the model's numbers with it [s].
+#: Time of a controller design, and of the loop analysis for one sample of the parameters [s].
 OF_DESIGN, OF_JUDGED = {"pid": 0.1, "lqg": 1.2}, {"pid": 0.005, "lqg": 0.01}
 
 
 def expect_reading(files: Sequence[str]) -> None:
-    """Say about how long it takes to read these files, where that is long."""
+    """Announce the duration of reading these files, if it is long."""
     size = 0
     for file in files:
         try:
@@ -417,13 +417,13 @@ def expect_reading(files: Sequence[str]) -> None:
 
 
 def expect_judging(runs: Sequence[Run], outputs: int, *, quiet: bool) -> None:
-    """Say about how long it takes to run a model of so many outputs over these runs, where that is long."""
+    """Announce the duration of simulating a model on these runs, if it is long."""
     samples = outputs * sum(run.length for run in runs)
     if OF_SAMPLE * samples > 0.2:
         Progress("", quiet=quiet).expect("running the model", *between(expected(OF_SAMPLE * samples, 1), CAME_TO))
 
 
 def expect_designing(design: str, samples: int) -> None:
-    """Say about how long a design takes whose loop is judged on so many samples, where that is long."""
+    """Announce the duration of a design with so many parameter samples, if it is long."""
     seconds = OF_DESIGN[design] + OF_JUDGED[design] * max(samples, 0)
     Progress("").expect("designing", *between(expected(seconds, 1), CAME_TO))

@@ -1,4 +1,4 @@
-"""The program `ftlm`: its commands in the order in which its help lists them."""
+"""Program `ftlm`: list of its commands in the order of the help."""
 
 from __future__ import annotations
 
@@ -23,7 +23,7 @@ app = typer.Typer(
     help="Fractional-order models of flexible machines from measured data.",
     no_args_is_help=True,
     add_completion=True,
-    # Marks of rich would take the brackets of units, [s] and [A], out of every help text.
+    # Rich markup would remove the brackets of units, [s] and [A], from help texts.
     rich_markup_mode=None,
     pretty_exceptions_enable=False,
     context_settings={"help_option_names": ["-h", "--help"]},
@@ -40,7 +40,7 @@ def version(
         raise typer.Exit
 
 
-#: Commands as `ftlm -h` lists them; each has its whole sentence in its own help.
+#: Short help of each command in `ftlm -h`; its docstring is its own help.
 COMMANDS = {
     demo: "Identify a simulated arm, and draw what came out.",
     page: "From a file to a model, in a browser.",
@@ -73,7 +73,7 @@ for _command, _short in COMMANDS.items():
 
 
 def main() -> None:
-    """Entry point."""
+    """Run the program."""
     # Who closes an output, as `>&-` does, wants none; what is opened next must not take its place.
     sys.stdout = sys.stdout or open(os.devnull, "w", encoding="utf-8")  # noqa: SIM115
     sys.stderr = sys.stderr or open(os.devnull, "w", encoding="utf-8")  # noqa: SIM115

@@ -1,4 +1,4 @@
-"""Commands that take a saved model: compare, resid, simulate, report, plot, export."""
+"""Commands for saved models: compare, resid, simulate, report, plot, export."""
 
 from __future__ import annotations
 
@@ -23,7 +23,7 @@ from ftlm.utils.files import COMMAND, check_free, write_atomically
 def _with_runs(
     model: str, reading: ReadingOptions, files: Sequence[str] | None, *, quiet: bool
 ) -> tuple[Model, list[Run]]:
-    """A saved model and the runs that it is run over."""
+    """Load a saved model and its runs."""
     loaded = load_model(model)
     runs = reading.runs(files)
     expect_judging(runs, len(loaded.outputs), quiet=quiet)
@@ -40,7 +40,7 @@ def compare(
     m: BlockPulses = None,
     as_json: Json = False,
 ) -> None:
-    """Equation error and output error of a saved model on measured runs."""
+    """Print the equation error and output error of a saved model on measured runs."""
     loaded, runs = _with_runs(model, reading, files, quiet=as_json)
     comparison = loaded.compare(runs, m=m)
     show(comparison, as_json=as_json)
@@ -62,7 +62,7 @@ def resid(
     reading: ReadingOptions,
     as_json: Json = False,
 ) -> None:
-    """Test a saved model's residuals: are they white, and independent of the inputs? Exit with 4 unless they are."""
+    """Test residuals for whiteness and independence of the inputs; exit code 4 if a test fails."""
     loaded, runs = _with_runs(model, reading, files, quiet=as_json)
     tests = loaded.resid(runs, lags=lags)
     show(tests, as_json=as_json)
@@ -81,7 +81,7 @@ def simulate(
     force: Force = False,
     as_json: Json = False,
 ) -> None:
-    """Free run of a saved model on a run's inputs, written as csv."""
+    """Simulate a saved model on the inputs of a run and write the outputs as csv."""
     check_free(out, force=force, words=COMMAND)
     loaded, runs = _with_runs(model, reading, [file], quiet=as_json)
     free = loaded.simulate(runs[0], tolerance=tolerance)
@@ -100,7 +100,7 @@ def report(
     force: Force = False,
     as_json: Json = False,
 ) -> None:
-    """Write the report of a saved model, with validation runs: one page that opens offline."""
+    """Write the HTML report of a saved model, with validation runs."""
     check_free(out, force=force, words=COMMAND)
     loaded, runs = _with_runs(model, reading, validation, quiet=as_json)
     page = model_page(loaded, out, validation=runs or None, force=force)
@@ -121,7 +121,7 @@ def plot(
     force: Force = False,
     as_json: Json = False,
 ) -> None:
-    """Draw a saved model for a paper: its fit or residuals on runs, or its Bode plot, poles, step or impulse."""
+    """Plot a saved model: fit or residuals on runs, Bode plot, poles, step or impulse response."""
     check_free(out, force=force, words=COMMAND)
     figure_kind(out)
     loaded, runs = _with_runs(model, reading, files, quiet=as_json)
@@ -154,7 +154,7 @@ def export(
     force: Force = False,
     as_json: Json = False,
 ) -> None:
-    """Write a saved model for another tool, to a file or to standard output."""
+    """Export a saved model for another tool, to a file or to standard output."""
     check_free(out, force=force, words=COMMAND)
     limits = None if band is None else _both_ends(band)
     text = export_text(load_model(model), to, band=limits, order=order)

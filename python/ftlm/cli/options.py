@@ -1,4 +1,4 @@
-"""Options that commands share: alone, or as a record with the verb for which they are given."""
+"""Option groups that commands share: single options, and dataclasses with the method that applies them."""
 
 from __future__ import annotations
 
@@ -24,7 +24,7 @@ from ftlm.structure.parser import equation
 from ftlm.structure.sensor_filter import SensorFilter
 from ftlm.structure.structure import START_WORDS, Structure, check_initial
 
-#: Options that may be left out.
+#: Types of optional options.
 Text = str | None
 Number = float | None
 Texts = list[str] | None
@@ -54,7 +54,7 @@ Force = Annotated[bool, Option("--force", help="Overwrite files.")]
 Json = Annotated[bool, Option("--json", help="Results as JSON.")]
 Verbose = Annotated[bool, Option("-v", "--verbose", help="Also all else that is known, and all warnings.")]
 Noise = Annotated[Texts, Option(metavar="OUTPUT=A", help="Deviation of an output's noise; default what the fit left.")]
-#: How a file is laid out; `layout_of` a record that has some of them.
+#: Options of a text file's layout; `layout_options` collects them from a dataclass.
 Separator = Annotated[
     Literal["comma", "semicolon", "tab", "space"] | None,
     Option(help="Between cells of text; default what is there."),
@@ -72,14 +72,14 @@ Sheet = Annotated[Text, Option(help="Sheet of a workbook that has several.")]
 
 
 def layout_of(record: object) -> dict[str, Any]:
-    """What options say of how files are laid out; those that a record does not have are not given."""
+    """Layout options that a dataclass has and the user has set."""
     said = {f.name: getattr(record, f.name, None) for f in fields(Layout)}
     return {name: value for name, value in said.items() if value is not None}
 
 
 @dataclass(frozen=True)
 class ReadingOptions:
-    """How files are read."""
+    """Options for reading files."""
 
     time: Annotated[Text, Option(help="Column of time; default by its name.")] = None
     time_unit: Annotated[
@@ -123,12 +123,12 @@ class ReadingOptions:
     ] = None
 
     def runs(self, files: Sequence[str] | None, *, apart: bool = False) -> list[Run]:
-        """Each file a run, detrended if that is asked for; see :meth:`_read`."""
+        """Load each file as a run, detrended if requested; see :meth:`_read`."""
         runs = self._read(files, apart=apart)
         return runs if self.detrend is None else [run.detrend(self.detrend) for run in runs]
 
     def _read(self, files: Sequence[str] | None, *, apart: bool) -> list[Run]:
-        """Each file a run; .mat files that hold one signal each are one run together, unless they stand apart."""
+        """Load each file as a run; .mat files with one signal each form one run unless ``apart``."""
         given: dict[str, Any] = {
             "time": self.time,
             "step": self.sampling,
@@ -159,7 +159,7 @@ class ReadingOptions:
         return [load(f, **options) for f in files]
 
     def opened(self, file: str) -> OpenedFile:
-        """What a file is, before it is a run."""
+        """Preview a file that is not loaded as a run."""
         if self.detrend is not None:
             raise ModelError("--detrend is not used with open; give it to the commands that open names")
         expect_reading([file])
@@ -182,7 +182,7 @@ class ReadingOptions:
 
 @dataclass(frozen=True)
 class StructureOptions:
-    """What is made of a structure in words; None is an option that is not given."""
+    """Options that modify a structure; None for an option that is not given."""
 
     only: Annotated[Text, Option(metavar="OUTPUT", help="Only the equation of this output.")] = None
     coupling: Annotated[
@@ -240,7 +240,7 @@ class StructureOptions:
     ] = None
 
     def structure(self, text: str, *, alone: bool = False) -> Structure:
-        """The structure that `text` names, with what the options say of it; alone, a link has no other stage."""
+        """Return the structure of `text` with the options applied; ``alone`` omits the other stage."""
         if text.startswith("flexible-link"):
             built = self._flexible_link(text)
         elif re.fullmatch(r"arm(:\w*)?", text):
@@ -263,7 +263,7 @@ class StructureOptions:
         return built.with_orders(numbers("--order", self.orders)).with_coefficients(numbers("--fixed", self.fixed))
 
     def measured(self, text: str, runs: Sequence[Run]) -> Structure:
-        """The structure that `text` names for runs: a link of the arm alone where no run has the other stage."""
+        """Return the structure of `text` for runs: one link alone if no run contains the other stage."""
         stage = re.fullmatch("arm:([12])", text)
         if stage is not None:
             other = f"theta{3 - int(stage[1])}"
@@ -274,14 +274,14 @@ class StructureOptions:
         return self.structure(text)
 
     def given(self) -> list[str]:
-        """Options that say something."""
+        """Options with values other than their defaults."""
         names = {"orders": "--order", "fixed": "--fixed"}
         usual = StructureOptions()
         said = [f.name for f in fields(self) if getattr(self, f.name) != getattr(usual, f.name)]
         return [names.get(n, "--" + n.replace("_", "-")) for n in said]
 
     def _check_equation(self, count: int) -> None:
-        """Refuse what only the flexible link has, for that many equations in words."""
+        """Raise for options of the flexible link, given the number of equations."""
         given = self._of_the_link() | {
             "--coupling": self.coupling is not None and count == 1,
         }
@@ -295,7 +295,7 @@ class StructureOptions:
             )
 
     def _of_the_link(self) -> dict[str, bool]:
-        """Whether options are given that only the flexible link has."""
+        """Whether each option of the flexible link is given."""
         return {
             "--cross-stage": self.cross_stage,
             "--inertial": self.inertial,
@@ -309,7 +309,7 @@ class StructureOptions:
         }
 
     def _sensor(self) -> SensorFilter | None:
-        """The low-pass that signals of equations in words passed."""
+        """Sensor filter of signals in equations."""
         if not self.filtered:
             if self.low_pass is not None:
                 raise ModelError("--low-pass is of signals that --filtered names; name them, or leave it out")
@@ -321,11 +321,12 @@ class StructureOptions:
             raise ModelError(f"--low-pass {self.low_pass!r} is not HZ or HZ:DAMPING, such as 2:0.9") from None
 
     def _arm(self, text: str, alone: bool) -> Structure:
-        """Deflections of the arm that exists, driven by all angles: whole orders but that of the links' elasticity.
+        """Deflections of the real arm with all angles as inputs, integer orders but that of the links' elasticity.
 
-        Of a link alone that of its damping instead, the one that earned its place on runs that it never saw. What reads
-        a deflection is a gauge, whose zero is each run's own. A spring-pot that is nearly a spring remembers next to
-        nothing: runs start with the link's angle and velocity, unless a history is asked for.
+        For a single link the order of the damping is free instead, which improved the fit on validation runs
+        significantly. A strain gauge measures the deflection, and its zero is an offset of each run. A spring-pot of
+        nearly integer order has hardly any memory. So runs start from the link's angle and velocity unless a history is
+        requested.
         """
         given = self._of_the_link() | {"--coupling": self.coupling is not None}
         given |= {"--filtered": bool(self.filtered), "--low-pass": self.low_pass is not None}
@@ -395,7 +396,7 @@ class StructureOptions:
 
 @dataclass(frozen=True)
 class SearchOptions:
-    """How candidates are made, computed and ranked; None is an option that is not given."""
+    """Options of candidates, their computation and ranking; None for an option that is not given."""
 
     criterion: Annotated[Criterion | None, Option(help="Error that ranks the candidates; default output-error.")] = None
     norm: Annotated[
@@ -416,7 +417,7 @@ class SearchOptions:
     keep: Annotated[int | None, Option(help="Rows of the ranked table; default 20.")] = None
 
     def lattice(self) -> Lattice | None:
-        """Where the orders are searched; None where nothing is said of it."""
+        """Order grid of the search; None without options."""
         if self.step is None and not self.values:
             return None
         named: dict[str, Any] = dict(pairs("--lattice", self.values))
@@ -425,7 +426,7 @@ class SearchOptions:
         return made if alpha is None else replace(made, orders={**made.orders, "alpha": alpha})
 
     def settings(self) -> dict[str, Any]:
-        """Everything that is given but the lattice, as a search takes it."""
+        """Search options other than the order grid."""
         given = {
             "criterion": self.criterion,
             "norm": self.norm,
@@ -440,7 +441,7 @@ class SearchOptions:
 
 @dataclass(frozen=True)
 class GeneticOptions:
-    """How far the genetic algorithm goes."""
+    """Options of the genetic algorithm."""
 
     seeds: Annotated[
         list[int] | None, Option("--seed", min=0, help="Seed of the genetic algorithm; several are several runs.")
@@ -448,7 +449,7 @@ class GeneticOptions:
     evaluations: Annotated[int | None, Option(help="Evaluations a seed of the genetic algorithm.")] = None
 
     def settings(self, method: str = "genetic") -> Genetic | None:
-        """Settings for a method, or None where none are asked for."""
+        """Settings for a method, or None without options."""
         if self.seeds is None and self.evaluations is None:
             return None
         if method != "genetic":

@@ -1,4 +1,4 @@
-"""The commands `ftlm demo` and `ftlm reproduce`."""
+"""Commands app, demo, reproduce and orders."""
 
 from __future__ import annotations
 
@@ -34,7 +34,7 @@ from ftlm.utils.files import COMMAND, check_folder, check_free
 from ftlm.utils.resources import expected
 from ftlm.utils.validation import check_threads
 
-#: Processor seconds of `ftlm demo` and of its pages on the machine that base/pace.py knows.
+#: Processor time of `ftlm demo` and its pages on the reference machine of base/pace.py [s].
 DEMO_SECONDS = 22.0
 
 
@@ -50,9 +50,9 @@ def demo(
     verbose: Verbose = False,
     as_json: Json = False,
 ) -> None:
-    """Simulate both stages, identify every equation with p = 1, 3, 5, 7, compare, save, draw.
+    """Simulate both stages, identify every equation with p = 1, 3, 5, 7, and write models, tables and charts.
 
-    The paper's lattice is that of --step 0.05, which takes minutes.
+    The paper's order grid has the increment 0.05, which takes minutes.
     """
     with Progress("", quiet=as_json) as progress:
         progress.expect("the demo", expected(DEMO_SECONDS * (0.1 / step) ** 2, check_threads(threads)))
@@ -99,7 +99,7 @@ def reproduce(
     force: Force = False,
     as_json: Json = False,
 ) -> None:
-    """Recompute the tables and figures of the paper, on the virtual rig or on measured runs, as one page."""
+    """Recompute the tables and figures of the paper on simulated or measured runs, as one HTML page."""
     check_free(out, force=force, words=COMMAND)
     if save is not None:
         check_folder(Path(save), ALWAYS_SAVED, force=force)
@@ -141,7 +141,7 @@ def orders(
     force: Force = False,
     as_json: Json = False,
 ) -> None:
-    """Integer against fractional orders of the arm's links, fitted to each run and judged on the others: a page."""
+    """Compare integer and fractional orders of the arm's links by cross-validation over runs, as an HTML page."""
     check_free(out, force=force, words=COMMAND)
     runs = reading.runs(files, apart=True)
     with Progress("", quiet=as_json) as progress:
@@ -165,5 +165,5 @@ def app(
         bool, Option("--browser/--no-browser", help="Open a browser, or print the address alone.")
     ] = True,
 ) -> None:
-    """From a file to a model in a browser: a local page that nobody else can open; Ctrl-C ends it."""
+    """Start the local web application for identification in a browser; Ctrl-C stops it."""
     serve(files or [], port=port, browser=browser)

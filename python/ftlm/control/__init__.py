@@ -1,4 +1,4 @@
-"""Control on an identified model: shapers, fractional and linear-quadratic controllers, observers, inverse dynamics."""
+"""Control design on identified models: input shapers, fractional PID, LQG, observers, inverse dynamics."""
 
 from ftlm.control.controller_file import HubLoops, load_controller, save_controller
 from ftlm.control.fractional_pid import FractionalPid, PidDesign, Realised, fractional_pid

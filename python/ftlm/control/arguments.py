@@ -1,4 +1,4 @@
-"""Arguments that designs share: names and sums of outputs, numbers above 0."""
+"""Argument checks that designs share: outputs and their sums, rates, positive numbers."""
 
 from __future__ import annotations
 
@@ -10,14 +10,14 @@ import numpy as np
 from ftlm.errors import ModelError
 from ftlm.utils.validation import Floats, check_seed, nearest, real_number, shown, whole_number
 
-#: Rates of a loop [Hz]: beyond, floating point tells no margins.
+#: Sampling rates [Hz] at which margins can be computed in floating point.
 RATES = (1e-9, 1e9)
-#: Deviations and times.
+#: Range of standard deviations and times.
 SIZES = (1e-100, 1e100)
 
 
 def checked_rate(rate: object) -> float:
-    """Samples per second of a loop, as a number."""
+    """Return a sampling rate [Hz]; raise outside the range."""
     value = real_number("rate", rate)
     if not RATES[0] <= value <= RATES[1]:
         raise ModelError(
@@ -27,7 +27,7 @@ def checked_rate(rate: object) -> float:
 
 
 def names_of(what: str, given: Sequence[str] | None, outputs: tuple[str, ...]) -> tuple[str, ...]:
-    """Outputs by name, all of them where none is named."""
+    """Return the given outputs, or all without a list."""
     if given is None:
         return outputs
     names = [] if isinstance(given, str) or not isinstance(given, Sequence) else [*given[: len(outputs) + 1]]
@@ -46,7 +46,7 @@ def names_of(what: str, given: Sequence[str] | None, outputs: tuple[str, ...]) -
 
 
 def positive(name: str, value: object) -> float:
-    """A finite number above 0."""
+    """Return a finite number above 0."""
     number = real_number(name, value)
     if not (math.isfinite(number) and number > 0):
         raise ModelError(f"{name} = {shown(value)} is not a finite number above 0")
@@ -56,7 +56,7 @@ def positive(name: str, value: object) -> float:
 
 
 def largest(limit: object) -> float:
-    """The largest command, which may be infinite."""
+    """Return the largest command, which may be infinite."""
     most = real_number("limit", limit)
     if not most > 0:
         raise ModelError(f"limit = {shown(limit)} is not a number above 0")
@@ -64,7 +64,7 @@ def largest(limit: object) -> float:
 
 
 def drawn_from(samples: object, seed: object) -> tuple[int, int]:
-    """How many samples of a model's numbers are drawn, and from which seed."""
+    """Return the number of parameter samples and their seed."""
     count = whole_number(samples)
     if count is None or not 0 <= count <= 10_000:
         raise ModelError(f"samples = {shown(samples)} is no whole number from 0 to 10000")
@@ -72,7 +72,7 @@ def drawn_from(samples: object, seed: object) -> tuple[int, int]:
 
 
 def sums(what: str, text: object, outputs: tuple[str, ...]) -> Floats:
-    """A sum of outputs in words, such as "theta11 + theta12", as the row of its factors."""
+    """Return the coefficients of a sum of outputs, such as "theta11 + theta12"."""
     row = np.zeros(len(outputs))
     for part in text.split("+") if isinstance(text, str) else [""]:
         name = part.strip()

@@ -1,4 +1,4 @@
-"""The file of a controller: what a machine needs to run it, sample by sample, and how it is read back."""
+"""Controller file with all numbers of the discrete-time algorithm; controllers of both joints for the rig."""
 
 from __future__ import annotations
 
@@ -18,7 +18,7 @@ from ftlm.utils.files import Saved, write_atomically
 from ftlm.utils.validation import Floats, words_of
 
 SCHEMA = 1
-#: How to run either kind without ftlm.
+#: Algorithm of each kind of controller, as text for implementations without ftlm.
 MEANING = {
     "pid": "each sample, with e = reference - measured: every lag becomes x = keep x + now e + before e_last, and the "
     "output is (kp + direct) e + the sum of weight x, cut at the limit; lags of the derivative begin with "
@@ -31,7 +31,7 @@ Matrix: TypeAlias = list[list[float]]
 
 
 class Lag(msgspec.Struct, forbid_unknown_fields=True):
-    """A memory of one number."""
+    """First-order lag of the discrete-time controller."""
 
     of: Literal["integral", "derivative"]
     keep: float
@@ -41,7 +41,7 @@ class Lag(msgspec.Struct, forbid_unknown_fields=True):
 
 
 class PidFile(msgspec.Struct, forbid_unknown_fields=True, tag="pid"):
-    """A fractional PID at a rate: what it is, and what it does from sample to sample."""
+    """Fractional PID at a sampling rate: gains, orders, and discrete-time coefficients."""
 
     kp: float
     ki: float
@@ -56,14 +56,14 @@ class PidFile(msgspec.Struct, forbid_unknown_fields=True, tag="pid"):
     lags: list[Lag]
 
     def controller(self) -> Realised:
-        """The controller, made again."""
+        """Return the controller."""
         pid = FractionalPid(self.kp, self.ki, self.kd, self.lam, self.mu)
         limit = math.inf if self.limit is None else self.limit
         return Realised(pid, self.rate, limit=limit, band=self.band, order=self.order)
 
 
 class LqgFile(msgspec.Struct, forbid_unknown_fields=True, tag="lqg"):
-    """An observer and a state feedback at a rate."""
+    """Observer and state feedback at a sampling rate."""
 
     rate: float
     limit: float | None
@@ -86,7 +86,7 @@ class LqgFile(msgspec.Struct, forbid_unknown_fields=True, tag="lqg"):
     deviations: list[float]
 
     def controller(self) -> Lqg:
-        """The controller, made again."""
+        """Return the controller."""
         a, b, c, correction, feedback = (
             np.array(m, dtype=np.float64) for m in (self.a, self.b, self.c, self.correction, self.feedback)
         )
@@ -134,7 +134,7 @@ class LqgFile(msgspec.Struct, forbid_unknown_fields=True, tag="lqg"):
 
 
 class ControllerFile(msgspec.Struct, forbid_unknown_fields=True):
-    """The whole file."""
+    """Content of a controller file."""
 
     format: Literal["ftlm-controller"]
     schema: int
@@ -144,30 +144,30 @@ class ControllerFile(msgspec.Struct, forbid_unknown_fields=True):
     controller: PidFile | LqgFile
 
 
-#: A controller of thirty states has a few tens of kilobytes.
+#: A controller of thirty states has a few tens of kilobytes; the default size limit suffices.
 CONTROLLER = Saved("controller", "a file that ftlm control wrote", ControllerFile, SCHEMA)
 
 
 def save_controller(
     controller: Realised | Lqg, path: str | os.PathLike[str], *, model: str = "", force: bool = False
 ) -> None:
-    """Write a controller as JSON: what it was made of, and the numbers that a machine runs from sample to sample.
+    """Write a controller as JSON: design data and the coefficients of its discrete-time algorithm.
 
     Parameters
     ----------
     controller
-        What runs.
+        Controller to write.
     path
         File to write.
     model
-        What it was designed on, in words.
+        Description of the model it was designed on.
     force
-        Overwrite a file that exists.
+        Overwrite an existing file.
 
     Raises
     ------
     ModelError
-        Something that is no controller of ftlm.
+        Another type of controller.
     DataError
         The file exists and ``force`` is not set, or it cannot be written.
     """
@@ -183,7 +183,7 @@ def save_controller(
 
 
 def load_controller(path: str | os.PathLike[str]) -> Realised | Lqg:
-    """Read a controller that :func:`save_controller` or ``ftlm control`` wrote.
+    """Read a controller written by :func:`save_controller` or ``ftlm control``.
 
     Raises
     ------
@@ -246,23 +246,23 @@ def _lqg(controller: Lqg) -> LqgFile:
     )
 
 
-#: What a rig hands over, in its order.
+#: Angles that the rig measures, in the order of the rig.
 ANGLES = ("theta11", "theta12", "theta21", "theta22")
 
 
 class HubLoops:
-    """A controller of each hub for :func:`ftlm.rig.control`: angles and reference in, currents out.
+    """Controllers of both joints for :func:`ftlm.rig.control`: angles and references to motor currents.
 
     Parameters
     ----------
     first, second
-        Of hub 1 and hub 2: a :class:`Realised`, called with reference less hub angle [rad], or an :class:`Lqg`, which
-        reads the angles that it names; None leaves a hub without current.
+        Controllers of joint 1 and joint 2: a :class:`DiscretePid` gets the reference minus the hub angle [rad], an
+        :class:`Lqg` gets its measured angles; None means zero current.
 
     Raises
     ------
     ModelError
-        What is neither, or a controller that reads what the arm does not measure.
+        Another type of controller, or one that needs a signal that the arm does not measure.
     """
 
     def __init__(self, first: Realised | Lqg | None, second: Realised | Lqg | None = None) -> None:
@@ -278,17 +278,17 @@ class HubLoops:
             self._reads.append([ANGLES.index(n) for n in names])
 
     def reset(self) -> None:
-        """Forgets what was."""
+        """Reset both controllers."""
         for loop in self.loops:
             if loop is not None:
                 loop.reset()
 
     def to_dict(self) -> dict[str, Any]:
-        """For JSON."""
+        """Return both controllers for JSON."""
         return {f"hub{j}": None if loop is None else loop.to_dict() for j, loop in enumerate(self.loops, start=1)}
 
     def __call__(self, time: float, angles: Floats, reference: Floats) -> tuple[float, float]:
-        """Both currents [A]."""
+        """Return both currents [A]."""
         first, second = (
             0.0
             if loop is None

@@ -1,4 +1,4 @@
-"""Fractional PID controllers, and the same one sample at a time in bounded memory."""
+"""Fractional PID controllers and their discrete-time realization in bounded memory."""
 
 from __future__ import annotations
 
@@ -17,29 +17,29 @@ from ftlm.model.model import Solved, check_solved
 from ftlm.simulation.discretization import check_linear
 from ftlm.utils.validation import Complex, Floats, nearest, real_number, shown, whole_number
 
-#: Poles reach this many times beyond the band on both sides.
+#: Poles extend this factor beyond the band on both sides.
 REACH = 30.0
-#: Widest band, high over low.
+#: Largest ratio of the band's ends.
 WIDEST = 1e9
-#: Frequencies at which the error is measured.
+#: Number of frequencies at which the approximation error is measured.
 COMPARED_FRACTIONAL = 200
 
 
 @dataclass(frozen=True)
 class FractionalPid:
-    """kp + ki s^-lam + kd s^mu.
+    """Fractional PID controller kp + ki s^-lam + kd s^mu.
 
     Parameters
     ----------
     kp, ki, kd
-        Gains, of the controller's output over the error.
+        Gains from the error to the controller output.
     lam, mu
         Orders of the integral and of the derivative, above 0 and at most 2.
 
     Raises
     ------
     ModelError
-        A gain that is no finite number, an order out of range.
+        A gain that is not finite, or an order out of range.
     """
 
     kp: float
@@ -63,7 +63,7 @@ class FractionalPid:
         return np.asarray(self.kp + self.ki * s**-self.lam + self.kd * s**self.mu)
 
     def to_dict(self) -> dict[str, Any]:
-        """For JSON."""
+        """Return gains and orders for JSON."""
         return asdict(self)
 
     def __str__(self) -> str:
@@ -72,7 +72,7 @@ class FractionalPid:
 
 @dataclass(frozen=True)
 class _Bank:
-    """A sum of gain, integral and lags 1/(s + p), exact for what is linear between samples."""
+    """Bank of first-order lags 1/(s + p) with a gain, exact for signals that are linear between samples."""
 
     direct: float
     weights: Floats
@@ -81,36 +81,35 @@ class _Bank:
     before: Floats
 
     def response(self, z: Complex) -> Complex:
-        """At points of the unit circle."""
+        """Frequency response at points of the unit circle."""
         inverse = 1.0 / z[:, None]
         lags = (self.now + self.before * inverse) / (1.0 - self.keeps * inverse)
         return np.asarray(self.direct + lags @ self.weights)
 
 
 class Realised:
-    """A fractional PID at a sampling rate: Oustaloup's poles, each an exponential memory of one number.
+    """Fractional PID at a sampling rate: Oustaloup's approximation as a bank of first-order lags.
 
-    The first sample is safe: a constant error has no derivative, so what is there at the start answers with kp alone.
-    While the output is at its limit the integral stands still where it would push it further.
+    The controller starts without a derivative kick: the first error is taken as constant in the past. While the output
+    is saturated, the integral does not change in the direction of the saturation (anti-windup).
 
     Parameters
     ----------
     pid
-        The controller, of orders up to 1.
+        Fractional PID with orders up to 1.
     rate
-        Samples per second.
+        Sampling rate [Hz].
     limit
-        Largest output; what is beyond is cut, since it is known to be and nothing winds up.
+        Largest output; it saturates there.
     band
-        Frequencies within which it is to hold [rad/s]; default from a thousandth to an eighth of the rate's half.
+        Frequency band of the approximation [rad/s]; default from a thousandth to an eighth of the Nyquist frequency.
     order
-        Of Oustaloup's filter: 2 order + 1 poles for the integral, as many for the derivative.
+        Order of Oustaloup's filter: 2 order + 1 poles for the integral, and as many for the derivative.
 
     Raises
     ------
     ModelError
-        A controller whose orders exceed 1 or whose gains leave floating point, a rate, limit, band or order that is
-        none.
+        Orders above 1, gains that overflow, or an invalid rate, limit, band or order.
     """
 
     def __init__(
@@ -156,16 +155,16 @@ class Realised:
 
     @property
     def memory(self) -> int:
-        """Numbers that are remembered from one sample to the next."""
+        """Number of states between two samples."""
         return len(self._integral.weights) + len(self._derivative.weights) + 1
 
     @property
     def direct(self) -> float:
-        """What acts at once, besides kp and the lags."""
+        """Direct feedthrough of integral and derivative, without kp."""
         return self._integral.direct + self._derivative.direct
 
     def lags(self) -> list[tuple[Literal["integral", "derivative"], tuple[float, float, float, float]]]:
-        """What each of its memories keeps, takes in of this error and of the last, and weighs."""
+        """Coefficients of the first-order lags: keep, now, before, weight; see the controller file."""
         banks: tuple[tuple[Literal["integral", "derivative"], _Bank], ...] = (
             ("integral", self._integral),
             ("derivative", self._derivative),
@@ -177,20 +176,20 @@ class Realised:
         ]
 
     def response(self, w: Floats | Complex) -> Complex:
-        """Its own response at frequencies [rad/s], limit apart."""
+        """Frequency response [rad/s] of the discrete-time controller without saturation."""
         z = np.exp(1j * np.asarray(w) / self.rate)
         return self.pid.kp + self._integral.response(z) + self._derivative.response(z)
 
     def reset(self) -> None:
-        """Forgets everything."""
+        """Reset all states."""
         self._sums = np.zeros(len(self._integral.weights))
         self._lags: Floats | None = None
         self._error = 0.0
 
     def __call__(self, error: float) -> float:
-        """The output for the error of a sample."""
+        """Return the output for the error of a sample."""
         if self._lags is None:
-            # As if the error had always been there: of a constant no derivative is left.
+            # The derivative starts in the steady state of a constant error, where it is zero.
             bank = self._derivative
             self._lags = error * (bank.now + bank.before) / (1.0 - bank.keeps)
             self._error, sums = error, self._sums
@@ -216,7 +215,7 @@ class Realised:
         return gain, float(np.degrees(np.max(np.abs(np.angle(quotient)))))
 
     def to_dict(self) -> dict[str, Any]:
-        """For JSON."""
+        """Return design data and approximation errors for JSON."""
         return {
             "pid": self.pid.to_dict(),
             "rate": self.rate,
@@ -237,14 +236,14 @@ def _power(power: float, reach: tuple[float, float], order: int) -> tuple[Floats
     """Poles, residues and direct gain of s^power, 0 < power <= 1."""
     if power < 1.0:
         poles, residues, _ = oustaloup(power, reach, order)
-        # The gain that leaves nothing of a constant, as no derivative does; Oustaloup's leaves the lower end's.
+        # The gain that makes the response to a constant zero; Oustaloup's gain is that at the band's lower end.
         return poles, residues, -float(np.sum(residues / poles))
     high = reach[1]
     return np.array([high]), np.array([-high * high]), high
 
 
 def _integral(power: float, reach: tuple[float, float], order: int) -> tuple[Floats, Floats, float]:
-    """The same of s^-power: an integral of s^(1 - power), so that nothing constant is left at rest."""
+    """Poles, residues and direct gain of s^-power, an integral of s^(1 - power) without steady-state error."""
     if power >= 1.0:
         return np.zeros(1), np.ones(1), 0.0
     poles, residues, gain = oustaloup(1.0 - power, reach, order)
@@ -253,7 +252,7 @@ def _integral(power: float, reach: tuple[float, float], order: int) -> tuple[Flo
 
 
 def _bank(factor: float, poles: Floats, residues: Floats, direct: float, step: float) -> _Bank:
-    """Lags that are exact for a signal that is linear between samples."""
+    """Return first-order lags that are exact for signals that are linear between samples."""
     x = poles * step
     keeps = np.exp(-x)
     # (1 - e^-x)/x and what follows from it, whose limits at 0 are 1, 1/2 and 1/2.
@@ -266,43 +265,43 @@ def _bank(factor: float, poles: Floats, residues: Floats, direct: float, step: f
         return _Bank(factor * direct, factor * residues, keeps, now, before)
 
 
-#: Orders that are tried: of the integral and of the derivative, first over all, then around the best.
+#: Range of the orders of integral and derivative, and values per order and round.
 LOWEST, HIGHEST, TRIED = 0.5, 1.0, 15
 ROUNDS = 3
-#: Frequencies of the curves on which orders are compared.
+#: Number of frequencies at which orders are compared.
 COMPARED = 300
-#: Largest sensitivity over all samples that is aimed at; where none has so little, this much above the least.
+#: Target of the largest sensitivity over all samples; if it is not reached, the tolerance above the smallest one.
 CALM, ABOVE = 1.5, 1.05
-#: Where the loop's gain is to be high, against friction and offsets: this share of the crossover.
+#: Frequency of the low-frequency gain, as a share of the crossover; that gain rejects friction and offsets.
 SLOW = 0.1
-#: A design that more than this share of the parameters' samples breaks is none.
+#: Largest share of parameter samples whose requirements the design may violate.
 BROKEN = 0.05
-#: A sample keeps a design whose phase margin is at least this share of what was asked for.
+#: Smallest phase margin of a sample as a share of the requested one.
 KEPT = 0.5
-#: The lowest crossover as a share of its rate: below, floating point tells no margins.
+#: Lowest crossover as a share of the rate; below, margins are not computable in floating point.
 SLOWEST = 1e-6
-#: Gains of the plant over which flatness is told.
+#: Relative plant gains at which the phase margin is evaluated.
 FLAT = (0.7, 1.4)
 
 
 @dataclass(frozen=True)
 class PidDesign(JudgedLoop):
-    """A fractional PID with the margins of its loop.
+    """Fractional PID with the margins of its loop.
 
     Parameters
     ----------
     pid
         The controller.
     rate
-        Of the loop [Hz].
+        Sampling rate [Hz].
     nominal
-        Margins at the values of the model's numbers.
+        Margins at the nominal parameters.
     samples
-        Margins at samples of the numbers from their covariance; none where the model has no covariance.
+        Margins at parameters drawn from the covariance; empty without a covariance.
     flat
-        Phase margin with 0.7, 1 and 1.4 times the plant's gain [degrees].
+        Phase margin at 0.7, 1 and 1.4 times the plant gain [degrees].
     plants
-        Every output that the input moves, that which is controlled first.
+        All outputs that depend on the input, the controlled output first.
     """
 
     pid: FractionalPid
@@ -313,12 +312,12 @@ class PidDesign(JudgedLoop):
     plants: tuple[Plant, ...] = field(default=(), compare=False, repr=False)
 
     def acting(self, w: Floats | Complex) -> tuple[tuple[str, ...], Complex, Complex]:
-        """The output it reads, its response to it and to the reference, at frequencies [rad/s], as it runs."""
+        """Return the measured output, and responses to it and to the reference at frequencies [rad/s]."""
         response = Realised(self.pid, self.rate).response(w)
         return (self.plants[0].output,), response[None], response
 
     def to_dict(self) -> dict[str, Any]:
-        """For JSON."""
+        """Return design and margins for JSON."""
         return {
             "design": "pid",
             "rate": self.rate,
@@ -350,46 +349,44 @@ def fractional_pid(
     coupling: Literal["simulated", "measured"] = "simulated",
     sensor: bool = False,
 ) -> PidDesign:
-    """Tune a fractional PID on a model: crossover, phase margin, flat phase, and the best worst case of its intervals.
+    """Tune a fractional PID for crossover, phase margin and flat phase, robust over the model's uncertainty.
 
     Parameters
     ----------
     model
-        A linear model, identified or written down, of any orders.
+        Linear model of any orders, identified or defined by hand.
     output, input : str, optional
-        What is controlled and what with; where the model has one of them alone it needs no name.
+        Controlled output and manipulated input; may be omitted for a model with one of them.
     crossover
-        Where the loop's gain is 1 [rad/s].
+        Gain crossover frequency [rad/s].
     phase_margin
-        There [degrees], 10 to 80.
+        Phase margin [degrees], 10 to 80.
     rate
-        Of the loop [Hz], whose sample of delay and whose hold are counted as they are.
+        Sampling rate [Hz]; one sample of delay and the zero-order hold are included.
     samples
-        Of the model's numbers, from their covariance, 0 to 10000.
+        Number of parameter samples from the covariance, 0 to 10000.
     seed
-        Of the samples.
+        Seed of the samples.
     coupling
-        ``"measured"``: the output's own equation alone.
+        ``"measured"``: only the equation of the output.
     sensor
-        Whether the loop reads what passed the model's sensor filter; by default the filter was of the run alone.
+        Whether the loop measures after the model's sensor filter; by default the filter belongs to the recording only.
 
     Returns
     -------
     PidDesign
-        With margins at the values and at each sample.
+        With margins at the nominal parameters and at each sample.
 
     Raises
     ------
     ModelError
-        A model that is not stable (an integral is), with friction, or whose intervals are too wide: more than a
-        twentieth of the samples break the loop or halve its phase margin. A margin that no gains from 0 reach there.
+        An unstable model (an integrator is allowed), friction, or too much uncertainty: more than 5 % of the samples
+        make the loop unstable or halve its phase margin. Requirements that no nonnegative gains meet.
 
-    Notes
-    -----
-    At given orders three conditions at the crossover, gain 1, phase, and no change of phase with frequency, are linear
-    in the three gains: they hold exactly. Of all orders whose largest sensitivity over all samples is at most 1.5 (or
-    within 5 % of the least there is) those are taken that give the loop most gain at a tenth of the crossover.
-    Monje, Vinagre, Feliu and Chen (2008), doi:10.1016/j.conengprac.2007.08.006.
+    Notes ----- At given orders, three conditions at the crossover (gain 1, phase, zero slope of the phase) are linear
+    in the three gains and hold exactly. Among all orders whose largest sensitivity over all samples is at most 1.5 (or
+    within 5 % of the smallest), those with the largest loop gain at a tenth of the crossover are selected. Monje,
+    Vinagre, Feliu and Chen (2008), doi:10.1016/j.conengprac.2007.08.006.
     """
     plant = plant_of(model, output, input, rate, coupling, sensor=sensor)
     wc = real_number("crossover", crossover)
@@ -448,7 +445,7 @@ def fractional_pid(
 def plant_of(
     model: Solved, output: str | None, driver: str | None, rate: float, coupling: str, *, sensor: bool
 ) -> Plant:
-    """The input and output that are meant, or a refusal."""
+    """Return the plant of an output and an input; raise if they are unknown or ambiguous."""
     check_solved(model)
     if not isinstance(sensor, bool):
         raise ModelError(f"sensor = {shown(sensor)} is neither True nor False")
@@ -472,7 +469,7 @@ def plant_of(
 
 
 def _best(target: complex, slope: float, wc: float, w: Floats, curves: Complex) -> FractionalPid | None:
-    """Of the calm controllers that meet all three conditions, the one with most gain at low frequencies."""
+    """Controller with the largest low-frequency gain among those that meet all conditions with low sensitivity."""
     found: list[tuple[float, float, FractionalPid]] = []
     centre, reach = ((LOWEST + HIGHEST) / 2,) * 2, (HIGHEST - LOWEST) / 2
     for _ in range(ROUNDS):
@@ -510,7 +507,7 @@ def _solved(target: complex, slope: float, wc: float, lam: float, mu: float) -> 
 
 
 def known_least(model: Solved) -> str:
-    """Which coefficient or order is known least."""
+    """Name of the coefficient or order with the largest relative uncertainty."""
     covariance = None if model.estimate is None else model.estimate.covariance
     if covariance is None:
         return "none is known"

@@ -1,4 +1,4 @@
-"""Input shapers: a reference split into a few steps whose vibrations cancel at the poles of a model."""
+"""ZV and ZVD input shapers for the poles of a model."""
 
 from __future__ import annotations
 
@@ -17,31 +17,31 @@ from ftlm.utils.formatting import with_error
 from ftlm.utils.statistics import NORMAL_95
 from ftlm.utils.validation import Floats, check_choice, shown, whole_number
 
-#: How often the zero-vibration shaper of a mode is put behind itself: the order of the zero on its pole.
+#: Convolution power of the zero-vibration shaper: the multiplicity of its zero at the pole.
 KINDS = {"zv": 1, "zvd": 2}
-#: A shaper that may leave more than this share of the vibration within the intervals of its poles is no design.
+#: Largest residual vibration over the confidence intervals of the poles.
 WIDEST = 0.2
-#: Most samples that a shaper may last, and poles that it may be made for [rad/s].
+#: Longest shaper [samples], and range of its poles [rad/s].
 LONGEST = 1 << 22
 POLES = (1e-12, 1e12)
-#: Values of frequency and damping each, of a grid over their intervals.
+#: Grid points per interval of frequency and of damping.
 GRID = 9
 
 
 @dataclass(frozen=True)
 class Shaper:
-    """A few impulses, of sum 1, that leave no vibration at the poles they were made for.
+    """Input shaper: impulses of sum 1 without residual vibration at given poles.
 
     Parameters
     ----------
     kind
-        ``"zv"``: no vibration at the pole. ``"zvd"``: nor any change of it with the pole, at twice the delay.
+        ``"zv"``: zero vibration. ``"zvd"``: also zero derivative with respect to the pole, at twice the delay.
     modes
-        What it was made for.
+        Modes that are shaped.
     times, amplitudes
-        The impulses in continuous time [s].
+        Impulses in continuous time [s].
     worst
-        Largest share of the vibration that is left within the 95 % intervals of the modes; None where they have none.
+        Largest residual vibration within the 95 % intervals of the modes; None without intervals.
     """
 
     kind: str
@@ -52,32 +52,32 @@ class Shaper:
 
     @property
     def delay(self) -> float:
-        """How much later a shaped reference arrives [s]."""
+        """Delay of a shaped reference [s]."""
         return self.times[-1]
 
     def residual(self, frequency: ArrayLike, damping: ArrayLike) -> Floats:
-        """Share of the vibration that is left of a step on a mode.
+        """Residual vibration of a mode after a shaped step, relative to an unshaped one.
 
         Parameters
         ----------
         frequency
-            Of the mode, undamped [rad/s].
+            Undamped natural frequency of the mode [rad/s].
         damping
-            Its ratio.
+            Damping ratio.
         """
         return left_over(np.array(self.times), np.array(self.amplitudes), frequency, damping)
 
     def impulses(self, rate: float) -> Floats:
-        """The impulses at the samples of a rate [Hz], shape (N,): zero at the very poles, and of sum 1.
+        """Impulses at the samples of a rate [Hz], shape (N,), with exact zeros at the poles and sum 1.
 
-        An impulse between two samples is split over both so that at the pole they are what it was, which interpolation
-        is not.
+        An impulse between two samples is split over both so that its effect at the pole is unchanged, unlike
+        interpolation.
 
         Raises
         ------
         ModelError
-            A rate that is none, with fewer than four samples a period of a mode, or so high that the shaper lasts for
-            millions of them.
+            An invalid rate, one with fewer than four samples per period of a mode, or one at which the shaper has
+            millions of samples.
         """
         rate = checked_rate(rate)
         if self.delay * rate > LONGEST:
@@ -98,21 +98,21 @@ class Shaper:
         return taps
 
     def filter(self, reference: ArrayLike, rate: float) -> Floats:
-        """A reference, or an input, of one row a sample at a rate [Hz] through the shaper; it is as long as before.
+        """Apply the shaper to a reference or input at a sampling rate [Hz]; the length does not change.
 
-        What was before the first row is the first row. Where it ends the shaper is `delay` behind: let it end at rest.
+        The past is taken equal to the first row. The output lags by `delay`, so the reference should end at rest.
 
         Parameters
         ----------
         reference
-            One row a sample.
+            One row per sample.
         rate
-            Samples per second.
+            Sampling rate [Hz].
 
         Raises
         ------
         DataError
-            Rows that are no finite numbers.
+            Rows that are not finite.
         ModelError
             As :meth:`impulses`.
         """
@@ -133,7 +133,7 @@ class Shaper:
         return np.asarray(shaped.reshape(given.shape), dtype=np.float64)
 
     def to_dict(self) -> dict[str, Any]:
-        """For JSON."""
+        """Return impulses and modes for JSON."""
         return {
             "kind": self.kind,
             "times": list(self.times),
@@ -156,20 +156,20 @@ def input_shaper(
     modes_shaped: int = 1,
     coupling: Literal["simulated", "measured"] = "simulated",
 ) -> Shaper:
-    """Input shaper from the poles of a model, whatever its orders.
+    """Design an input shaper for the poles of a model of any orders.
 
     Parameters
     ----------
     model
-        An identified model, of which the least damped modes are shaped; or a pole [rad/s] such as ``-2 + 17j``.
+        Identified model, whose least damped modes are shaped; or a pole [rad/s] such as ``-2 + 17j``.
     kind
-        ``"zv"`` (Smith's posicast; half a period of delay) or ``"zvd"`` (a period; an error of the pole counts to
-        second order alone).
+        ``"zv"`` (Smith's posicast; half a period of delay) or ``"zvd"`` (a full period; pole errors have a second-order
+        effect only).
     modes_shaped
-        How many modes, the least damped first. Every one of them adds its delay.
+        Number of modes, the least damped first. Each adds its delay.
     coupling
-        ``"simulated"``: poles of the equations together. ``"measured"``: of each alone, as where a stiff loop moves a
-        hub that a link hangs on.
+        ``"simulated"``: poles of the coupled equations. ``"measured"``: poles of each equation alone, for a link whose
+        hub is moved by a stiff loop.
 
     Returns
     -------
@@ -178,13 +178,11 @@ def input_shaper(
     Raises
     ------
     ModelError
-        A model that is not stable, has friction, or has fewer modes that swing; poles so uncertain that a fifth of the
-        vibration may be left.
+        An unstable model, friction, too few oscillatory modes, or poles so uncertain that the residual vibration may
+        exceed 20 %.
 
-    Notes
-    -----
-    Singer and Seering (1990), doi:10.1115/1.2894142. A fractional model has a power of time beside its swings, which no
-    shaper cancels; it is no vibration.
+    Notes ----- Singer and Seering (1990), doi:10.1115/1.2894142. Besides its oscillation a fractional model has a
+    component that decays as a power of time, which no shaper cancels; it is no vibration.
     """
     check_choice("kind", kind, KINDS)
     count = whole_number(modes_shaped)
@@ -229,7 +227,7 @@ def input_shaper(
 
 
 def left_over(times: Floats, amplitudes: Floats, frequency: ArrayLike, damping: ArrayLike) -> Floats:
-    """Amplitude of the vibration after the last impulse over that after one impulse of sum 1 at its instant."""
+    """Amplitude of the vibration after the last impulse, relative to a single impulse of sum 1 at that time."""
     w, z = np.broadcast_arrays(np.asarray(frequency, dtype=np.float64), np.asarray(damping, dtype=np.float64))
     pole = w * (-z + 1j * np.sqrt(np.maximum(1.0 - z * z, 0.0)))
     left = np.sum(amplitudes * np.exp(pole[..., None] * (times[-1] - times)), axis=-1)
@@ -237,7 +235,7 @@ def left_over(times: Floats, amplitudes: Floats, frequency: ArrayLike, damping: 
 
 
 def _through(x: Floats, taps: Floats) -> Floats:
-    """What comes out of a filter of a few impulses, as long as what goes in."""
+    """Causal convolution with a few impulses, truncated to the length of the signal."""
     out = np.zeros(len(x))
     for at in np.flatnonzero(taps[: len(x)]):
         out[at:] += taps[at] * x[: len(x) - at]
@@ -258,13 +256,13 @@ def _mode_of(given: complex | np.number[Any]) -> Mode:
 
 
 def _half(mode: Mode) -> tuple[float, float]:
-    """Half a period of a mode [s], and what is left of a swing after it."""
+    """Half a period of a mode [s], and the decay over it."""
     half = math.pi / mode.pole.imag
     return half, math.exp(mode.pole.real * half)
 
 
 def _sampled(mode: Mode, step: float) -> Floats:
-    """The zero-vibration shaper of a mode at its samples: 1 + K e^(-s half) = 0 at its pole, exactly."""
+    """Discrete zero-vibration shaper of a mode: 1 + K e^(-s half) = 0 exactly at its pole."""
     half, kept = _half(mode)
     whole = math.floor(half / step)
     rest = half - whole * step
@@ -280,7 +278,7 @@ def _sampled(mode: Mode, step: float) -> Floats:
 
 
 def _worst(times: Floats, amplitudes: Floats, chosen: tuple[Mode, ...]) -> float | None:
-    """Largest share that is left over the intervals of the modes' frequencies and dampings."""
+    """Largest residual vibration over the confidence intervals of frequency and damping."""
     worst: float | None = None
     for mode in chosen:
         if mode.frequency_error is None or mode.damping_error is None:

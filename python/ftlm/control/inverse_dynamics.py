@@ -1,4 +1,4 @@
-"""Inverse dynamics: the reference with which a loop moves a tip along a path, by the exact response of its model."""
+"""Inverse dynamics: reference signal that moves an output along a path, by inversion of the exact response."""
 
 from __future__ import annotations
 
@@ -16,53 +16,53 @@ from ftlm.errors import DataError, ModelError
 from ftlm.model.model import Solved
 from ftlm.utils.validation import Complex, Floats, real_number, shown
 
-#: The transform is so many times as long as the path, under a weight that falls to exp(-FALLS) over it: what was long
-#: ago is then not what comes again, which a memory without end would never forget.
+#: Length of the transform relative to the path, and exponent of its weight exp(-t): the weight suppresses the periodic
+#: continuation, which the fading memory of a fractional model would never forget.
 LONGER, FALLS = 8, 28.0
-#: A reference that is so many times as large as the move grows without end.
+#: Largest reference relative to the move; larger ones are unstable.
 GROWN = 20.0
-#: Longest path that is inverted [rows].
+#: Longest path [samples].
 MOST = 100_000
-#: A reference that begins further off than this share of the move needs a longer rest before the path.
+#: Largest initial offset of a reference relative to the move; above, the path needs a longer dwell before the move.
 UNREST = 1e-3
-#: More than this share of what a path itself as the reference leaves, and the intervals are too wide.
+#: Largest residual vibration relative to that of the path as reference; above, the uncertainty is too large.
 SHARE_LEFT = 0.5
 
 
 class Loop(Protocol):
-    """A designed loop."""
+    """Protocol of a loop design."""
 
     @property
     def rate(self) -> float:
-        """Samples per second."""
+        """Sampling rate [Hz]."""
 
     @property
     def plants(self) -> tuple[Plant, ...]:
-        """What it moves, an output each."""
+        """Plants of the loop, one per output."""
 
     def acting(self, w: Floats | Complex) -> tuple[tuple[str, ...], Complex, Complex]:
-        """Outputs it reads, its response to each of them, shape (outputs, W), and to the reference, (W,)."""
+        """Return measured outputs, responses to each, shape (outputs, W), and to the reference, (W,)."""
 
 
 @dataclass(frozen=True)
 class PlannedMove:
-    """A reference that moves what was asked for along a path.
+    """Reference signal for a move along a path.
 
     Parameters
     ----------
     reference
-        For the loop, a row a sample.
+        Reference of the loop, one row per sample.
     path
-        What is to be followed.
+        Desired path.
     command
-        What the loop will ask for, as its linear model has it.
+        Predicted command of the loop, from its linear model.
     outputs
-        The model's outputs on the way.
-    left
-        RMS of what is off the path after its end, beyond which no more than one sample in forty of the model's numbers
-        is; None where it has no covariance.
+        Predicted outputs of the model.
+    residual_vibration
+        RMS deviation from the path after its end, exceeded by at most 2.5 % of the parameter samples; None without a
+        covariance.
     plain
-        The same at the model's values if the path itself were the reference.
+        Nominal RMS deviation with the path itself as reference.
     """
 
     reference: Floats
@@ -73,7 +73,7 @@ class PlannedMove:
     plain: float
 
     def to_dict(self) -> dict[str, Any]:
-        """For JSON, without the rows."""
+        """Return a summary for JSON, without the rows."""
         return {
             "rows": len(self.path),
             "largest_command": float(np.max(np.abs(self.command))),
@@ -93,23 +93,23 @@ class PlannedMove:
 def smooth_move(
     size: float, duration: float, rate: float = 500.0, *, before: float = 0.3, after: float = 1.2
 ) -> Floats:
-    """A path from rest to rest whose speed, acceleration and jerk are 0 at both ends: a polynomial of degree 7.
+    """Point-to-point path with zero velocity, acceleration and jerk at both ends: a polynomial of degree 7.
 
     Parameters
     ----------
     size
-        Of the move, in the unit of what moves.
+        Distance, in the unit of the output.
     duration
-        Of it [s].
+        Duration of the move [s].
     rate
-        Samples per second.
+        Sampling rate [Hz].
     before, after
-        Rest on both sides [s].
+        Dwell times before and after the move [s].
 
     Raises
     ------
     ModelError
-        Numbers that are none, a move of fewer than ten samples.
+        Invalid numbers, or a move of fewer than ten samples.
     """
     reach = real_number("size", size)
     if not math.isfinite(reach):
@@ -132,39 +132,37 @@ def smooth_move(
 def inverse(
     design: Loop, path: ArrayLike, *, of: str | None = None, limit: float = math.inf, samples: int = 40, seed: int = 0
 ) -> PlannedMove:
-    """Find the reference with which a designed loop moves a sum of outputs, such as a tip, along a path.
+    """Compute the reference with which a loop moves a sum of outputs, such as a tip, along a path.
 
     Parameters
     ----------
     design : PidDesign or LqgDesign
-        The loop; its model's response is inverted as it is, fractional, with delay, hold and the controller as it runs.
+        Loop design. The exact fractional response is inverted with delay, hold and the discrete-time controller.
     path : array_like
-        What is to be followed, one row a sample at the loop's rate; at rest at both ends, and before its move for as
-        long as the reference has to begin earlier.
+        Desired path, one row per sample at the loop's rate. It is at rest at both ends, with a dwell before the move as
+        long as the reference must lead.
     of : str, optional
-        An output of the model or a sum such as ``"theta11 + theta12"``, as the loop reads them; where the model has one
-        output alone it needs no name.
+        Output of the model or a sum such as ``"theta11 + theta12"``, as measured by the loop; may be omitted for a
+        model with one output.
     limit
         Largest command.
     samples, seed
-        Of the model's numbers, from their covariance, 0 to 10000.
+        Number of parameter samples from the covariance, 0 to 10000, and their seed.
 
     Returns
     -------
-    PlannedMove
+    Trajectory
 
     Raises
     ------
     DataError
-        A path that is none.
+        An invalid path.
     ModelError
-        A path that needs more than the limit, or a reference that moves before the path's first row; intervals so wide
-        that more than half may be left of what the path itself as the reference leaves.
+        A path that exceeds the limit, a reference that moves before the path's first row, or too much uncertainty: the
+        residual vibration may exceed half of that with the path itself as reference.
 
-    Notes
-    -----
-    In the frequency domain, where a tip that first moves backwards has a bounded inverse, which begins before the path
-    does: Bayo (1987), doi:10.1002/rob.4620040406.
+    Notes ----- In the frequency domain a nonminimum-phase response has a bounded inverse, which starts before the path:
+    Bayo (1987), doi:10.1002/rob.4620040406.
     """
     if not isinstance(design, JudgedLoop):
         raise ModelError(f"design is a {type(design).__name__}, no PidDesign or LqgDesign; design a loop first")
@@ -182,7 +180,7 @@ def inverse(
     heard, acts, asks = design.acting(w[inside])
 
     def moved(model: Solved) -> tuple[Complex, Complex]:
-        """Command and outputs of the closed loop by the reference."""
+        """Command and outputs of the closed loop per reference."""
         held = np.array([replace(p, model=model).response(w[inside]) for p in design.plants])
         loop = np.sum([a * held[names.index(o)] for o, a in zip(heard, acts, strict=True)], axis=0)
         command = asks / (1.0 + loop)
@@ -236,7 +234,7 @@ def inverse(
 
 
 def _path(path: ArrayLike) -> Floats:
-    """A path as numbers, shape (rows,)."""
+    """Return a path as an array of shape (rows,)."""
     try:
         raw = np.asarray(path)
         good = raw.dtype.kind in "fiu" and raw.ndim == 1 and 16 <= raw.size <= MOST
@@ -260,5 +258,5 @@ def _path(path: ArrayLike) -> Floats:
 
 
 def _off(found: Floats, rows: Floats, ends: int) -> float:
-    """RMS of what is off a path behind its end."""
+    """RMS deviation from a path after its end."""
     return float(np.sqrt(np.mean(np.square((found - rows)[min(ends, len(rows) - 1) :]))))

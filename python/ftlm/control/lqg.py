@@ -1,4 +1,4 @@
-"""What is not measured, from what is: a Kalman filter on the poles of an identified model, one sample at a time."""
+"""Kalman filter on the low-order realization of an identified model."""
 
 from __future__ import annotations
 
@@ -20,28 +20,28 @@ from ftlm.errors import DataError, ModelError
 from ftlm.model.model import Solved, check_solved
 from ftlm.utils.validation import Complex, Floats, nearest, shown
 
-#: What an observer calls the unknown part of its input.
+#: Name of the input disturbance in the estimates.
 UNKNOWN = "unknown input"
 
 
 @dataclass(frozen=True)
 class Observer:
-    """A Kalman filter: a model's sampled states and an unknown part of its input, corrected by what is measured.
+    """Kalman filter of a sampled model with an unknown input disturbance.
 
     Parameters
     ----------
     realisation
-        Of the model, all outputs; its error is in it.
+        Realization of the model for all outputs, with its approximation error.
     measured
-        Outputs that it reads.
+        Measured outputs.
     noise
-        Standard deviation of each of them.
+        Standard deviation of the noise of each measured output.
     drift
-        By how much the unknown part of the input walks in a second (standard deviation).
+        Process noise intensity: standard deviation of the disturbance's change in a second.
     gain
-        Of the correction, shape (states + 1, measured).
+        Correction gain, shape (states + 1, measured).
     deviations
-        Standard deviation of every output's estimate in the steady state, as the model and its noise have it.
+        Steady-state standard deviation of every output's estimate, according to the model and its noise.
     """
 
     realisation: Realisation
@@ -53,12 +53,12 @@ class Observer:
 
     @property
     def rows(self) -> Floats:
-        """Which states the measured outputs are."""
+        """Output matrix of the measured outputs."""
         return self.realisation.c[[self.realisation.outputs.index(o) for o in self.measured]]
 
     @property
     def matrices(self) -> tuple[Floats, Floats, Floats]:
-        """States and the input's unknown part from sample to sample, what the input does, what is measured."""
+        """Matrices a, b, c of the discrete-time system extended by the input disturbance."""
         a, b = self.realisation.a, self.realisation.b
         size = len(a)
         whole = np.eye(size + 1)
@@ -66,14 +66,14 @@ class Observer:
         return whole, np.vstack([b, [[0.0]]]), np.column_stack([self.rows, np.zeros(len(self.rows))])
 
     def over(self, run: Run) -> dict[str, Floats]:
-        """Estimates along a run from its input and what is measured of it, no sample ahead: of every output, and input.
+        """Filter a run: estimates of every output and of the input disturbance from past and present samples.
 
-        The first sample is taken to be at rest where its first measured output that integrates is.
+        The initial state is at rest; if the first measured output integrates, it is that output's first sample.
 
         Raises
         ------
         DataError
-            A run without these signals, or with another step.
+            A run without these signals, or with another sampling step.
         """
         names = (self.realisation.input, *self.measured)
         absent = [n for n in names if n not in run.signals]
@@ -104,7 +104,7 @@ class Observer:
         return dict(zip(self.realisation.outputs, shown, strict=True)) | {UNKNOWN: states[-1]}
 
     def rest(self, measured: Floats) -> Floats:
-        """States at rest where an integrating output is what is measured; of one that does not, 0."""
+        """Equilibrium states for a measured value of an integrating output; 0 for any other output."""
         states = np.zeros(self.realisation.states)
         column = self.rows[:, 0]
         if self.realisation.poles[0] == 0 and np.any(column):
@@ -130,26 +130,26 @@ def observer(
     coupling: Literal["simulated", "measured"] = "simulated",
     sensor: bool = False,
 ) -> Observer:
-    """Observe all outputs of a model from some of them: a deflection from a hub, a tip with less noise than its gauge.
+    """Design an observer of all outputs of a model from some of them, such as a deflection from a hub angle.
 
     Parameters
     ----------
     model
-        A linear model that is stable, an integral apart.
+        Linear model that is stable except for an integrator.
     input : str, optional
-        What drives it; where the model has one input alone it needs no name.
+        Input; may be omitted for a model with one input.
     measured : sequence of str, optional
-        Outputs that are read; default all.
+        Measured outputs; default all.
     noise : mapping, optional
-        Standard deviation of the noise of each; default what the fit of the model left.
+        Standard deviation of the noise of each measured output; default the residuals of the model's fit.
     drift
-        By how much an unknown part of the input may walk in a second, in its unit (standard deviation): friction,
-        offsets, what else is not modelled.
+        Process noise intensity: standard deviation of the change of an input disturbance in a second, in the unit of
+        the input. It covers friction, offsets and other unmodeled effects.
     rate, band, poles
-        Of the realisation; see :class:`Realisation`. The band is by default a five-thousandth to an eighth of half the
-        rate, the number of poles what brings the error below 0.1 dB and 1 degree.
+        Arguments of the realization; see :class:`Realisation`. The default band is from a five-thousandth to an eighth
+        of the Nyquist frequency. The default number of poles gives errors below 0.1 dB and 1 degree.
     coupling, sensor
-        See :func:`ftlm.analysis.frequency_response`; by default what is measured passed no sensor filter.
+        See :func:`ftlm.analysis.frequency_response`; by default the measurements are not filtered.
 
     Returns
     -------
@@ -158,8 +158,8 @@ def observer(
     Raises
     ------
     ModelError
-        A model that is not stable, an output or an input that it does not have, noise that is not known, a model that
-        a few poles do not realise, python-control that is not installed.
+        An unstable model, an unknown output or input, unknown noise, a model without an accurate low-order realization,
+        or python-control is not installed.
     """
     plants = plants_of(model, input, rate, coupling, sensor=sensor)
     names = names_of("measured", measured, tuple(p.output for p in plants))
@@ -167,7 +167,7 @@ def observer(
 
 
 def plants_of(model: Solved, driver: str | None, rate: float, coupling: str, *, sensor: bool) -> list[Plant]:
-    """A stable model's outputs from one input; refuses the others."""
+    """Return all outputs of a stable model from one input; raise for an unstable model."""
     check_solved(model)
     plants = [plant_of(model, o, driver, rate, coupling, sensor=sensor) for o in model.outputs]
     plants[0].check_stable()
@@ -178,11 +178,11 @@ def plants_of(model: Solved, driver: str | None, rate: float, coupling: str, *, 
 
 
 def filtered(realisation: Realisation, measured: tuple[str, ...], noise: tuple[float, ...], drift: float) -> Observer:
-    """The Kalman filter of a realisation."""
+    """Return the Kalman filter of a realization."""
     bare = Observer(realisation, measured, noise, drift, np.zeros((0, 0)), {})
     a, b, c = bare.matrices
     step = 1.0 / realisation.rate
-    # What is not known of the input: as much again from sample to sample as it walks in a second.
+    # Process noise of the input itself: the same deviation per sample as its random walk has in a second.
     inside = np.zeros_like(a)
     inside[:-1, :-1] = b[:-1] @ b[:-1].T * drift**2
     inside[-1, -1] = drift**2 * step
@@ -202,7 +202,7 @@ def filtered(realisation: Realisation, measured: tuple[str, ...], noise: tuple[f
 
 
 def noises(model: Solved, measured: tuple[str, ...], given: Mapping[str, float] | None) -> tuple[float, ...]:
-    """Deviation of the noise of each measured output."""
+    """Standard deviation of the noise of each measured output."""
     if given is not None and not isinstance(given, Mapping):
         raise ModelError(f"noise = {shown(given)} is no mapping from outputs to standard deviations")
     for name in given or {}:
@@ -223,36 +223,36 @@ def noises(model: Solved, measured: tuple[str, ...], given: Mapping[str, float] 
     return tuple(out)
 
 
-#: Largest sensitivity of a loop that is a design: a phase margin of 19 degrees and gain margins of 1.5 at least.
+#: Largest sensitivity of an acceptable design: phase margin of at least 19 degrees, gain margins of at least 1.5.
 SHARP = 3.0
-#: Frequencies of a Nyquist curve, and how far below the band it begins.
+#: Number of frequencies of a Nyquist curve, and its start relative to the band.
 POINTS, BELOW = 2500, 1e-2
-#: A pole of the controller this close to 1 is its integral.
+#: Distance from 1 below which a pole of the controller is its integrator.
 AT_ONE = 1e-7
 
 
 class Lqg:
-    """An observer and a state feedback, one sample at a time.
+    """Discrete-time observer and state feedback.
 
-    The first sample is safe: the observer begins at rest where the output stands, and what is asked for is answered
-    from there. It is told the currents that were cut at the limit, so that nothing winds up.
+    The controller starts without a step: the observer begins at rest at the measured output. It uses the saturated
+    commands, which avoids windup.
 
     Parameters
     ----------
     observer
-        What it knows its states from.
+        Observer of the states.
     feedback
-        Of the states, shape (1, states).
+        State feedback gain, shape (1, states).
     tracked
-        The output that follows the reference.
+        Output that follows the reference.
     limit
         Largest command.
 
     Raises
     ------
     ModelError
-        Feedback of another shape or that is not finite, a limit that is not above 0, an output that cannot be held;
-        when it is called, a command that is no number.
+        Feedback of the wrong shape or not finite, a limit that is not above 0, an output without an equilibrium; when
+        called, a command that is not finite.
     """
 
     def __init__(self, observer: Observer, feedback: ArrayLike, tracked: str, *, limit: float = math.inf) -> None:
@@ -272,23 +272,23 @@ class Lqg:
 
     @property
     def memory(self) -> int:
-        """Numbers that are remembered from one sample to the next."""
+        """Number of states between two samples."""
         return len(self._a) + 1
 
     @property
     def estimate(self) -> dict[str, float]:
-        """Every output as it is thought to be at the next sample, and the unknown part of the input."""
+        """Prediction of all outputs at the next sample, and estimate of the input disturbance."""
         states = np.zeros(len(self._a)) if self._states is None else self._states
         shown = (self.observer.realisation.c @ states[:-1]).tolist()
         return dict(zip(self.observer.realisation.outputs, shown, strict=True)) | {UNKNOWN: float(states[-1])}
 
     def reset(self) -> None:
-        """Forgets everything."""
+        """Reset all states."""
         self._states: Floats | None = None
         self._applied = 0.0
 
     def __call__(self, measured: Sequence[float] | Floats, reference: float) -> float:
-        """The command for what is measured at a sample, in the observer's order, and what is asked for."""
+        """Return the command for the measured outputs of a sample, in the observer's order, and a reference."""
         y = np.asarray(measured, dtype=np.float64)
         with np.errstate(over="ignore", invalid="ignore"):
             if self._states is None:
@@ -304,7 +304,7 @@ class Lqg:
         return self._applied
 
     def response(self, w: Floats | Complex) -> tuple[Complex, Complex]:
-        """Of the command to what is measured, shape (measured, W), and to the reference, (W,), without the limit."""
+        """Frequency responses of the command to the measured outputs, (measured, W), and to the reference, (W,)."""
         z = np.exp(1j * np.asarray(w) / self.rate)
         a, into = self._closed()
         system = z[:, None, None] * np.eye(len(a)) - a
@@ -313,16 +313,16 @@ class Lqg:
         return np.asarray(-z[None] * answer[:, :-1].T), np.asarray(self.ahead * (1.0 - answer[:, -1]))
 
     def poles(self) -> Complex:
-        """Its own, in the plane of z."""
+        """Poles of the controller in the z-plane."""
         return np.asarray(np.linalg.eigvals(self._closed()[0]))
 
     def _closed(self) -> tuple[Floats, Floats]:
-        """The controller from sample to sample, and what is measured into it."""
+        """State and input matrices of the controller."""
         into = self._a @ self.observer.gain
         return self._a - self._b @ self._gains - into @ self._c, into
 
     def to_dict(self) -> dict[str, Any]:
-        """For JSON."""
+        """Return the controller for JSON."""
         realisation = self.observer.realisation
         return {
             "kind": "lqg",
@@ -350,20 +350,20 @@ class Lqg:
 
 @dataclass(frozen=True)
 class LqgDesign(JudgedLoop):
-    """A linear-quadratic controller with the margins of its loop on the exact model.
+    """Linear-quadratic controller with the margins of its loop on the exact model.
 
     Parameters
     ----------
     controller
-        What runs.
+        Controller to run.
     realisation
-        Of the model, with its error.
+        Realization of the model, with its approximation error.
     nominal
-        Margins at the values of the model's numbers, at the plant's input.
+        Margins at the nominal parameters, at the plant input.
     samples
-        Margins at samples of the numbers from their covariance; none where the model has no covariance.
+        Margins at parameters drawn from the covariance; empty without a covariance.
     plants
-        The model's outputs as they are measured.
+        Measured outputs of the model.
     """
 
     controller: Lqg
@@ -374,20 +374,20 @@ class LqgDesign(JudgedLoop):
 
     @property
     def rate(self) -> float:
-        """Of the loop [Hz]."""
+        """Sampling rate [Hz]."""
         return self.realisation.rate
 
     def acting(self, w: Floats | Complex) -> tuple[tuple[str, ...], Complex, Complex]:
-        """Outputs it reads, its response to each of them and to the reference, at frequencies [rad/s]."""
+        """Return the measured outputs, and responses to each of them and to the reference at frequencies [rad/s]."""
         heard, asked = self.controller.response(w)
         return self.controller.observer.measured, -heard, asked
 
     def controlled(self, limit: float) -> Lqg:
-        """The controller with a limit of its command, as a rig has it."""
+        """Return the controller with a limit of its command."""
         return Lqg(self.controller.observer, self.controller.feedback, self.controller.tracked, limit=limit)
 
     def to_dict(self) -> dict[str, Any]:
-        """For JSON, without the matrices."""
+        """Return design and margins for JSON, without the matrices."""
         made = self.realisation
         return {
             "design": "lqg",
@@ -426,45 +426,44 @@ def lqg(
     coupling: Literal["simulated", "measured"] = "simulated",
     sensor: bool = False,
 ) -> LqgDesign:
-    """Control a model of any orders from an observer of its states: linear-quadratic, with an integral.
+    """Design an LQG controller with integral action on a low-order realization of a model of any orders.
 
     Parameters
     ----------
     model
-        A linear model that is stable, an integral apart.
+        Linear model that is stable except for an integrator.
     allowed : mapping
-        Deviations of outputs, or of sums such as ``"theta11 + theta12"`` (a tip), that are as dear as `effort`.
+        Maximum acceptable deviations of outputs, or of sums such as ``"theta11 + theta12"`` (a tip); Bryson's rule.
     effort
-        Of the input, in its unit.
+        Maximum acceptable input, in its unit.
     input, output : str, optional
-        What is controlled with, and the output that follows the reference: default the one that integrates, or the
-        first. Where the model has one input alone it needs no name.
+        Manipulated input and output that follows the reference, by default the integrating output, or the first. The
+        input may be omitted for a model with one input.
     measured, noise, rate, band, poles, coupling, sensor
         See :func:`observer`.
     drift
-        By how much an unknown part of the input may walk in a second; default a fifth of `effort`. The larger, the
-        faster is the observer, and the more of the noise is in the command.
+        Process noise intensity: change of an input disturbance in a second; default a fifth of `effort`. Larger values
+        give a faster observer and more noise in the command.
     limit
         Largest command.
     samples, seed
-        Of the model's numbers, from their covariance, 0 to 10000.
+        Number of parameter samples from the covariance, 0 to 10000, and their seed.
 
     Returns
     -------
     LqgDesign
-        Its `controller` runs; margins are those of the controller as it runs on the exact response of the model.
+        Its `controller` runs in discrete time; the margins are those of this controller on the exact response of the
+        model.
 
     Raises
     ------
     ModelError
-        As :func:`observer`; a loop whose largest sensitivity on the exact model is above 3, intervals so wide that it
-        is in more than a twentieth of their samples.
+        As :func:`observer`; a largest sensitivity above 3 on the exact model, nominally or for more than 5 % of the
+        parameter samples.
 
-    Notes
-    -----
-    The riccati equations are python-control's, on the sampled realisation; a sample of delay is counted. Such loops
-    have no guaranteed margins: Doyle (1978), doi:10.1109/TAC.1978.1101812. So they are judged by the argument principle
-    on the exact response.
+    Notes ----- Solves the Riccati equations by python-control on the sampled realization, including one sample of
+    delay. LQG loops have no guaranteed margins: Doyle (1978), doi:10.1109/TAC.1978.1101812. Therefore the argument
+    principle on the exact response decides.
     """
     count, start = drawn_from(samples, seed)
     dear = positive("effort", effort)
@@ -515,7 +514,7 @@ def lqg(
 
 
 def _tracked(output: str | None, plants: Sequence[Plant]) -> str:
-    """The output that follows the reference."""
+    """Return the output that follows the reference."""
     names = [p.output for p in plants]
     if output is not None:
         return names_of("output", [output], tuple(names))[0]
@@ -523,7 +522,7 @@ def _tracked(output: str | None, plants: Sequence[Plant]) -> str:
 
 
 def _weights(allowed: Mapping[str, float], names: tuple[str, ...]) -> list[tuple[Floats, float]]:
-    """Rows of outputs that are summed up, and the deviations that are allowed for."""
+    """Return coefficients of sums of outputs, with their maximum acceptable deviations."""
     if not isinstance(allowed, Mapping) or not allowed:
         raise ModelError(
             f"allowed = {shown(allowed)} is no mapping from outputs, or sums of them, to deviations; give such as "

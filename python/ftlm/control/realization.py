@@ -1,4 +1,4 @@
-"""A model as a few poles: rational functions fitted to its exact response, and the same sampled, with their errors."""
+"""Low-order realization by vector fitting of the exact response, and its discretization with errors."""
 
 from __future__ import annotations
 
@@ -17,39 +17,39 @@ from ftlm.control.stability_margins import Plant
 from ftlm.errors import ModelError
 from ftlm.utils.validation import Complex, Floats, real_number, shown, whole_number, words_of
 
-#: Frequencies at which the exact response is fitted; the fit is judged between them, too.
+#: Number of fitted frequencies; the error is also evaluated between them.
 FITTED = 120
-#: Rounds in which poles move, and the share of themselves below which they stand still.
+#: Most iterations of pole relocation, and relative change of converged poles.
 ROUNDS, STILL = 30, 1e-6
-#: A pole that adds less than this share to every output at every frequency is none.
+#: Smallest contribution of a pole, relative to every output at every frequency; smaller ones are dropped.
 NOTHING = 1e-6
-#: One closer to 0 than this share of the band's lower end is an integral.
+#: Poles closer to 0 than this share of the band's lower end are integrators.
 AT_ORIGIN = 1e-3
-#: Errors up to which poles are added, gain [dB] and phase [degrees], and the most of them.
+#: Target errors of gain [dB] and phase [degrees], and range of the number of poles.
 GAIN_DB, PHASE_DEGREES = 0.1, 1.0
 FEWEST, MOST = 2, 30
-#: Errors beyond which nothing is designed on it.
+#: Largest errors of a realization that a design may use.
 COARSE_DB, COARSE_DEGREES = 1.0, 6.0
 
 
 @dataclass(frozen=True)
 class Realisation:
-    """A model from one input as a linear system of whole order, continuous and sampled.
+    """Integer-order state-space realization of a model from one input, continuous and sampled.
 
     Parameters
     ----------
     outputs, input
         Names.
     rate
-        Samples per second; the input is held between them.
+        Sampling rate [Hz]; the input has a zero-order hold.
     band
-        Where it was fitted [rad/s].
+        Fitted frequency band [rad/s].
     poles
-        In the plane of s [rad/s], one of each pair; of a hub that integrates one is 0.
+        Poles in the s-plane [rad/s], one of each conjugate pair; 0 for an integrator.
     a, b, c
-        State space of the samples: x' = a x + b u, y = c x.
+        Discrete-time state space: x' = a x + b u, y = c x.
     gain_error, phase_error
-        Largest errors over the band of each output against the model's exact response [dB], [degrees].
+        Largest errors over the band of each output against the exact response [dB], [degrees].
     """
 
     outputs: tuple[str, ...]
@@ -69,7 +69,7 @@ class Realisation:
         return len(self.a)
 
     def response(self, w: Floats) -> Complex:
-        """Of its samples to a held input, at frequencies [rad/s], shape (outputs, W)."""
+        """Frequency response [rad/s] of the samples to a held input, shape (outputs, W)."""
         z = np.exp(1j * np.asarray(w, dtype=np.float64) / self.rate)
         system = z[:, None, None] * np.eye(self.states) - self.a
         states = np.linalg.solve(system, np.broadcast_to(self.b, (z.size, *self.b.shape)))[:, :, 0]
@@ -84,26 +84,26 @@ class Realisation:
 
 
 def realised(plants: Sequence[Plant], band: tuple[float, float] | None, poles: int | None) -> Realisation:
-    """Fit a system of whole order to the exact response of outputs to one input, and sample it.
+    """Fit an integer-order system to the exact response of outputs to one input, and discretize it.
 
     Parameters
     ----------
     plants
-        Of one model, input and rate: one for each output.
+        Plants of one model, input and rate, one per output.
     band
-        Frequencies (low, high) [rad/s]; default from a five-thousandth to an eighth of half the rate.
+        Frequencies (low, high) [rad/s]; default from a five-thousandth to an eighth of the Nyquist frequency.
     poles
-        Their number besides that of an integral; default as many as bring the error below 0.1 dB and 1 degree.
+        Number of poles without the integrator; default as many as give errors below 0.1 dB and 1 degree.
 
     Raises
     ------
     ModelError
-        A band or a number that is none, python-control that is not installed, a fit off by more than 1 dB or 6 degrees.
+        An invalid band or number, python-control is not installed, or errors above 1 dB or 6 degrees.
 
     Notes
     -----
-    Poles in common by vector fitting: Gustavsen and Semlyen (1999), doi:10.1109/61.772353, relative errors weighed
-    alike. Sampled under a hold by python-control.
+    Common poles by vector fitting: Gustavsen and Semlyen (1999), doi:10.1109/61.772353, with equal weight on relative
+    errors. Discretized with a zero-order hold by python-control.
     """
     low, high = _band(band, plants[0].rate)
     if poles is None:
@@ -141,7 +141,7 @@ def realised(plants: Sequence[Plant], band: tuple[float, float] | None, poles: i
 
 @contextmanager
 def solving(what: str, way_out: str) -> Iterator[None]:
-    """Put into words what floating point does not carry: numbers beyond it, matrices that are singular in it."""
+    """Raise ModelError for overflow and for numerically singular matrices."""
     with np.errstate(over="raise", divide="raise", invalid="raise"), warnings.catch_warnings():
         # SciPy warns of a matrix whose solution has no digits.
         warnings.simplefilter("error", RuntimeWarning)
@@ -154,7 +154,7 @@ def solving(what: str, way_out: str) -> Iterator[None]:
 
 
 def python_control() -> Any:
-    """The package python-control, or how to get it."""
+    """Import python-control; raise with the install command if it is absent."""
     try:
         return importlib.import_module("control")
     except ImportError:
@@ -177,14 +177,14 @@ def _band(band: tuple[float, float] | None, rate: float) -> tuple[float, float]:
 
 
 def _begun(own: Sequence[complex], low: float, high: float, count: int) -> Complex:
-    """Poles to begin with, one of each pair: the model's own swings, and relaxations spread over the band."""
+    """Initial poles, one of each pair: the oscillatory modes of the model, and real poles over the band."""
     pairs = list(own)[: count // 2]
     real = -np.geomspace(low, high, count - 2 * len(pairs))
     return np.asarray([*pairs, *real.tolist()], dtype=np.complex128)
 
 
 def _basis(s: Complex, poles: Complex) -> Complex:
-    """1/(s - p) of every pole, of a pair its real and its imaginary part, shape (S, number of poles)."""
+    """Partial fractions 1/(s - p) of every pole, real and imaginary part for a pair, shape (S, number of poles)."""
     columns = []
     for p in poles:
         one = 1.0 / (s - p)
@@ -197,7 +197,7 @@ def _basis(s: Complex, poles: Complex) -> Complex:
 
 
 def _system(poles: Complex) -> tuple[Floats, Floats]:
-    """The state space whose outputs the columns of :func:`_basis` are."""
+    """State space with the columns of :func:`_basis` as outputs."""
     size = int(np.sum(np.where(poles.imag == 0, 1, 2)))
     a, b = np.zeros((size, size)), np.zeros((size, 1))
     at = 0
@@ -213,7 +213,7 @@ def _system(poles: Complex) -> tuple[Floats, Floats]:
 
 
 def _fit(s: Complex, exact: Complex, integrates: Sequence[bool], poles: Complex) -> tuple[Complex, Floats, bool]:
-    """Poles and, by output, the residues of each, the integral's first."""
+    """Return the poles and, by output, their residues, the integrator's first."""
     weight = 1.0 / np.abs(exact)
     for _ in range(ROUNDS):
         basis = _basis(s, poles)
@@ -254,14 +254,14 @@ def _fit(s: Complex, exact: Complex, integrates: Sequence[bool], poles: Complex)
 
 
 def _least(matrix: Complex, vector: Complex) -> Floats:
-    """Real numbers that solve complex equations best: by the triangle of the equations, which is small."""
+    """Real least-squares solution of complex equations, by their triangular factor."""
     both = np.column_stack([matrix, vector])
     triangle = np.asarray(np.linalg.qr(np.concatenate([both.real, both.imag]), mode="r"), dtype=np.float64)
     return np.asarray(np.linalg.lstsq(triangle[:, :-1], triangle[:, -1])[0])
 
 
 def _residues(s: Complex, exact: Complex, integrates: Sequence[bool], poles: Complex) -> Floats:
-    """Residues of an integral and of the columns of :func:`_basis`, by output."""
+    """Residues of an integrator and of the columns of :func:`_basis`, by output."""
     basis = _basis(s, poles)
     residues = np.zeros((len(exact), basis.shape[1] + 1))
     for i, line in enumerate(exact):
@@ -276,7 +276,7 @@ def _residues(s: Complex, exact: Complex, integrates: Sequence[bool], poles: Com
 def _sampled(
     library: Any, plants: Sequence[Plant], band: tuple[float, float], poles: Complex, residues: Floats, integral: bool
 ) -> Realisation:
-    """The fitted system at its samples, and how far off it is."""
+    """Return the discretized realization with its approximation errors."""
     a, b = _system(poles)
     c = residues[:, 1:]
     if integral:
@@ -286,7 +286,7 @@ def _sampled(
         poles = np.append(0.0, poles)
     rate = plants[0].rate
     system = library.sample_system(library.ss(a, b, c, np.zeros((len(c), 1))), 1.0 / rate, "zoh")
-    # States of like size: what is weighed against each other is then nothing that units make.
+    # Scale the states, so that units have no influence on the weights of a design.
     size = np.maximum(np.sqrt(np.sum(c * c, axis=0)), 1e-300)
     made = Realisation(
         tuple(p.output for p in plants),
@@ -309,6 +309,6 @@ def _sampled(
 
 
 def _worst(made: Realisation) -> float:
-    """Its errors in terms of those that are aimed at."""
+    """Largest approximation error relative to its target."""
     worst = max(max(made.gain_error.values()) / GAIN_DB, max(made.phase_error.values()) / PHASE_DEGREES)
     return worst if math.isfinite(worst) else math.inf

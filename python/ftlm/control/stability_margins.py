@@ -1,4 +1,4 @@
-"""Loops on a model's exact frequency response: whether they are stable, and how far from not being so."""
+"""Stability margins on the exact frequency response of a model."""
 
 from __future__ import annotations
 
@@ -21,25 +21,25 @@ from ftlm.errors import ModelError
 from ftlm.model.model import Solved
 from ftlm.utils.validation import Complex, Floats
 
-#: Frequencies of a Nyquist curve, from a thousandth of the crossover to half the sampling rate.
+#: Number of frequencies of a Nyquist curve, from a thousandth of the crossover to the Nyquist frequency.
 POINTS = 1500
 BELOW = 1e-3
 
 
 @dataclass(frozen=True)
 class Margins:
-    """How far a loop is from instability.
+    """Stability margins of a loop.
 
     Parameters
     ----------
     stable
         Whether the closed loop is stable, by the argument principle on 1 + L.
     crossover
-        Highest frequency at which abs(L) = 1 [rad/s]; NaN where there is none.
+        Highest frequency with abs(L) = 1 [rad/s]; NaN without one.
     phase
         Smallest phase margin of all crossovers [degrees].
     gain
-        Smallest factor by which the loop's gain may rise or fall before the phase is -180 degrees at 1.
+        Gain margin: smallest factor by which the loop gain may rise or fall until L = -1.
     sensitivity
         Largest abs(1/(1 + L)).
     """
@@ -60,18 +60,18 @@ class Margins:
 
 
 class JudgedLoop:
-    """What is told of a loop: its margins at the values of a model's numbers, and at samples of them."""
+    """Loop design with margins at the nominal parameters and at samples of their distribution."""
 
     nominal: Margins
     samples: tuple[Margins, ...]
 
     @property
     def kept(self) -> float:
-        """Share of the samples whose loop is stable; 1 where there are none."""
+        """Share of the samples with a stable loop; 1 without samples."""
         return sum(m.stable for m in self.samples) / len(self.samples) if self.samples else 1.0
 
     def within(self, what: Literal["crossover", "phase", "gain", "sensitivity"]) -> tuple[float, float]:
-        """Where 95 % of the samples have a margin."""
+        """Central 95 % interval of a margin over the samples."""
         if not self.samples:
             value = getattr(self.nominal, what)
             return value, value
@@ -79,14 +79,14 @@ class JudgedLoop:
         return float(low), float(high)
 
     def _margins(self) -> dict[str, Any]:
-        """Margins at the values and over samples, for JSON."""
+        """Nominal and sampled margins for JSON."""
         told = [{f.name: getattr(m, f.name) for f in fields(m)} for m in (self.nominal, *self.samples)]
         for one in told:
             one |= {n: v if math.isfinite(v) else None for n, v in one.items()}
         return {"nominal": told[0], "samples": told[1:]}
 
     def _judged(self) -> list[str]:
-        """Lines that say so."""
+        """Margins as lines of text."""
         lines = [f"at the values: {self.nominal}"]
         if self.samples:
             phase, gain, peak = (self.within(n) for n in ("phase", "gain", "sensitivity"))
@@ -100,7 +100,7 @@ class JudgedLoop:
 
 @dataclass(frozen=True)
 class Plant:
-    """One input and one output of a model behind a sampled loop.
+    """Input and output of a model in a sampled loop.
 
     Parameters
     ----------
@@ -109,7 +109,7 @@ class Plant:
     output, input
         Names.
     rate
-        Of the loop [Hz]: an answer acts a sample later and is held.
+        Sampling rate [Hz]; a command acts one sample later and is held.
     coupling, sensor
         See :func:`ftlm.analysis.frequency_response`.
     """
@@ -136,7 +136,7 @@ class Plant:
         return np.asarray(every[self.model.outputs.index(self.output), inputs.index(self.input)])
 
     def _seen(self, s: Complex) -> Complex:
-        """What the sensor filter makes of it."""
+        """Response of the sensor filter."""
         passed = self.model.structure.sensor_filter if self.sensor else None
         if passed is None:
             return np.ones_like(s)
@@ -145,16 +145,16 @@ class Plant:
         return np.asarray((above / below) ** power)
 
     def held(self, w: Floats | Complex) -> Complex:
-        """The same behind the hold of a sampled input, below half the rate."""
+        """Response with a zero-order hold of the input, below half the rate."""
         turn = 1j * w / self.rate
         return np.asarray(self.exact(w) * -np.expm1(-turn) / turn)
 
     def response(self, w: Floats | Complex) -> Complex:
-        """The same behind the loop's sample of delay, too."""
+        """Response with zero-order hold and one sample of delay."""
         return np.asarray(self.held(w) * np.exp(-1j * w / self.rate))
 
     def integrates(self) -> float:
-        """Order of the plant's own integral."""
+        """Order of the plant's integration at zero frequency."""
         transfer = transfer_functions(self.model, coupling=self.coupling)
         above = transfer.numerators[self.output, self.input]
         if not above:
@@ -162,16 +162,16 @@ class Plant:
         return transfer.denominator[self.output][-1][1] - above[-1][1]
 
     def grows(self) -> float:
-        """Number of unstable poles; NaN where one is on the axis."""
+        """Number of unstable poles; NaN with a pole on the imaginary axis."""
         found = stability(self.model, coupling=self.coupling)
         return math.nan if found.on_axis else found.unstable_poles
 
     def reached(self) -> bool:
-        """Whether the input does anything to the output."""
+        """Whether the output depends on the input."""
         return bool(transfer_functions(self.model, coupling=self.coupling).numerators[self.output, self.input])
 
     def check_stable(self) -> None:
-        """Refuse a model that is not stable; an integral is."""
+        """Raise for an unstable model; an integrator is allowed."""
         grows = self.grows()
         if grows != 0:
             why = "a pole is on the imaginary axis" if math.isnan(grows) else f"{grows:g} of its poles are on the right"
@@ -181,7 +181,7 @@ class Plant:
             )
 
     def samples(self, count: int, seed: int) -> list[Plant]:
-        """Plants as the covariance of the model's numbers has them; none where it has no covariance."""
+        """Return plants with parameters drawn from the model's covariance; empty without a covariance."""
         estimate = self.model.estimate
         if estimate is None or estimate.covariance is None:
             return []
@@ -201,7 +201,7 @@ def grid(crossover: float, rate: float) -> Floats:
 
 
 def margins_of(loop: Complex, w: Floats, integrates: float, grows: float = 0.0) -> Margins:
-    """Margins of a loop's response on a fine grid.
+    """Margins of a loop's frequency response on a fine grid.
 
     Parameters
     ----------
@@ -210,9 +210,9 @@ def margins_of(loop: Complex, w: Floats, integrates: float, grows: float = 0.0) 
     w
         Frequencies, rising [rad/s].
     integrates
-        Order with which L grows towards 0.
+        Order of integration of L at zero frequency.
     grows
-        Unstable poles of L.
+        Number of unstable poles of L.
     """
     if not np.isfinite(loop).all() or math.isnan(grows):
         return Margins(False, math.nan, math.nan, math.nan, math.inf)

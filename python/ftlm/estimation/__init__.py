@@ -1,1 +1,1 @@
-"""From runs to a model: estimators called, results judged and reported."""
+"""Estimation of fractional-order models from measured data."""

@@ -1,4 +1,4 @@
-"""The reference of a closed loop as instrument: inputs replaced by the part of them that it explains."""
+"""Closed-loop identification with the reference signal as external instrument."""
 
 from __future__ import annotations
 
@@ -17,27 +17,27 @@ from ftlm.utils.statistics import autoregression, is_constant
 from ftlm.utils.validation import Floats, nearest
 from ftlm.validation.residual_tests import LAGS, past_columns
 
-#: How many samples of a reference may stand by themselves, one for so many rows of the shortest run at least; those
-#: before are averaged over blocks, each wider by a factor.
+#: Numbers of reference lags with a coefficient of their own, and fewest samples of the shortest run for each. Earlier
+#: samples are averaged over blocks of growing width.
 DENSE = (3, 6, 12, 25, 50, 100)
 ROWS_A_SAMPLE = 15
-#: A first stage whose F is below this makes a weak instrument (Staiger and Stock, doi:10.2307/2171753).
+#: Smallest first-stage F statistic of a strong instrument (Staiger and Stock, doi:10.2307/2171753).
 WEAK = 10.0
 
 
 def driven_by(runs: Sequence[Run], structure: Structure, reference: str) -> tuple[list[Run], list[str]]:
-    """Runs whose inputs are what a reference explains of them, and what to beware of.
+    """Return runs whose inputs are replaced by their part explained by a reference, and warnings.
 
-    The controller and the loop are one linear law from reference to input, fitted by least squares over all runs, as in
-    the first of two stages (Van den Hof and Schrama, An indirect method for transfer function estimation from closed
-    loop data, Automatica 29, 1993, 1523-1527). What noise puts into an input is not in its answer to the reference.
+    Controller and loop form one linear filter from reference to input. Least squares over all runs fits it, as in the
+    first step of the two-stage method (Van den Hof and Schrama, An indirect method for transfer function estimation
+    from closed loop data, Automatica 29, 1993, 1523-1527). The explained part of an input contains no fed-back noise.
 
     Raises
     ------
     ModelError
-        A reference that is no signal's name, or a signal of the model.
+        The reference is not a signal name, or is a signal of the model.
     DataError
-        A reference that a run does not have, or that does not move; no input.
+        A run lacks the reference, the reference is constant, or the model has no input.
     """
     if not isinstance(reference, str):
         raise ModelError(f"reference is {type(reference).__name__}, not the name of a signal of the runs")
@@ -90,7 +90,7 @@ def driven_by(runs: Sequence[Run], structure: Structure, reference: str) -> tupl
 
 
 def strength(answers: Sequence[Floats], missed: Sequence[Floats], coefficients: int) -> float:
-    """F of the first stage: what the answers have for each coefficient over what slow noise gives to each."""
+    """Return the first-stage F statistic, with the long-run variance of the residuals."""
     colour = autoregression(missed, LAGS)
     errors = np.concatenate([np.convolve(e - np.mean(e), colour, "valid") for e in missed])
     level = float(np.mean(errors**2)) / max(float(np.sum(colour)) ** 2, 1e-12)
@@ -99,7 +99,7 @@ def strength(answers: Sequence[Floats], missed: Sequence[Floats], coefficients: 
 
 
 def _columns(moves: Sequence[Floats], shortest: int, dense: int) -> Floats:
-    """The past of a reference as regressors, and a level for every run."""
+    """Return lagged reference values as regressors, and one constant for every run."""
     parts = [np.stack(past_columns(r, 0, shortest // 2, dense=dense), axis=1) for r in moves]
     levels = np.repeat(np.eye(len(moves)), [r.size for r in moves], axis=0)
     return np.hstack([np.concatenate(parts), levels])
@@ -123,7 +123,7 @@ def _answering(run: Run, number: int, answers: dict[str, list[Floats]]) -> Run:
 
 
 def by_reference(fit: Fit, reference: str, warnings: Sequence[str]) -> Fit:
-    """A fit with a reference as instrument, told as one."""
+    """Return a fit with the reference recorded in its settings and warnings."""
     # The noise of a loop is coloured, and no sign of what the model leaves out; intervals count it.
     own = [w for w in fit.warnings if "are not white" not in w]
     return replace(fit, warnings=[*own, *warnings], settings={**fit.settings, "reference": reference})

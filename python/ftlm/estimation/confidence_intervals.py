@@ -1,7 +1,7 @@
-"""Profile likelihood: intervals where the cost around a joint fit's optimum is no parabola.
+"""Confidence intervals of a joint fit: Wald and profile likelihood.
 
-For each value of one number all others are fitted anew; the interval holds the values at which the cost has risen by no
-more than noise explains (Venzon & Moolgavkar, doi:10.2307/2347496; Raue et al., doi:10.1093/bioinformatics/btp358).
+At each value of one parameter all others are refitted. The interval holds the values at which the cost rises by no more
+than the noise explains (Venzon & Moolgavkar, doi:10.2307/2347496; Raue et al., doi:10.1093/bioinformatics/btp358).
 """
 
 from __future__ import annotations
@@ -27,47 +27,49 @@ from ftlm.utils.linalg import dot, projections, singular
 from ftlm.utils.resources import pool
 from ftlm.utils.validation import Floats, real_number
 
-#: The quadratic picture fails for a number where either end of its interval is off by more than this share, as one
-#: linear step of all others tells.
+#: Largest relative error of a bound of the Wald interval, from one linear step of all other parameters. Above it the
+#: parameter is profiled.
 BENT = 0.1
-#: An end is found where the root of the rise is as near to its threshold, and Newton's next step a smaller share of the
-#: way from the optimum.
+#: A bound is found if the root of the rise is within RISE_TOLERANCE of its threshold and Newton's next step is shorter
+#: than BOUND_TOLERANCE times the distance from the optimum.
 NEAR = 0.1
 FOUND = 0.02
-#: A valley is looked at on half as fine a grid where its optimum is no further off than so many standard errors, or
-#: than this share of the numbers themselves.
+#: Half the refinement is enough if it moves the optimum by less than this many standard errors, or less than this
+#: fraction of each parameter.
 NEARBY, ALIKE = 2.0, 1e-3
-#: Evaluations of one refit, and refits an end at most.
+#: Maximum number of evaluations of one refit, and of refits for one bound.
 LAP = 120
 REFITS = 40
-#: Free runs below which an end is not gone on with.
+#: Smallest budget of simulations with which the search for a bound continues.
 LEAST_SHARE = 10
-#: An end that far out, in half-widths of the quadratic interval, is none: the cost does not rise.
+#: Largest distance of a bound, in half-widths of the Wald interval. Beyond it the interval is unbounded.
 FARTHEST = 1e3
-#: The first step is that of the quadratic picture or the number itself, but not below this share of the former; a
-#: bracket is narrow where it is FOUND of the value inside it, or of this share of the way.
+#: The first step is the Wald half-width or the value itself, but at least MIN_FIRST_STEP_RATIO times the former. A
+#: bracket is narrow if its width is BOUND_TOLERANCE of the value inside it, or of BRACKET_SCALE_RATIO times the
+#: distance.
 LEAST_WAY = 0.01
 FINEST = 0.1
-#: Least and most growth of the way from the optimum in a step.
+#: Smallest and largest factor by which the distance from the optimum grows in one step.
 LEAST_GROWTH, GROWTH = 1.1, 4.0
-#: Share of the threshold to which a refit is minimised, and by which a lower cost is another optimum.
+#: Tolerance of a refit as a fraction of the threshold, and the cost decrease that indicates another optimum.
 EXACT = 1e-4
 LOWER = 0.02
-#: The others are tried by powers of the number where one moves by more than this share of itself, to no more than this
-#: power.
+#: If a step moves another parameter by more than this fraction, power laws are tried as well, with exponents up to
+#: this.
 BY_POWERS, STEEPEST = 0.3, 4.0
-#: The cost levels off where its root rises by half of what it did before or less, and would stay this share below.
+#: The cost levels off if its root rises by at most this fraction of the last rise and stays this far below the
+#: threshold.
 LEVEL_OFF, BELOW = 0.5, 0.05
-#: A lower optimum is another fit where the sum of squares falls by more than this share of a standard error's.
+#: A lower optimum is reported if the sum of squares falls by more than this fraction of one standard error's rise.
 WORTH = 0.1
-#: How often the search goes on from a lower optimum that it came upon.
+#: Largest number of lower optima from which the search continues.
 DESCENTS = 5
-#: Directions in which other numbers move nothing, as a share of the largest.
+#: Relative singular value below which a direction of the other parameters has no effect.
 FLAT = 1e-12
 
 
 class _LowerError(Exception):
-    """A refit whose cost is below the optimum's."""
+    """Refit with a cost below that of the optimum."""
 
     def __init__(self, attempt: Attempt) -> None:
         super().__init__()
@@ -77,19 +79,19 @@ class _LowerError(Exception):
 
 @dataclass(frozen=True)
 class Valley:
-    """The cost of a joint fit around its optimum, on its last grid.
+    """Cost of a joint fit around its optimum, on its finest grid.
 
     Parameters
     ----------
     grid, best
-        The grid, each output weighing as its residuals ask for, and the optimum there.
+        Objective with weights from the residuals, and its optimum.
     shift
-        From there to the estimate, the limit for step 0.
+        Difference between the estimate, extrapolated to step 0, and this optimum.
     bread
-        Inverse of the cost's curvature.
+        Inverse of the Hessian of the cost.
     errors, units
-        Standard errors, and by how much the sum of squares rises at one standard error of each: the noise's variance,
-        widened for coloured residuals, so that a parabola gives the quadratic interval.
+        Standard errors, and the rise of the sum of squares at one standard error: the noise variance, widened for
+        colored residuals, so that a parabola gives the Wald interval.
     """
 
     grid: Grid
@@ -101,7 +103,7 @@ class Valley:
 
     @classmethod
     def of(cls, joint: JointFit, problem: FreeProblem, runs: Sequence[Run]) -> Valley:
-        """The valley in which a fit ended."""
+        """Return the profile likelihood around the optimum of a fit."""
         weights = [1.0 / max(joint.noise[o], 1e-300) for o in problem.structure.outputs]
         # Where a growing optimum was left, its valley is not this one.
         steady = joint.growth is not None and not joint.growth.kept
@@ -118,7 +120,7 @@ class Valley:
 
     @classmethod
     def at(cls, grid: Grid, values: Floats, shift: Floats) -> Valley:
-        """The valley below a point."""
+        """Return the profile likelihood around the optimum reached from a point."""
         best = grid.descend(_attempt(grid, values), LAP, plain=True)
         bread = covariance_of(np.asarray(best.outcome["jacobian"]), [], 1.0)
         spread = np.diag(covariance(best, grid))
@@ -127,22 +129,22 @@ class Valley:
 
     @property
     def names(self) -> list[str]:
-        """Everything that is free."""
+        """Names of all free parameters."""
         return self.grid.problem.names
 
     def seen(self, i: int) -> bool:
-        """Whether the runs see a number at all."""
+        """Whether the data determine a parameter at all."""
         return bool(0 < self.errors[i] < math.inf and 0 < self.units[i] < math.inf)
 
     def rise(self, i: int, squares: float) -> float:
-        """By how many standard deviations a sum of squares is above the optimum's."""
+        """Return the rise of a sum of squares above the optimum, in standard deviations."""
         return math.sqrt(max(squares - 2.0 * float(self.best.outcome["cost"]), 0.0) / float(self.units[i]))
 
     def bent(self, i: int, width: float) -> float:
-        """By which share an end of the quadratic interval is off, as far as one evaluation at each end tells.
+        """Return the relative error of the Wald interval of a parameter, from one evaluation at each bound.
 
-        Both ends are moved along the direction of the conditional optimum; there all other numbers follow by one linear
-        step. Infinite where an end is out of bounds or has no finite free run.
+        Each bound is moved along the conditional optimum, and all other parameters follow by one linear step. Infinite
+        if a bound violates a constraint or its simulation is not finite.
         """
         if not self.seen(i):
             return 0.0
@@ -163,13 +165,11 @@ class Valley:
         return worst
 
     def end(self, i: int, side: float, width: float, stop: threading.Event | None = None) -> Search:
-        """The search for the end of a number's interval on one side, by Newton's method between in and out.
+        """Search one bound of the interval of a parameter by a bracketed Newton method.
 
-        It asks, as a generator, for the free runs that it may have taken in all by the next refit, tells whenever these
-        do not suffice how many it took, and returns the end.
-
-        At a refit the cost's slope along the number alone is the slope of the profile; the root of its rise is linear
-        where the cost is a parabola, so that one refit finds the end there.
+        A generator: it receives the total budget of simulations, yields the number used whenever the budget is
+        exhausted, and returns the bound. At a refit the slope of the cost along the parameter is the slope of the
+        profile. The root of its rise is linear if the cost is a parabola, so one refit then suffices.
         """
         start, sigma = float(self.best.values[i]), float(self.errors[i])
         limit = self.grid.problem.all_bounds[i][0 if side < 0 else 1]
@@ -244,12 +244,12 @@ class Valley:
         return End(start + side * outside if risen else side * math.inf, points, evaluations)
 
     def refitted(self, i: int, value: float, near: Attempt, lap: int = LAP) -> Attempt | None:
-        """The optimum of all others at a value of one number, followed from a point nearby; None where there is none.
+        """Refit all other parameters at a value of one, from a nearby point; None if none is feasible.
 
         Raises
         ------
-        _LowerError
-            It lies below the optimum.
+        _LowerOptimumError
+            The cost is below that of the optimum.
         """
         rise = float(self.units[i])
         least = 2.0 * float(self.best.outcome["cost"])
@@ -264,10 +264,10 @@ class Valley:
         return None
 
     def _starts(self, i: int, value: float, near: Attempt) -> list[Floats]:
-        """Where the others may be at a value of one number, the likeliest first.
+        """Return initial guesses of the other parameters at a value of one, most promising first.
 
-        Along the tangent, or, where that moves them by much, all or orders by powers of the number if that costs less:
-        valleys without end are bent like d mu = const, d + a = const.
+        Along the tangent; if that moves them far, also along power laws, for all parameters or for the orders only.
+        Unbounded valleys often have the form d mu = const, d + a = const.
         """
         values, tangent = near.values, _tangent(near, i)
         orders = len(self.grid.problem.orders)
@@ -286,14 +286,14 @@ class Valley:
         return sorted(points, key=lambda p: self._cost(i, p)) if len(points) > 2 else points
 
     def _cost(self, i: int, values: Floats) -> float:
-        """Cost at a point; infinite where it has no finite free run."""
+        """Return the cost at a point; infinite if the simulation is not finite."""
         try:
             return float(self._descended(i, values, 0, EXACT).outcome["cost"])
         except FtlmError:
             return math.inf
 
     def _along(self, i: int, values: Floats, direction: Floats, value: float) -> Floats:
-        """A point with a value of one number, the others moved along, as far as bounds and orders allow."""
+        """Return a point with a given value of one parameter, the others moved as far as feasible."""
         at = values.copy()
         at[i] = value
         if not direction[i]:
@@ -318,7 +318,7 @@ Search = Generator[int, int, "End"]
 
 @dataclass(frozen=True)
 class End:
-    """One end of an interval: its value on the grid, the points on the way, free runs."""
+    """Bound of an interval: value on the grid, evaluated points and number of simulations."""
 
     value: float
     points: list[tuple[float, float]]
@@ -327,18 +327,18 @@ class End:
 
 @dataclass(frozen=True)
 class Profiles:
-    """Profile intervals of some numbers, and the lower optimum that the search for them may have come upon.
+    """Profile-likelihood intervals, and any lower optimum found on the way.
 
     Parameters
     ----------
     intervals
-        By name.
-    lower
-        Values of everything free at an optimum that is lower than the fit's; None where there is none worth a fit.
-    left
-        Names of numbers whose profile would have taken more free runs than were allowed.
+        Intervals by name.
+    lower_optimum
+        Parameters of an optimum with a lower cost than the fit; None if there is no significantly lower one.
+    incomplete_names
+        Parameters whose profile needed more simulations than allowed.
     evaluations
-        Free runs that all of it took.
+        Total number of simulations.
     """
 
     intervals: dict[str, ProfileInterval]
@@ -356,24 +356,24 @@ def profiled(
     progress: Callable[[int, int], None] | None = None,
     most: int | None = None,
 ) -> Profiles:
-    """Profile intervals of some of a fit's numbers.
+    """Compute profile-likelihood intervals of some parameters of a fit.
 
-    Every end is followed from the optimum by itself, so that the figures do not depend on the number of threads. A
-    number that the runs do not see has the whole line for its interval.
+    Each bound is searched from the optimum independently, so results do not depend on the number of threads. A
+    parameter that the data do not determine has the whole line as its interval.
 
     Parameters
     ----------
     valley
-        Where the fit ended.
+        Profile likelihood around the optimum.
     names
-        Numbers by name.
+        Parameter names.
     level
         Probability between 0 and 1.
     threads, progress
-        Threads, and what is called with (ends found, ends in all).
+        Number of threads, and a callback with (bounds found, total bounds).
     most
-        Free runs for all ends together, those from lower optima on the way included; None for as many as they need.
-        They are dealt out evenly, and what an end does not need goes to those that are not found yet.
+        Budget of simulations for all bounds, including those of lower optima; None for no limit. It is distributed
+        evenly, and the unused part goes to the bounds that are not found yet.
 
     Raises
     ------
@@ -416,9 +416,9 @@ def _ends(
     progress: Callable[[int, int], None] | None,
     most: int | None,
 ) -> tuple[dict[tuple[str, float], End | _LowerError | None], int]:
-    """Both ends of every number that the runs see, and the free runs that they took.
+    """Search both bounds of every identifiable parameter; return them and the number of simulations.
 
-    The first of them whose way leads to a lower optimum is the last: all others would be ends around another one.
+    The search stops at the first lower optimum, because the other bounds would belong to the wrong optimum.
     """
     width, stop = half_width(level), threading.Event()
     asked = [(n, side) for n in names if valley.seen(valley.names.index(n)) for side in (-1.0, 1.0)]
@@ -469,13 +469,13 @@ def _ends(
 
 
 def bent_numbers(valley: Valley, level: float) -> list[str]:
-    """Numbers for which the quadratic picture fails, by two evaluations each."""
+    """Return the parameters whose Wald interval is inaccurate, from two evaluations each."""
     width = half_width(level)
     return [n for i, n in enumerate(valley.names) if valley.bent(i, width) > BENT]
 
 
 def half_width(level: float) -> float:
-    """Half-width of an interval of this probability in standard deviations."""
+    """Return the half-width of an interval of this probability, in standard deviations."""
     return NormalDist().inv_cdf(0.5 + 0.5 * level)
 
 
@@ -485,7 +485,7 @@ def _attempt(grid: Grid, values: Floats) -> Attempt:
 
 
 def _middle(start: float, side: float, inside: float, outside: float) -> float:
-    """The middle of a bracket, by its ratio where the values differ by one."""
+    """Return the midpoint of a bracket; geometric if both values have the same sign."""
     near, far = start + side * inside, start + side * outside
     if near * far > 0:
         return side * (math.copysign(math.sqrt(near * far), near) - start)
@@ -493,7 +493,7 @@ def _middle(start: float, side: float, inside: float, outside: float) -> float:
 
 
 def _slope(attempt: Attempt, i: int) -> float:
-    """Half the derivative of the sum of squares with respect to one number; 0 where it is beyond the numbers."""
+    """Return half the derivative of the sum of squares by one parameter; 0 on overflow."""
     # Near where a free run has no value its derivatives overflow: they tell no step.
     with np.errstate(over="ignore", invalid="ignore"):
         slope = dot(np.asarray(attempt.outcome["jacobian"])[i], np.asarray(attempt.outcome["residuals"]))
@@ -501,7 +501,7 @@ def _slope(attempt: Attempt, i: int) -> float:
 
 
 def _span(attempt: Attempt, i: int) -> tuple[Any, Floats]:
-    """Singular value decomposition of the other numbers' sensitivities, rows of unit length, and these lengths."""
+    """Return the SVD of the other parameters' sensitivities (unit rows), and the row norms."""
     others = np.delete(np.asarray(attempt.outcome["jacobian"]), i, axis=0)
     # Far out, sensitivities may be so large that their squares are no numbers.
     length = np.abs(others).max(axis=1, initial=0.0)
@@ -513,14 +513,14 @@ def _span(attempt: Attempt, i: int) -> tuple[Any, Floats]:
 
 
 def _left(attempt: Attempt, i: int) -> Floats:
-    """Residuals once all other numbers follow by one linear step."""
+    """Return the residuals after one linear step of all other parameters."""
     residuals = np.asarray(attempt.outcome["residuals"])
     (_, _, right), _ = _span(attempt, i)
     return np.asarray(residuals - right.T @ projections(right.T, residuals))
 
 
 def _tangent(attempt: Attempt, i: int) -> Floats:
-    """How all numbers move along the profile when one moves by 1."""
+    """Return the direction of all parameters along the profile when one moves by 1."""
     (left, sizes, right), length = _span(attempt, i)
     along = np.asarray(attempt.outcome["jacobian"])[i]
     with np.errstate(over="ignore"):
@@ -528,14 +528,14 @@ def _tangent(attempt: Attempt, i: int) -> Floats:
     return np.insert(others, i, 1.0)
 
 
-#: Level of the intervals that are printed.
+#: Confidence level of the printed intervals.
 PRINTED = 0.95
-#: A lower optimum is spoken of where the residuals of an output fall by this share.
+#: A lower optimum is reported if the residuals of an output fall by this fraction.
 TOLD = 1e-3
-#: How often a fit goes on from a lower optimum that its intervals came upon.
+#: Largest number of restarts from a lower optimum found by the interval search.
 REFITS_INTERVALS = 2
-#: Pulses that may be spent on profiles nobody asked for, all numbers together, and free runs that an end is worth
-#: beginning with. Where an order is free, a pulse costs so many of running sums.
+#: Budget of block pulses for profiles under intervals="auto", and fewest simulations with which a bound is started.
+#: With free orders a pulse costs FREE_ORDER_COST_FACTOR times as much.
 UNASKED, FEWEST = 6_000_000, 20
 FRACTIONAL = 3
 
@@ -550,10 +550,10 @@ def with_intervals(
     progress: Callable[[int, int], None] | None = None,
     loss: Loss = "squares",
 ) -> tuple[JointFit, list[str]]:
-    """A joint fit with the intervals that were asked for, and what is to be said of them.
+    """Return a joint fit with the requested intervals, and warnings about them.
 
-    ``"auto"`` profiles the numbers for which the quadratic picture fails, ``"profile"`` all. Where that leads to an
-    optimum below the fit's, the fit is done again from there.
+    ``"auto"`` profiles the parameters whose Wald interval is inaccurate, ``"profile"`` all. If a profile leads to a
+    lower optimum, the fit is repeated from there.
     """
     fitted = len(joint.names) + joint.initial_terms
     # Where no more samples are left over than numbers were fitted, the residuals do not tell what noise explains.
@@ -606,9 +606,9 @@ def with_intervals(
 
 
 def is_lower(grid: Grid, before: Floats, after: Floats) -> bool:
-    """Whether one point costs less than another on the next finer grid as well.
+    """Whether a point has a lower cost than another one on the next finer grid as well.
 
-    There they are only evaluated: a mode of the scheme would settle on that grid anew.
+    The points are only evaluated there, because a mode of the scheme would otherwise adapt to that grid.
     """
     finer, costs = grid.finer, []
     for values in (before, after):
@@ -622,7 +622,7 @@ def is_lower(grid: Grid, before: Floats, after: Floats) -> bool:
 
 
 def valley_of(result: Judged) -> Valley:
-    """The cost around the optimum of a result by output error."""
+    """Return the profile likelihood around the optimum of an output-error result."""
     if result.joint is None or result.task is None:
         raise ModelError(f"method {result.method!r} has no likelihood to profile; identify by method='output-error'")
     problem = FreeProblem.of(replace(result.task.structure, initial=result.joint.initial))
@@ -632,7 +632,7 @@ def valley_of(result: Judged) -> Valley:
 def profile(
     result: Judged, names: Sequence[str], level: float, threads: int, progress: Callable[[int, int], None] | None
 ) -> dict[str, ProfileInterval]:
-    """Profile intervals of a result's numbers; see :meth:`ftlm.Identification.profile`."""
+    """Return profile-likelihood intervals of a result; see :meth:`ftlm.Identification.profile`."""
     if "reference" in result.settings:
         raise ModelError(
             "a fit with reference= is where residuals are orthogonal to instruments, and no minimum of a cost: it has "

@@ -1,4 +1,4 @@
-"""Whether parts of a run, or several runs, are one model: each identified by itself, number by number and together."""
+"""Consistency test: whether segments of a run, or several runs, share one model (parameter constancy)."""
 
 from __future__ import annotations
 
@@ -23,29 +23,29 @@ from ftlm.utils.statistics import NORMAL_95, chi_squared_99
 from ftlm.utils.validation import whole_number
 from ftlm.validation.comparison import compare, finite
 
-#: Parts that one run is cut into.
+#: Default number of segments of one run.
 PARTS = 2
-#: Words of the table, by what the intervals of two parts do.
+#: Table entries for the comparison of two intervals.
 APART, TOGETHER, UNTOLD = "apart", "overlap", "not told"
-#: An end of an interval nearer or farther than this many times where a parabola has it.
+#: Largest ratio of an interval bound to the Wald bound for which the covariance is used.
 SKEWED = 2.0
 
 
 @dataclass(frozen=True)
 class Difference:
-    """What two parts say of one number.
+    """Difference of one parameter between two segments.
 
     Parameters
     ----------
     name
-        The number.
+        The parameter.
     parts
-        Places of the two parts.
-    errors
-        Standard errors of the difference that lie between them, of intervals by profile likelihood by the ends that
-        face each other; not a number where one part does not tell it.
-    apart
-        Whether their 95 % intervals have nothing in common.
+        Indices of the two segments.
+    difference_in_errors
+        Difference in its standard errors; for profile-likelihood intervals from the facing bounds. NaN if the parameter
+        is not identifiable from one segment.
+    disjoint
+        Whether the 95 % intervals do not overlap.
     """
 
     name: str
@@ -56,21 +56,21 @@ class Difference:
 
 @dataclass(frozen=True)
 class Agreement(Reported):
-    """Parts of a run, or runs, identified each by itself, and whether they are one model.
+    """Segments of a run, or runs, identified separately, and whether they share one model.
 
     Parameters
     ----------
     names
-        What the parts are called.
+        Names of the segments.
     results
-        The identification of each.
+        Identification of each segment.
     differences
-        Of each number between each two parts, the farthest apart first.
+        Difference of each parameter between each two segments, largest first.
     distance, degrees
-        How far all numbers together are from those that serve every part best, in the covariances that the parts give
-        them: chi-squared of so many degrees where it is one model. None where a method gives no covariance.
-    crossed
-        Fit in percent of each part's model (first) on each part (second), by output; outputs of one run stand apart.
+        Chi-squared statistic of all parameters about their common weighted mean, and its degrees of freedom under one
+        common model. None for a method without covariance.
+    cross_validation
+        Fit in percent of each segment's model (first) on each segment (second), by output.
     """
 
     names: tuple[str, ...]
@@ -82,14 +82,14 @@ class Agreement(Reported):
 
     @property
     def same(self) -> bool | None:
-        """Whether nothing tells the parts apart; None where no number is told by two of them."""
+        """Whether the segments share one model; None if no parameter is identifiable from two segments."""
         if all(math.isnan(d.errors) for d in self.differences):
             return None
         return not any(d.apart for d in self.differences) and not self._far
 
     @property
     def limit(self) -> float:
-        """What chance leaves the distance below in 99 % of cases."""
+        """99 % quantile of the distance under one common model."""
         return chi_squared_99(self.degrees) if self.degrees else math.inf
 
     @property
@@ -98,7 +98,7 @@ class Agreement(Reported):
 
     @property
     def untold(self) -> tuple[str, ...]:
-        """Numbers that some part does not tell, with which any other agrees."""
+        """Parameters not identifiable from some segment; they cannot contradict the others."""
         return tuple(dict.fromkeys(d.name for d in self.differences if math.isnan(d.errors)))
 
     @property
@@ -111,7 +111,7 @@ class Agreement(Reported):
         return values_of(self.results[part])
 
     def words(self, difference: Difference) -> str:
-        """A number in two parts: its values, its intervals, and how many standard errors lie between."""
+        """Describe one parameter in two segments: values, intervals and difference in standard errors."""
         said = []
         for part in difference.parts:
             low, high = self.results[part].intervals[difference.name]
@@ -121,7 +121,7 @@ class Agreement(Reported):
 
     @property
     def reason(self) -> str:
-        """Whether it is one model, and which number of which parts says so."""
+        """Conclusion in one sentence, with the parameters and segments that decide it."""
         told = [d for d in self.differences if not math.isnan(d.errors)]
         if self.same is None:
             return "Not told: no number is known by two parts"
@@ -140,7 +140,7 @@ class Agreement(Reported):
 
     @property
     def warnings(self) -> tuple[str, ...]:
-        """What speaks against the comparison: numbers that are not told, and what speaks against each part."""
+        """Limitations of the comparison: parameters that are not identifiable, and warnings of each segment."""
         out = []
         if self.untold and self.same is not None:
             out.append(f"{', '.join(self.untold)}: not told by some part, so any other agrees with it")
@@ -155,7 +155,7 @@ class Agreement(Reported):
         return tuple(out)
 
     def numbers_table(self) -> Table:
-        """Numbers of each part, with their intervals, and how far they are apart."""
+        """Return a table of the parameters of each segment, with intervals and differences."""
         rows: list[list[Cell]] = []
         for name in dict.fromkeys(d.name for d in self.differences):
             worst = next(d for d in self.differences if d.name == name)
@@ -175,7 +175,7 @@ class Agreement(Reported):
         )
 
     def fits_table(self) -> Table:
-        """What the model of each part predicts of each."""
+        """Return a table of the fit of each segment's model on every segment."""
         rows: list[list[Cell]] = [
             [f"{name}, {output}", *(self.crossed[k][j].get(output) for j in range(len(self.names)))]
             for k, name in enumerate(self.names)
@@ -195,7 +195,7 @@ class Agreement(Reported):
         return Page("Parts of a run", [first, *sections], lead)
 
     def to_frame(self) -> Any:
-        """Numbers as a pandas frame by number and part."""
+        """Return the parameters as a pandas frame by parameter and segment."""
         rows = [
             {
                 "number": name,
@@ -211,7 +211,7 @@ class Agreement(Reported):
         return to_frame(rows, ["number", "part"])
 
     def to_dict(self) -> dict[str, Any]:
-        """For JSON."""
+        """Return the result as a dictionary for JSON."""
         return {
             "same": self.same,
             "reason": self.reason,
@@ -250,7 +250,7 @@ def _cell(value: Cell) -> str:
 
 
 def values_of(result: Identification) -> dict[str, float]:
-    """Everything that has a standard error, by name."""
+    """Return all parameters with a standard error, by name."""
     return {**result.orders, **result.coefficients, **({} if result.joint is None else result.joint_values)}
 
 
@@ -262,39 +262,39 @@ def agreement(
     progress: Callable[[int, int], None] | None = None,
     **options: Any,
 ) -> Agreement:
-    """Identify parts of a run each by itself, and tell whether they are one model.
+    """Identify segments of a run separately and test whether they share one model.
 
-    A structure that is the machine's gives the same numbers whichever part of a run it is identified from. Parts whose
-    95 % intervals of some number have nothing in common are not one model, nor are those whose numbers together are
-    farther apart than their covariances explain in 99 of 100 cases: either the machine changed, or the structure leaves
-    something out that one part shows and another does not.
+    If the structure is right, every segment gives the same parameters. Segments are inconsistent if the 95 % intervals
+    of some parameter do not overlap, or if the parameters together differ by more than their covariances explain (99
+    %). Then the plant changed, or the structure lacks an effect that only some segments excite.
 
     Parameters
     ----------
     runs
-        One run, which is cut into parts of the same length, or several, each a part.
+        One run, which is split into segments of equal length, or several runs, one segment each.
     structure
-        What each is identified as. A part that begins in motion has initial terms, or a history, of its own.
-    parts
-        How many parts of one run, by default 2; not used with several runs.
+        Structure to identify. Each segment with a nonzero start has its own initial terms or history.
+    segments
+        Number of segments of one run, by default 2; not used with several runs.
     progress
-        Called with (parts done, parts in all).
+        Callback with (segments done, total segments).
     **options
-        Of :func:`ftlm.identify`, but for `store` and `start`; a method with standard errors.
+        Options of :func:`ftlm.identify` except `store` and `start`, with a method that gives standard errors.
 
     Returns
     -------
-    Agreement
-        Prints well; ``.same``, ``.reason`` in words, ``.differences`` by number, ``.report`` writes a page.
+    Consistency
+        Printable result with ``.consistent``, ``.reason`` and ``.differences``; ``.report`` writes an HTML page.
 
     Raises
     ------
     ModelError
-        One part, a number of parts with several runs, a method without standard errors, or nothing to estimate.
+        Fewer than two segments, a number of segments with several runs, a method without standard errors, or no free
+        parameter.
     DataError
-        A run too short to be cut, runs that do not fit together, or a part that cannot be identified.
+        A run too short to split, runs that do not fit together, or a segment that cannot be identified.
     ConvergenceError
-        A part that cannot be fitted.
+        A segment whose fit fails.
     """
     every = as_runs(runs)
     given = None if parts is None else whole_number(parts)
@@ -326,7 +326,7 @@ def agreement(
 
 
 def cut(run: Run, parts: int) -> list[Run]:
-    """Parts of a run of the same length, but for a row."""
+    """Split a run into segments of equal length, up to one sample."""
     if parts * FEWEST_ROWS > run.length:
         raise DataError(f"{run.name} has {run.length} rows, too few to be cut into {parts} parts; use fewer")
     ends = [k * run.length // parts for k in range(parts + 1)]
@@ -337,7 +337,7 @@ def cut(run: Run, parts: int) -> list[Run]:
 
 
 def _named(pieces: Sequence[Run]) -> list[str]:
-    """What parts are called: runs of different names by these, others by when they were."""
+    """Return segment names: the run names if they differ, otherwise the time intervals."""
     names = [p.name for p in pieces]
     if len(set(names)) == len(names):
         return names
@@ -348,7 +348,10 @@ def _named(pieces: Sequence[Run]) -> list[str]:
 
 
 def _crossed(result: Identification, piece: Run, own: Identification) -> dict[str, float]:
-    """Fit of a part's model on a part, which begins as its own fit found; none where the free run is not finite."""
+    """Return the fit of one segment's model on another segment; empty if the simulation is not finite.
+
+    The initial conditions are those of the other segment's own fit.
+    """
     if result is own:
         return dict(result.fit_percent)
     begun = replace(result.model.structure, initial=own.model.structure.initial)
@@ -359,7 +362,7 @@ def _crossed(result: Identification, piece: Run, own: Identification) -> dict[st
 
 
 def differences(results: Sequence[Identification]) -> list[Difference]:
-    """Of each number between each two parts, the farthest apart first; what is not told last."""
+    """Return the differences of each parameter between each two segments, largest first, NaN last."""
     out = []
     for places in itertools.combinations(range(len(results)), 2):
         pair = [results[k] for k in places]
@@ -375,23 +378,23 @@ def differences(results: Sequence[Identification]) -> list[Difference]:
 
 
 def tells(result: Identification, name: str) -> bool:
-    """Whether a part says anything of a number: not where it may be anything."""
+    """Whether a parameter is identifiable from a segment: finite standard error and a bounded side."""
     low, high = result.intervals[name]
     return 0.0 < result.standard_errors[name] < math.inf and (low > -math.inf or high < math.inf)
 
 
 def is_quadratic(result: Identification, name: str) -> bool:
-    """Whether both ends of an interval are about where the standard error has them."""
+    """Whether both bounds of an interval are close to those of the Wald interval."""
     value, usual = values_of(result)[name], NORMAL_95 * result.standard_errors[name]
     low, high = result.intervals[name]
     return tells(result, name) and all(usual / SKEWED <= end <= SKEWED * usual for end in (value - low, high - value))
 
 
 def together(results: Sequence[Identification]) -> tuple[float | None, int]:
-    """Chi-squared of all numbers about those that serve every part best, and its degrees of freedom.
+    """Return the chi-squared distance of all parameters from their mean, and its degrees of freedom.
 
-    Left out of all are numbers whose interval in some part is no parabola's: there a covariance says little. Each is
-    told in units of its standard errors, so that powers of the unit of time do not decide what rounding is.
+    Parameters without an approximately quadratic cost in every segment are left out, because their covariance says
+    little. Each is scaled by its standard errors, so that units do not determine the numerical rank.
     """
     joints = [r.joint for r in results if r.joint is not None]
     if len(joints) < len(results):

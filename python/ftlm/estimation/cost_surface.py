@@ -1,4 +1,4 @@
-"""A joint fit's cost around its optimum, over the two orders that its runs tell apart least."""
+"""Cost surface of a joint fit over its two most correlated orders."""
 
 from __future__ import annotations
 
@@ -16,24 +16,24 @@ from ftlm.svg.heat_map import Landscape
 from ftlm.utils.linalg import dot, projections, singular
 from ftlm.utils.validation import Floats
 
-#: Points a side of a joint fit's landscape, and its half-width in standard errors.
+#: Points on each axis of the cost surface, and its half-width in standard errors.
 SIDE, HALF_WIDTH = 11, 4.0
-#: Evaluations that find the optimum of the fit's last grid.
+#: Maximum number of evaluations that find the optimum on the finest grid.
 REFITS = 20
 
 
 def correlated_orders(result: Judged) -> tuple[str, str, float] | None:
-    """The two orders of a joint fit that its runs tell apart least, and their correlation.
+    """Return the two most correlated orders of a joint fit, and their correlation.
 
     Parameters
     ----------
     result
-        By output error.
+        Result by output error.
 
     Returns
     -------
     tuple or None
-        None with fewer than two free orders, or where no correlation is known.
+        None with fewer than two free orders, or without a known correlation.
     """
     if result.joint is None:
         return None
@@ -49,23 +49,22 @@ def correlated_orders(result: Judged) -> tuple[str, str, float] | None:
 def output_error_landscape(
     result: Judged, orders: tuple[str, str] | None = None, *, refit: bool = True
 ) -> Landscape | None:
-    """Cost of a joint output-error fit over two of its orders, four standard errors around the optimum.
+    """Compute the cost of an output-error fit over two orders, four standard errors around the optimum.
 
     Parameters
     ----------
     result
-        By output error.
+        Result by output error.
     orders
-        Names of the two; by default those that the runs tell apart least.
+        Names of the two orders; by default the most correlated ones.
     refit
-        Whether all other orders, coefficients and delays follow by one linear step from the optimum; otherwise they
-        are held.
+        Whether all other parameters follow by one linear step from the optimum; otherwise they stay fixed.
 
     Returns
     -------
     Landscape or None
-        Scores are 1 plus what the sum of squares, weighted by the noise, exceeds its smallest value by; for white
-        residuals the 95 % region of both orders ends at 7. None where two orders have no finite standard error.
+        Scores are 1 plus the increase of the sum of squares, weighted by the noise. For white residuals the 95 % region
+        of both orders ends at 7. None if two orders have no finite standard error.
 
     Raises
     ------
@@ -106,7 +105,7 @@ def output_error_landscape(
 
 @dataclass(frozen=True)
 class Around:
-    """A joint fit around its optimum: the grid it ended on, the best point there, and what all but two numbers span."""
+    """Cost surface around the optimum of a joint fit."""
 
     grid: Grid
     best: Attempt
@@ -115,7 +114,7 @@ class Around:
 
     @classmethod
     def of(cls, joint: JointFit, task: Task, names: tuple[str, str], *, refit: bool) -> Around:
-        """The optimum of the last grid; the estimate is extrapolated to step 0, so it is close by."""
+        """Return the surface around the optimum of the finest grid, close to the estimate."""
         problem = FreeProblem.of(replace(task.structure, initial=joint.initial))
         weights = [1.0 / joint.noise[o] for o in problem.structure.outputs]
         grid = Grid(problem, task.runs, weights, joint.refinement, shares=joint.shares)
@@ -129,18 +128,18 @@ class Around:
 
     @property
     def centre(self) -> Floats:
-        """Values of everything free at the best point."""
+        """Parameters at the optimum."""
         return self.best.values
 
     def rest(self, attempt: Attempt) -> float:
-        """Sum of squares that is left of an attempt's residuals once all other numbers follow."""
+        """Return the residual sum of squares after one linear step of all other parameters."""
         residuals = np.asarray(attempt.outcome["residuals"])
         if self.basis is not None:
             residuals = residuals - self.basis.T @ projections(self.basis.T, residuals)
         return dot(residuals, residuals)
 
     def cost(self, x: float, y: float) -> float:
-        """The same where the two numbers are moved; infinite where that has no finite free run."""
+        """Return the sum of squares at two parameter values; infinite if the simulation is not finite."""
         values = self.centre.copy()
         values[self.at] = x, y
         try:
@@ -150,6 +149,6 @@ class Around:
 
 
 def _moved(grid: Grid, values: Floats, evaluations: int) -> Attempt:
-    """Descend from given values of everything free."""
+    """Minimize the cost from given parameters."""
     orders, coefficients, inputs = grid.problem.split(values.tolist())
     return grid.descend(Attempt(orders, coefficients, "landscape", {}, inputs), evaluations, plain=True)

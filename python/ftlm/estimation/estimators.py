@@ -1,4 +1,4 @@
-"""A joint fit whose residuals are orthogonal to instruments, not to sensitivities: what a closed loop needs."""
+"""Joint output-error fit with external instruments, for data from a closed loop."""
 
 from __future__ import annotations
 
@@ -36,24 +36,24 @@ from ftlm.utils.linalg import length, orthonormal, projections
 from ftlm.utils.validation import Floats
 from ftlm.validation.comparison import compare_means
 
-#: Most steps, and how often one is halved.
+#: Maximum number of Gauss-Newton steps, and of halvings of one step.
 STEPS = 40
 HALVINGS = 6
-#: A step that moves no number by this share of its standard error ends them.
+#: Largest step of a converged fit, in standard errors of each parameter.
 STILL = 1e-3
-#: What is left of an instrument below this share is rounding.
+#: Relative size below which a singular direction of the instruments is rounding.
 ALIKE = 1e-12
-#: Least pulses a sample interval: the estimates are those of one grid.
+#: Fewest pulses a sample interval. The estimates are those of one grid.
 EVERY = 2
 
 
 def instrumented(joint: JointFit, problem: FreeProblem, runs: Sequence[Run], answers: Sequence[Run]) -> JointFit:
-    """Solve for zero correlation of the residuals with sensitivities simulated from clean inputs.
+    """Fit so that the residuals are uncorrelated with instruments simulated from noise-free inputs.
 
-    Residuals e are of the runs as they were measured, so nothing of the input is left out of the model; sensitivities
-    are of the answers of the inputs to a reference, which noise is no part of. Where they are orthogonal, feedback of
-    noise biases nothing, however well the answers are known (Young, Recursive Estimation and Time-Series Analysis,
-    2011, chapters 7 and 9). Gauss-Newton from the fit to the answers; the covariance is robust to coloured residuals.
+    The residuals e are those of the measured runs. The instruments are the sensitivities for `answers`, the parts of
+    the inputs explained by the reference, which contain no noise. Orthogonality removes the bias by noise feedback,
+    whatever the accuracy of `answers` (Young, Recursive Estimation and Time-Series Analysis, 2011, chapters 7 and 9).
+    Gauss-Newton starts from the fit to `answers`. The covariance is robust to colored residuals.
     """
     weights = [1.0 / max(joint.noise[o], 1e-300) for o in problem.structure.outputs]
     every = max(joint.refinement, EVERY)
@@ -101,7 +101,7 @@ def instrumented(joint: JointFit, problem: FreeProblem, runs: Sequence[Run], ans
 
 
 def _moment(measured: Grid, clean: Grid, values: Floats) -> tuple[Attempt, Floats, Floats]:
-    """Residuals and sensitivities on the measured inputs, and sensitivities on the clean ones."""
+    """Return residuals, sensitivities on measured inputs, and sensitivities on noise-free inputs."""
     orders, coefficients, inputs = measured.problem.split(values.tolist())
     start = Attempt(orders, coefficients, "instruments", {}, inputs)
     at = measured.descend(start, 1, plain=True)
@@ -110,46 +110,46 @@ def _moment(measured: Grid, clean: Grid, values: Floats) -> tuple[Attempt, Float
 
 
 def _size(moment: tuple[Attempt, Floats, Floats]) -> float:
-    """What of the residuals lies in the span of the instruments."""
+    """Return the norm of the residuals projected onto the span of the instruments."""
     attempt, _, instruments = moment
     basis = orthonormal(instruments.T, ALIKE)
     return length(projections(basis, np.asarray(attempt.outcome["residuals"])))
 
 
 def _covariance(grid: Grid, attempt: Attempt, influence: Floats) -> Floats:
-    """Covariance of the numbers from the influence of each residual on each."""
+    """Return the covariance of the parameters from the influence of each residual on each of them."""
     series = [residuals for part in grid.residuals(attempt) for residuals in part.values()]
     return long_run(influence, series)
 
 
-#: Most pulses a run on which instrumental variables end where m is not given.
+#: Largest number of block pulses a run for the final instrumental-variable fit if m is not given.
 MOST_PULSES = 1 << 14
-#: Seeds of the genetic algorithm whose errors differ by more than this factor have not all found the optimum.
+#: Largest ratio of the final errors of two seeds. Above it some seeds have missed the optimum.
 SCATTERED = 1.2
 Told = Callable[[int, int], None] | None
 
 
 @dataclass(frozen=True)
 class Fit:
-    """What an estimator came to, before anybody has judged it.
+    """Result of one estimator, before validation.
 
     Parameters
     ----------
     task
-        What was asked, as the estimator took it.
+        Task as the estimator used it.
     method
-        The estimator.
+        Name of the estimator.
     model
-        Its numbers.
+        Estimated model.
     parameters
-        How many of them were free.
+        Number of free parameters.
     settings
-        What they depend on besides the task.
+        Settings that the result depends on, besides the task.
     warnings
-        What the estimator itself knows against them.
+        Warnings of the estimator itself.
     searches, errors, joint, covariance
         Order searches, standard errors of coefficients at the orders found, the joint fit, and the covariance of the
-        model's numbers, where the estimator has them.
+        model parameters, if the estimator gives them.
     """
 
     task: Task
@@ -165,26 +165,26 @@ class Fit:
 
 
 def solved(task: Task, method: str, structure: Structure, orders: Mapping[str, float], m: int, **about: Any) -> Model:
-    """The task's structure as a model, once everything in it is a number."""
+    """Return the structure of the task as a model with all parameters fixed."""
     units = {n: u for n, u in task.runs[0].units.items() if n in structure.signals}
     told = {"method": method, "runs": ", ".join(r.name for r in task.runs), **about}
     return Model(structure, orders=orders, units=units, m=m, about=told)
 
 
 def in_words(initial: Initial) -> str:
-    """Decided initial terms as settings name them."""
+    """Return decided initial terms as text for the settings."""
     if isinstance(initial, History):
         return f"history, {len(initial)} powers of t up to {initial[-1]:g}"
     return initial if isinstance(initial, str) else f"t^{list(initial)}"
 
 
 def offset_setting(structure: Structure) -> dict[str, str]:
-    """The setting that an offset is, if there is one."""
+    """Return the offset as a setting; empty without an offset."""
     return {} if structure.offset == "none" else {"offset": structure.offset}
 
 
 def loss_setting(joint: JointFit) -> dict[str, Any]:
-    """The loss, where it is another one than squares, and what it did."""
+    """Return the loss and its summary as settings; empty for squares."""
     return {} if joint.robust is None else {"loss": "huber", **asdict(joint.robust)}
 
 
@@ -200,9 +200,10 @@ def by_output_error(
     more: Mapping[str, float] | None = None,
     alone: bool = False,
 ) -> Fit:
-    """Orders and coefficients together by joint output error; answers of the inputs to a reference are instruments.
+    """Estimate orders and coefficients together by joint output error.
 
-    Alone, what begins is the only start, which somebody knows to be near.
+    `answers` are the inputs explained by a reference and serve as instruments. With `alone`, `begin` is the only
+    initial guess.
     """
     # An order with one value is known.
     known = {n: v[0] for n, v in task.structure.order_values.items() if len(v) == 1}
@@ -280,7 +281,7 @@ def by_lattice(
     store: str | os.PathLike[str] | None,
     executor: Executor | None,
 ) -> Fit:
-    """Orders from the lattice, coefficients by the estimator that ranked them."""
+    """Search the orders on the order grid, then estimate the coefficients by the same linear method."""
     method, structure = settings.coefficients, task.structure
     searches = searched(task, settings, m, progress, store, executor) if structure.order_names else {}
     orders = {n: v for search in searches.values() for n, v in search.orders.items()}
@@ -324,7 +325,7 @@ def by_lattice(
 
 
 def settled(task: Task) -> set[str]:
-    """Orders of which the lattice has one value, so that they are no estimates."""
+    """Return the orders with one grid value, which are not estimated."""
     parts = task.structure.parts().values() if task.structure.order_names else []
     axes = [(task.lattice_of(part) or Lattice()).values(part) for part in parts]
     return {n for values in axes for n, v in values.items() if len(v) == 1}
@@ -338,7 +339,7 @@ def searched(
     store: str | os.PathLike[str] | None,
     executor: Executor | None,
 ) -> dict[str, SearchResult]:
-    """Order searches of all parts of a structure, by name, in one store."""
+    """Run the order searches of all independent groups of equations, with one checkpoint file."""
     jobs = {
         name: make_job(task.runs, part, task.lattice_of(part), m=m, progress=progress, **asdict(settings))
         for name, part in task.structure.parts().items()
@@ -354,10 +355,10 @@ def searched(
 
 
 def coupled_rank(task: Task, settings: Settings, m: int | None, search: SearchResult) -> int:
-    """Rank of the kept row whose coupled free run is the likeliest; the table ranks equations one by one.
+    """Return the rank of the kept row whose coupled simulation has the highest likelihood.
 
-    Among orders that the equations one by one hardly tell apart, the run of the whole from the inputs alone decides:
-    by the sum of ln NR over outputs, the likelihood of white noise of unknown size.
+    The table ranks equations separately, which hardly distinguishes neighboring orders. The criterion is the sum of ln
+    NR over outputs, the likelihood of white noise of unknown variance.
     """
     best, rank = math.inf, 1
     for row in search.table:
@@ -375,7 +376,7 @@ def coupled_rank(task: Task, settings: Settings, m: int | None, search: SearchRe
 
 
 def by_genetic_algorithm(task: Task, settings: Genetic, norm: str, m: int | None, threads: int, progress: Told) -> Fit:
-    """Orders and coefficients by a genetic algorithm: each equation alone, or all under their order law."""
+    """Estimate orders and coefficients by a genetic algorithm, one equation at a time or jointly."""
     structure = task.structure
     parts = {"stage": structure} if structure.has_order_law else {o: structure.equation(o) for o in structure.outputs}
     free = {name: (*part.order_names, *part.coefficient_names) for name, part in parts.items()}

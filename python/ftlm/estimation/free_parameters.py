@@ -1,4 +1,4 @@
-"""What is free in a joint fit, as the core takes it."""
+"""Free parameters of a structure: bounds, warm starts, time scaling and collinear inputs."""
 
 from __future__ import annotations
 
@@ -27,16 +27,16 @@ from ftlm.utils.validation import Floats, check_known, real_number
 
 @dataclass(frozen=True)
 class FreeProblem:
-    """A structure, its initial terms decided, as the core takes it.
+    """Structure with decided initial terms and its free parameters, as the core takes it.
 
-    Orders are affine in free ones, coefficients products of free ones.
+    Orders are affine functions of free orders. Coefficients are products of free coefficients.
     """
 
     structure: Structure
 
     @cached_property
     def core(self) -> _core.JointProblem:
-        """What the core makes of the structure."""
+        """Estimation problem of the core, built from the structure."""
         return _core.JointProblem(told(self.structure))
 
     @cached_property
@@ -46,12 +46,12 @@ class FreeProblem:
 
     @cached_property
     def coefficients(self) -> tuple[str, ...]:
-        """Free coefficients, those of a law among them."""
+        """Free coefficients, including those of a coefficient law."""
         return tuple(self.core.coefficients)
 
     @cached_property
     def products(self) -> Mapping[str, tuple[float, tuple[str, ...]]]:
-        """Coefficients that a law gives: sign and factors by name."""
+        """Coefficients that a coefficient law gives: sign and factors by name."""
         return {name: (sign, tuple(factors)) for name, sign, factors in self.core.products}
 
     @cached_property
@@ -61,38 +61,38 @@ class FreeProblem:
 
     @property
     def inputs(self) -> tuple[FreeInput, ...]:
-        """Free numbers of inputs."""
+        """Free delays, saturations and dead zones of inputs."""
         return self.structure.free_inputs
 
     @property
     def names(self) -> list[str]:
-        """Everything that is free: orders, coefficients, then numbers of inputs."""
+        """Names of all free parameters: orders, coefficients, then input parameters."""
         return [*self.orders, *self.coefficients, *(item.name for item in self.inputs)]
 
     def split(self, values: Sequence[float]) -> tuple[list[float], list[float], list[float]]:
-        """Values of orders, coefficients and numbers of inputs."""
+        """Split values into those of orders, coefficients and input parameters."""
         flat = list(map(float, values))
         first, second = len(self.orders), len(self.orders) + len(self.coefficients)
         return flat[:first], flat[first:second], flat[second:]
 
     @classmethod
     def of(cls, structure: Structure) -> FreeProblem:
-        """The same, refused at once where the core cannot take it."""
+        """Return the problem of a structure; raises at once if the core does not support it."""
         problem = cls(structure)
         _ = problem.core
         return problem
 
     @property
     def all_bounds(self) -> list[tuple[float, float]]:
-        """Bounds of everything that is free; those of coefficients are infinite, but friction takes energy."""
+        """Bounds of all free parameters. Coefficients are unbounded, except that friction must dissipate."""
         return self.core.bounds
 
     def feasible(self, at: Floats, towards: Floats) -> Floats:
-        """The last point on the way from a feasible one to another that keeps bounds and constraints of orders."""
+        """Return the last feasible point on the line from a feasible point to another one."""
         return self.core.feasible(at, towards)
 
     def named(self, values: Sequence[float]) -> dict[str, float]:
-        """Every coefficient of the structure by name from the free ones."""
+        """Return every coefficient of the structure by name, from the free ones."""
         free = dict(zip(self.coefficients, map(float, values), strict=True))
         out: dict[str, float] = {}
         for name in self.structure.coefficient_names:
@@ -101,10 +101,10 @@ class FreeProblem:
         return out
 
     def number_jacobian(self, orders: Sequence[float], coefficients: Sequence[float]) -> Floats:
-        """Derivatives of a model's numbers (rows) with respect to everything that is free (columns).
+        """Return derivatives of the model parameters (rows) by the free parameters (columns).
 
-        Rows are, equation by equation, alpha, then order and coefficient of each term, then the coefficient of friction
-        where there is some (of Stribeck's term after it fs and vs); numbers of inputs are none of them.
+        Rows are, for each equation, alpha, then order and coefficient of each term, then the friction coefficient if
+        present (followed by fs and vs of a Stribeck term). Input parameters have no rows.
         """
         free = dict(zip(self.coefficients, coefficients, strict=True))
         count, idle = len(self.orders), len(self.inputs)
@@ -133,12 +133,12 @@ class FreeProblem:
         return np.stack(rows)
 
     def free_from(self, estimated: Mapping[str, float]) -> list[float]:
-        """Free coefficients from freely estimated ones; ratios as the median of what the equations can say."""
+        """Return the free coefficients from separately estimated ones; ratios are medians over equations."""
         return self.core.free_from(dict(estimated))
 
 
 def told(structure: Structure) -> Any:
-    """A structure, its initial terms decided, as the core takes it."""
+    """Return a structure with decided initial terms as keyword data of the core."""
     signals, hints = structure.signals, structure.hints or Hints()
     states = structure.filter_states(structure.initial)
     # What is free does not hang on an offset that is still to be decided.
@@ -182,15 +182,16 @@ def told(structure: Structure) -> Any:
     }
 
 
-#: Whole orders at which a term starts that what is known does not have, and how many starts that may make.
+#: Integer orders at which a term starts that the known values lack, and the largest number of warm starts.
 WHOLE = (0.0, 1.0, 2.0)
 MOST = 9
 
 
 def known_starts(problem: FreeProblem, known: Mapping[str, float]) -> list[dict[str, float]]:
-    """Starts from values by name; what they lack has the coefficient 0, so that it does nothing at first.
+    """Return warm starts from values by name.
 
-    An order that they lack starts at each whole value within its bounds.
+    A coefficient without a value starts at 0, so its term has no effect at first. An order without a value starts at
+    each integer within its bounds.
 
     Raises
     ------
@@ -218,14 +219,15 @@ def known_starts(problem: FreeProblem, known: Mapping[str, float]) -> list[dict[
 
 
 def values_of_model(problem: FreeProblem, model: Solved, more: Mapping[str, float]) -> dict[str, float]:
-    """What a model of the same outputs knows of a problem's numbers; ``more`` are those that it holds under a law.
+    """Return the values that a model of the same outputs gives to the free parameters of a problem.
 
-    Orders that are free here and were numbers there are those of the same coefficient's term.
+    `more` are values that the model has under a coefficient law. A fixed order of the model is used for the free order
+    of the term with the same coefficient.
 
     Raises
     ------
     ModelError
-        A model of other outputs.
+        The model has other outputs.
     """
     check_known("output of start", model.outputs, problem.structure.outputs)
     found = {**model.orders, **model.coefficients, **more}
@@ -248,24 +250,25 @@ def values_of_model(problem: FreeProblem, model: Solved, more: Mapping[str, floa
 
 
 def spans(runs: Sequence[Run]) -> list[tuple[float, float]]:
-    """Sample interval and duration of each run [s]."""
+    """Return sample interval and duration of each run [s]."""
     return [(run.step, run.length * run.step) for run in runs]
 
 
 def clock(problem: FreeProblem, runs: Sequence[Run]) -> _core.JointClock:
-    """The unit of a frequency half way, in logarithms, between that of the runs and Nyquist's.
+    """Return the time scaling: the geometric mean of the frequencies of the run length and of Nyquist.
 
-    A coefficient before D^nu y beside D^alpha y is a time to the power of -(alpha - nu), which free orders change.
+    A coefficient of D^nu y beside D^alpha y has the unit of time to the power -(alpha - nu), which changes with free
+    orders.
     """
     return problem.core.clock(spans(runs))
 
 
-#: Share of a signal's size that it may differ from a multiple of another one and still be one: rounding of files.
+#: Relative difference up to which two signals are multiples of each other: rounding of files.
 ROUNDED = 1e-9
 
 
 def twin_words(runs: Sequence[Run], structure: Structure) -> str | None:
-    """Which two signals with free coefficients drive an equation at the same order, one a multiple of the other."""
+    """Return a message that names two proportional inputs of one equation and order, or None."""
     for item in structure.equations:
         driving = [t for t in item.terms if t.signal != item.output and isinstance(t.coefficient, str)]
         for one, other in itertools.combinations(driving, 2):

@@ -1,4 +1,4 @@
-"""Equations as frequency responses of free orders, coefficients and delays, with exact derivatives."""
+"""Frequency responses of equations with free orders, coefficients and delays, with exact derivatives."""
 
 from __future__ import annotations
 
@@ -28,13 +28,13 @@ from ftlm.utils.resources import between, expected
 from ftlm.utils.statistics import ROUNDING, chi_squared_99, is_white
 from ftlm.utils.validation import Complex, Floats, as_floats, check_known
 
-#: Least of a highest order, and what an own order stays below it: closer, a term says what the left side says.
+#: Smallest highest order of an equation, and smallest gap between it and the order of an own term.
 LEAST_ORDER, GAP = 0.01, 0.005
 
 
 @dataclass(frozen=True)
 class Measured:
-    """One record in a unit of time of its own, its weights beside it."""
+    """One measured frequency response in scaled time, with its weights."""
 
     output: int
     input: str
@@ -44,9 +44,10 @@ class Measured:
 
 
 class ResponseProblem:
-    """A structure and records, in numbers that are near 1: time is counted in 1/`unit` of a second.
+    """Structure and measured responses in scaled time, so that the parameters are near 1.
 
-    Numbers stand in the order of `names`: free orders, free coefficients, free delays.
+    Time is counted in 1/`unit` of a second. Parameters have the order of `names`: free orders, free coefficients, free
+    delays.
     """
 
     def __init__(self, structure: Structure, records: Sequence[FrequencyData], weights: Sequence[Floats]) -> None:
@@ -70,15 +71,15 @@ class ResponseProblem:
         self.term_of = {t.coefficient: (e, t) for e in structure.equations for t in e.terms}
 
     def order_at(self, order: Order, values: Floats) -> float:
-        """Value of an order."""
+        """Return the value of an order."""
         return order.constant + math.fsum(w * float(values[self._place[n]]) for n, w in order.weights)
 
     def scaled(self, values: Floats) -> Floats:
-        """Numbers in seconds as numbers of this problem's unit of time."""
+        """Convert parameters from seconds to the time unit of this problem."""
         return self._turned(values, -1.0)
 
     def in_seconds(self, values: Floats) -> Floats:
-        """Numbers of this problem as numbers in seconds."""
+        """Convert parameters from the time unit of this problem to seconds."""
         return self._turned(values, 1.0)
 
     def _turned(self, values: Floats, way: float) -> Floats:
@@ -92,7 +93,7 @@ class ResponseProblem:
         return out
 
     def slopes_in_seconds(self, values: Floats, slopes: Floats) -> Floats:
-        """Columns of slopes by this problem's numbers as slopes by numbers in seconds."""
+        """Convert a Jacobian by scaled parameters to one by parameters in seconds."""
         out = slopes.copy()
         log = np.log(self.unit)
         for name, at in self._coefficient.items():
@@ -108,19 +109,19 @@ class ResponseProblem:
         return out
 
     def coefficient(self, term: Term, item: Equation, values: Floats) -> float:
-        """Value of a term's coefficient in this unit of time."""
+        """Return the coefficient of a term in scaled time."""
         if isinstance(term.coefficient, str):
             return term.factor * float(values[self._coefficient[term.coefficient]])
         power = self.order_at(item.order, values) - self.order_at(term.order, values)
         return float(term.fixed or 0.0) * math.pow(self.unit, -power)
 
     def shift(self, signal: str, values: Floats) -> float:
-        """Delay of an input in this unit of time."""
+        """Return the delay of an input in scaled time."""
         at = self._delay.get(signal)
         return self.known_delays.get(signal, 0.0) if at is None else float(values[at])
 
     def responses(self, values: Floats, *, slopes: bool = True) -> list[tuple[Complex, Complex | None]]:
-        """Response of the model at every record, and its slopes by all numbers (a column each)."""
+        """Return the model response at every record, and its derivatives by all parameters (one column each)."""
         return [self._response(record, values, slopes) for record in self.records]
 
     def _response(self, record: Measured, values: Floats, slopes: bool) -> tuple[Complex, Complex | None]:
@@ -178,7 +179,7 @@ class ResponseProblem:
         return response, out
 
     def residuals(self, values: Floats, *, slopes: bool = True) -> tuple[Floats, Floats]:
-        """Weighted residuals, real parts of all records and then imaginary parts, and their slopes."""
+        """Return the residuals times weights, real parts before imaginary parts, and their Jacobian."""
         left, steep = [], []
         with np.errstate(all="ignore"):
             for record, (response, moved) in zip(self.records, self.responses(values, slopes=slopes), strict=True):
@@ -190,7 +191,7 @@ class ResponseProblem:
         return np.concatenate([flat.real, flat.imag]), np.concatenate([jacobian.real, jacobian.imag])
 
     def constraints(self) -> tuple[Floats, Floats, list[str]]:
-        """Rows and limits of what orders and delays keep to, rows @ values <= limits, and what each says."""
+        """Return the constraints ``rows @ values <= limits`` of orders and delays, with descriptions."""
         rows: list[Floats] = []
         limits: list[float] = []
         words: list[str] = []
@@ -233,7 +234,7 @@ class ResponseProblem:
         return table, np.array(limits), words
 
     def searched(self) -> dict[str, tuple[float, ...] | tuple[float, float]]:
-        """Values of each free order on its lattice, or the interval in which a search looks of itself."""
+        """Return the grid values of each free order, or the interval of its default search."""
         out: dict[str, tuple[float, ...] | tuple[float, float]] = {}
         for name in self.orders:
             if name in self.structure.order_values:
@@ -244,19 +245,19 @@ class ResponseProblem:
         return out
 
     def _highest(self) -> float:
-        """Highest order that a search tries of itself."""
+        """Return the highest order of the default search."""
         orders = [o for e in self.structure.equations for o in (e.order, *(t.order for t in e.terms))]
         return max([SEARCHED_ORDER, *(o.constant for o in orders if not o.names)])
 
 
-#: Points of orders and delays that are tried, frequencies that are looked at, reweightings, and starts that are kept.
+#: Largest number of grid points, of frequencies, of reweighting iterations, and of initial guesses returned.
 MOST_POINTS, MOST_FREQUENCIES, REWEIGHTED, KEPT = 3000, 160, 4, 8
-#: Points whose true cost is computed, corners of one own term that are tried besides, and at how many points.
+#: Points whose exact cost is computed, corner frequencies tried for one own term, and points at which they are tried.
 JUDGED, CORNERS, CORNERED = 60, 14, 120
 
 
 def starts(problem: ResponseProblem) -> list[Floats]:
-    """Numbers to start from, the most promising first; all within the inequalities."""
+    """Return feasible initial guesses, most promising first."""
     points = _points(problem)
     found = _solved(problem, points) if problem.coefficients else list(points)
     judged = []
@@ -278,7 +279,7 @@ def starts(problem: ResponseProblem) -> list[Floats]:
 
 
 def _points(problem: ResponseProblem) -> Floats:
-    """Orders and delays that are tried, a row each, coefficients 0."""
+    """Return the grid points of orders and delays, one row each, with coefficients 0."""
     axes = list(problem.searched().values())
     given = [n in problem.structure.order_values for n in problem.orders]
     delays = [(item.bounds[0] * problem.unit, item.bounds[1] * problem.unit) for item in problem.structure.free_inputs]
@@ -312,13 +313,13 @@ def _points(problem: ResponseProblem) -> Floats:
 
 
 def _product(sides: Sequence[Sequence[float] | Floats]) -> Floats:
-    """Every point of a lattice, a row each; a lattice without axes has one."""
+    """Return every point of a grid, one row each; a grid without axes has one point."""
     rows = list(itertools.product(*sides))
     return np.array(rows, dtype=np.float64).reshape(len(rows), len(sides))
 
 
 def _halton(count: int, width: int) -> Floats:
-    """Points that fill a unit box evenly, by radical inverses in the first primes."""
+    """Return a Halton sequence in the unit box: radical inverses in the first primes."""
     primes = [p for p in range(2, 300) if all(p % q for q in range(2, int(p**0.5) + 1))][:width]
     out = np.zeros((count, width))
     for k, base in enumerate(primes):
@@ -331,7 +332,7 @@ def _halton(count: int, width: int) -> Floats:
 
 
 def _solved(problem: ResponseProblem, points: Floats) -> list[Floats]:
-    """Coefficients at every point, one equation after the other; the most promising points only."""
+    """Return the coefficients at the most promising points, one equation after the other."""
     slow = points[np.unique(np.linspace(0, len(points) - 1, min(CORNERED, len(points))).astype(int))]
     points, corners = np.concatenate([points, np.repeat(slow, CORNERS, axis=0)]), _corners(problem, len(points), slow)
     table = points.copy()
@@ -350,10 +351,10 @@ def _solved(problem: ResponseProblem, points: Floats) -> list[Floats]:
 
 
 def _corners(problem: ResponseProblem, first: int, slow: Floats) -> Floats:
-    """Where an own term turns the response over, for points after the first; NaN where nothing is said.
+    """Return corner frequencies imposed on the slowest own term, for points after the first; else NaN.
 
-    Where noise hides a small arc, reweighted least squares are biased and their own terms far too small or too large.
-    Given the slowest of them, what is left is hardly so.
+    If noise hides a small arc, reweighted least squares are biased and own terms are far too small or too large. With
+    the slowest own term fixed, the remaining bias is small.
     """
     every = np.concatenate([r.frequency for r in problem.records])
     tried = np.geomspace(every.min(), every.max(), CORNERS)
@@ -361,7 +362,7 @@ def _corners(problem: ResponseProblem, first: int, slow: Floats) -> Floats:
 
 
 def _thinned_levy(record: Measured) -> Measured:
-    """A record of no more frequencies than a start needs, spread over its order."""
+    """Return a record subsampled to the number of frequencies that an initial guess needs."""
     order = np.argsort(record.frequency, kind="stable")
     if order.size > MOST_FREQUENCIES:
         order = order[np.linspace(0, order.size - 1, MOST_FREQUENCIES).astype(int)]
@@ -376,7 +377,7 @@ def _equation(
     points: Floats,
     corners: Floats,
 ) -> tuple[Floats, Floats]:
-    """Coefficients of one equation at every point, and the cost that they leave."""
+    """Return the coefficients of one equation at every point, and their cost."""
     item = problem.structure.equations[place]
     alpha = _orders(problem, item.order.constant, item.order.weights, points)
     columns: dict[str, list[Complex]] = {n: [] for n in names}
@@ -430,7 +431,7 @@ def _equation(
 
 
 def _slowest(problem: ResponseProblem, item: Equation, points: Floats) -> tuple[str, Floats] | None:
-    """The free own term of an equation that acts at the lowest frequencies, and by how much its order is lower."""
+    """Return the free own term that acts at the lowest frequencies, and its order gap."""
     own = [t for t in item.terms if t.signal == item.output and isinstance(t.coefficient, str) and t.factor == 1]
     if not own:
         return None
@@ -441,7 +442,7 @@ def _slowest(problem: ResponseProblem, item: Equation, points: Floats) -> tuple[
 
 
 def _least_squares(left: Complex, right: Complex) -> Floats:
-    """Real answers to complex equations, for every point; directions that nothing tells are left at 0."""
+    """Return real least-squares solutions of complex equations; undetermined directions are 0."""
     lengths = np.sqrt(np.sum(np.abs(left) ** 2, axis=1))
     unit = np.where((lengths > 0) & np.isfinite(lengths), lengths, 1.0)
     scaled = np.nan_to_num(left / unit[:, None, :])
@@ -466,7 +467,7 @@ def _shifts(problem: ResponseProblem, signal: str, points: Floats) -> Floats:
 
 
 def _signal(problem: ResponseProblem, record: Measured, name: str, late: Complex) -> Complex | float:
-    """What a term reads: a measured response, the input itself, or nothing."""
+    """Return the factor of a term: a measured response, the delayed input, or 0."""
     outputs = problem.structure.outputs
     if name not in outputs:
         return late if name == record.input else 0.0
@@ -483,17 +484,17 @@ def _signal(problem: ResponseProblem, record: Measured, name: str, late: Complex
 
 
 Weights = Literal["auto", "relative", "uniform", "deviation"]
-#: Two fits whose sums of squares differ by no more than this share ended at one optimum.
+#: Largest relative difference of the sums of squares of one and the same optimum.
 SAME = 1e-6
-#: Residuals below this share of the response leave nothing to gain.
+#: Relative size of the residuals below which they are rounding.
 FLOOR = 1e-13
-#: Frequencies of a record on which starts race.
+#: Largest number of frequencies of a record in the multistart.
 RACING = 800
-#: Shares of the whole that are done once starts are found, and once they have raced.
+#: Fractions of the progress at which the initial guesses are found, and at which the multistart ends.
 STARTED, RACED = 0.25, 0.85
-#: Fits took between these multiples of what their numbers and frequencies let expect.
+#: Range of the measured durations, relative to the time estimate.
 CAME_TO = (0.4, 4.0)
-#: Lags at which residuals are looked at, from one frequency to the next.
+#: Number of lags of the whiteness test, from one frequency to the next.
 LAGS = 8
 
 
@@ -508,46 +509,46 @@ def identify_frequency(
     start: Mapping[str, float] | None = None,
     progress: Callable[[int, int], None] | None = None,
 ) -> FrequencyIdentification:
-    """Identify orders, coefficients and delays of equations from a measured frequency response or impedance.
+    """Identify orders, coefficients and delays from a measured frequency response or impedance.
 
-    The same equations as of runs over time: ``"D^alpha y = a0 y + b0 u"`` has the response
-    b0 / ((jω)^α - a0), and ``"D^alpha U = a U + r D^alpha I + b I"`` is a resistor before a depressed arc. Starts come
-    by themselves, from linear least squares over the lattice of orders; then all numbers move together, by damped least
-    squares of the complex residuals with exact derivatives.
+    The equations are written as for runs over time: ``"D^alpha y = a0 y + b0 u"`` has the response b0 / ((jω)^α - a0),
+    and ``"D^alpha U = a U + r D^alpha I + b I"`` is a resistor in series with a depressed arc. Linear least squares on
+    a grid of orders gives the initial guesses. Levenberg-Marquardt with exact derivatives then fits all parameters to
+    the complex response.
 
     Parameters
     ----------
     data
-        One record, or several: of other outputs and inputs, or of other bands.
+        One record or several: other outputs and inputs, or other frequency bands.
     structure
-        What to identify; see :func:`ftlm.equation`. Several outputs follow together from the inputs.
+        Structure to identify; see :func:`ftlm.equation`. Several outputs are simulated together from the inputs.
     weights
-        ``"deviation"``: residuals over the records' standard deviations. ``"relative"``: over the size of the response
-        at each frequency, as noise in proportion to the size asks for. ``"uniform"``: as they are. ``"auto"``
-        (default): deviation where all records have one, else relative. An array, of one record: a standard deviation
-        of real and imaginary part for each frequency.
+        ``"deviation"``: residuals divided by the standard deviations of the records. ``"relative"``: divided by the
+        magnitude of the response at each frequency, for noise proportional to it. ``"uniform"``: unweighted. ``"auto"``
+        (default): deviation if all records state one, otherwise relative. An array, for one record: a standard
+        deviation of real and imaginary part for each frequency.
     orders, fixed, delay
-        See :func:`ftlm.equation`: lattices of orders bound them, too; a delay (least, largest) is estimated.
+        See :func:`ftlm.equation`: grids of orders bound them, too; a delay (low, high) is estimated.
     start
-        Values of free numbers by name to start from besides; what it leaves out is 1, 0 of a delay.
+        Additional initial guess by name; missing values are 1, and 0 for a delay.
     progress
-        Called with parts done and parts in all.
+        Callback with (parts done, total parts).
 
     Returns
     -------
     FrequencyIdentification
-        Prints well; ``.model`` simulates over time, draws and saves.
+        Printable result; ``.model`` simulates over time, plots and saves.
 
     Raises
     ------
     DataError
-        Data that are none, of signals that the equations do not have, too few for the free numbers, or of size 0 under
-        relative weights.
+        Invalid data, signals that the equations do not have, too few frequencies for the free parameters, or a response
+        of 0 under relative weights.
     ModelError
-        A structure with nothing free, friction, limits of inputs, an offset, a sensor filter or a law of coefficients;
-        weights or names that are not known.
+        Nothing is free; friction, saturation or dead zone, offset, sensor filter or coefficient law; unknown weights or
+        names.
     ConvergenceError
-        No start with a finite response.
+        No initial guess has a finite response.
     """
     wanted = _structure(structure, orders, fixed, delay)
     records = _fitting(as_frequency_data(data), wanted)
@@ -600,7 +601,7 @@ def _structure(
     fixed: Mapping[str, float] | None,
     delay: Mapping[str, float | tuple[float, float]] | None,
 ) -> Structure:
-    """What is to be identified, all of its outputs together; refuses what a frequency response does not know."""
+    """Return the structure to identify; raise for what a frequency response cannot represent."""
     wanted = equation(structure) if isinstance(structure, str) else structure
     if not isinstance(wanted, Structure):
         raise ModelError(f"structure is {type(structure).__name__}; give an equation: 'D^alpha y = a0 y + b0 u'")
@@ -624,7 +625,7 @@ def _structure(
 
 
 def _fitting(records: Sequence[FrequencyData], structure: Structure) -> list[FrequencyData]:
-    """The records with the names of what they are of; refuses those of other signals, and equations without any."""
+    """Return the records with their signal names; raise if signals or equations have no counterpart."""
     outputs = structure.outputs
     inputs = tuple(s for s in structure.signals if s not in outputs)
     if not inputs:
@@ -656,7 +657,7 @@ def _fitting(records: Sequence[FrequencyData], structure: Structure) -> list[Fre
 
 
 def _weights(records: Sequence[FrequencyData], weights: object) -> tuple[str, list[Floats]]:
-    """What residuals are multiplied by."""
+    """Return the kind of weights and the factor of each residual."""
     if not isinstance(weights, str):
         if len(records) > 1:
             raise ModelError("weights= as an array are of one record; give each record its deviation instead")
@@ -686,7 +687,7 @@ def _weights(records: Sequence[FrequencyData], weights: object) -> tuple[str, li
 
 
 def _stated(record: FrequencyData, weights: object) -> Floats:
-    """Standard deviations that stand in the place of a record's own."""
+    """Return standard deviations given by the user in place of those of a record."""
     given = as_floats("weights", weights)
     if given.shape != record.frequency.shape:
         raise DataError(f"weights has shape {given.shape}, the data {record.frequency.shape}; give one deviation each")
@@ -694,7 +695,7 @@ def _stated(record: FrequencyData, weights: object) -> Floats:
 
 
 def _thinned(record: FrequencyData, weight: Floats) -> tuple[FrequencyData, Floats]:
-    """A record of no more frequencies than a race needs, spread evenly over its own, with their weights."""
+    """Return a record and its weights, subsampled evenly to the number of frequencies of the multistart."""
     if record.frequency.size <= RACING:
         return record, weight
     order = np.argsort(record.frequency, kind="stable")
@@ -705,7 +706,7 @@ def _thinned(record: FrequencyData, weight: Floats) -> tuple[FrequencyData, Floa
 
 
 def _begun(problem: ResponseProblem, start: Mapping[str, float] | None, rows: Floats, limits: Floats) -> list[Floats]:
-    """The start that a person gives."""
+    """Return the initial guess of the user, if any."""
     if start is None:
         return []
     if not isinstance(start, Mapping):
@@ -793,7 +794,7 @@ def _result(
 
 
 def _rising(records: Sequence[FrequencyData]) -> NDArray[np.intp]:
-    """Places of residuals with the frequencies of each record in their order."""
+    """Return indices that sort the residuals of each record by frequency."""
     places, at = [], 0
     for record in records:
         places.append(at + np.argsort(record.frequency, kind="stable"))
@@ -803,14 +804,14 @@ def _rising(records: Sequence[FrequencyData]) -> NDArray[np.intp]:
 
 
 def _series(records: Sequence[FrequencyData], left: Floats) -> list[Floats]:
-    """Real and imaginary parts of every record's residuals, one after the other as they stand in `left`."""
+    """Return real and imaginary parts of the residuals of every record, in the order of `left`."""
     ends = np.cumsum([r.frequency.size for r in records])
     half = left.size // 2
     return [*np.split(left[:half], ends[:-1]), *np.split(left[half:], ends[:-1])]
 
 
 def _untold(problem: ResponseProblem, values: Floats, standard: Mapping[str, float]) -> list[str]:
-    """Numbers that the data do not tell, or hardly."""
+    """Return warnings about parameters that the data determine poorly or not at all."""
     unseen = [n for n, e in standard.items() if not math.isfinite(e)]
     out = []
     if unseen:
@@ -832,7 +833,7 @@ def _model(
     standard: Mapping[str, float],
     warnings: Sequence[str],
 ) -> Model:
-    """The model with what its file keeps of the identification."""
+    """Return the model with its estimate, as stored in its file."""
     orders = {n: round(named[n], 9) for n in problem.orders}
     late = {free.signal: named[free.name] for free in problem.structure.free_inputs}
     found = problem.structure.with_delays(late).with_orders(orders)
@@ -868,7 +869,7 @@ def _model(
 
 
 def _student(degrees: int) -> float:
-    """97.5 % quantile of Student's distribution, by its series about the normal one; good to 1 % from 4 degrees."""
+    """Return the 97.5 % quantile of Student's t by a series, accurate to 1 % from 4 degrees of freedom."""
     z, n = NormalDist().inv_cdf(0.975), float(degrees)
     terms = [(z**3 + z) / 4, (5 * z**5 + 16 * z**3 + 3 * z) / 96, (3 * z**7 + 19 * z**5 + 17 * z**3 - 15 * z) / 384]
     return z + sum(t / n ** (k + 1) for k, t in enumerate(terms))

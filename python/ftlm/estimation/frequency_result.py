@@ -1,4 +1,4 @@
-"""Measured and modelled frequency responses as charts: gain and phase, the locus in the plane, what is left over."""
+"""Charts of measured and modeled frequency responses: Bode, Nyquist and relative residuals."""
 
 from __future__ import annotations
 
@@ -31,14 +31,14 @@ if TYPE_CHECKING:
     pass
 
 DECIBEL = 20.0 / np.log(10.0)
-#: Points of a smooth curve between the ends of what was measured.
+#: Points of a smooth curve over the measured band.
 CURVE = 160
 
 
 def grid_of(record: FrequencyData) -> tuple[Floats, Floats]:
-    """Frequencies of a smooth curve with those of a record among them, and where the record's are (else NaN).
+    """Return the frequencies of a smooth curve, and those of a record among them.
 
-    Between two that were measured lies one that was not, so that each measured point stands alone, as a dot.
+    One frequency lies between each two measured ones, so that every measured point is drawn as a separate dot.
     """
     measured = np.unique(record.frequency)
     between = np.sqrt(measured[1:] * measured[:-1])
@@ -47,7 +47,7 @@ def grid_of(record: FrequencyData) -> tuple[Floats, Floats]:
 
 
 def curve_of(model: Model, record: FrequencyData, omega: Floats) -> tuple[Complex, Floats | None, Floats | None]:
-    """Response of the model, and half-widths of the 95 % bands of its gain [dB] and phase [degrees]."""
+    """Return the model response, and half-widths of the 95 % bands of its gain [dB] and phase [degrees]."""
     at = model.outputs.index(record.output), response_inputs(model, coupled=True).index(record.input)
     response = frequency_response(model, omega)[at]
     if model.estimate is None or model.estimate.covariance is None:
@@ -57,7 +57,7 @@ def curve_of(model: Model, record: FrequencyData, omega: Floats) -> tuple[Comple
 
 
 def bode_of(model: Model, record: FrequencyData) -> list[Figure]:
-    """Gain and phase of a record with the model's and its 95 % band."""
+    """Return gain and phase charts of a record and the model with its 95 % band."""
     omega, _ = grid_of(record)
     response, wide, turned = curve_of(model, record, omega)
     phase = np.degrees(np.unwrap(np.angle(response)))
@@ -96,7 +96,7 @@ def bode_of(model: Model, record: FrequencyData) -> list[Figure]:
 
 
 def locus_of(model: Model, record: FrequencyData) -> Figure:
-    """The response in the complex plane; of impedances with -Im upwards, as chemists draw it."""
+    """Return the Nyquist chart of a record and the model; impedances with -Im upwards."""
     omega, _ = grid_of(record)
     response, _, _ = curve_of(model, record, omega)
     impedance = record.unit.endswith("Ω")
@@ -114,7 +114,7 @@ def locus_of(model: Model, record: FrequencyData) -> Figure:
 
 
 def misses_of(model: Model, record: FrequencyData) -> Figure:
-    """What is left over at each frequency, over the size of the measured response."""
+    """Return the chart of the residuals relative to the measured response, by frequency."""
     order = np.argsort(record.frequency, kind="stable")
     omega = record.frequency[order]
     response, _, _ = curve_of(model, record, omega)
@@ -132,27 +132,27 @@ def misses_of(model: Model, record: FrequencyData) -> Figure:
     )
 
 
-#: A model that misses more than this share of a response describes little of it.
+#: Largest relative error of a usable model.
 USELESS = 0.5
-#: A validation misses far more than the data of the fit did where it is this many times as much, and above this share.
+#: A validation is worse if its error exceeds this multiple of the estimation error and this relative error.
 MORE, LITTLE = 3.0, 0.02
 NOT_TRIED = "no response that it was not fitted to has been tried"
 
 
 @dataclass(frozen=True)
 class ResponseError:
-    """How far a model is from one measured response.
+    """Error of a model on one measured response.
 
     Parameters
     ----------
     name
-        Of the record.
+        Name of the record.
     output, input
-        What the response is of and from.
+        Output and input of the response.
     rms, largest
-        Of the complex error over the size of the measured response, [%].
+        Root mean square and maximum of the complex error, relative to the measured response [%].
     at
-        Where it is largest [rad/s].
+        Frequency of the largest error [rad/s].
     """
 
     name: str
@@ -165,16 +165,16 @@ class ResponseError:
 
 @dataclass(frozen=True)
 class FrequencyValidation:
-    """A model on responses that it was not fitted to.
+    """Validation of a model on responses that it was not fitted to.
 
     Parameters
     ----------
     data
-        The responses.
+        Validation responses.
     errors
-        How far the model is from each.
+        Error on each response.
     verdict
-        Whether to trust it after this.
+        Verdict that includes this validation.
     """
 
     data: tuple[FrequencyData, ...]
@@ -182,7 +182,7 @@ class FrequencyValidation:
     verdict: Verdict
 
     def to_dict(self) -> dict[str, Any]:
-        """For JSON."""
+        """Return the result as a dictionary for JSON."""
         return {"errors": [vars(e) for e in self.errors], "verdict": self.verdict.to_dict()}
 
     def __str__(self) -> str:
@@ -191,31 +191,30 @@ class FrequencyValidation:
 
 @dataclass(frozen=True, eq=False)
 class FrequencyIdentification:
-    """What :func:`ftlm.identify_frequency` found.
+    """Result of :func:`ftlm.identify_frequency`.
 
     Parameters
     ----------
     model
-        The model: it simulates over time, draws and saves as any other.
+        Identified model.
     data
-        The records that it was fitted to.
+        Records that it was fitted to.
     weights
         ``"deviation"``, ``"relative"`` or ``"uniform"``.
     values, standard_errors, intervals
-        Orders, coefficients and delays by name, their standard errors, their 95 % intervals; infinite where the data do
-        not tell them.
+        Orders, coefficients and delays by name, their standard errors and 95 % intervals; infinite if not identifiable.
     names, covariance
-        What the rows of the covariance are of.
+        Covariance matrix and the names of its rows.
     chi_squared
-        Mean square of the residuals in stated standard deviations, 1 where the model is right; None without any.
+        Mean square of the residuals in stated standard deviations, 1 for a correct model; None if none are stated.
     converged
-        Whether the fit stood still.
-    reached
-        How many starts ended at this optimum, and how many there were.
+        Whether the fit converged.
+    start_counts
+        Number of initial guesses that reached this optimum, and total number.
     white
-        Whether residuals are noise from one frequency to the next (99 %).
+        Whether the residuals are white over frequency (99 %).
     warnings
-        What makes the model doubtful, in words.
+        Warnings about the model.
     """
 
     model: Model
@@ -234,17 +233,17 @@ class FrequencyIdentification:
 
     @property
     def orders(self) -> dict[str, float]:
-        """Free orders as they were found."""
+        """Free orders with their estimates."""
         return {n: v for n, v in self.values.items() if n in self.model.orders}
 
     @property
     def coefficients(self) -> dict[str, float]:
-        """Free coefficients as they were found."""
+        """Free coefficients with their estimates."""
         return {n: v for n, v in self.values.items() if n in self.model.coefficients}
 
     @property
     def errors(self) -> tuple[ResponseError, ...]:
-        """How far the model is from each record."""
+        """Error of the model on each record."""
         return tuple(error_of(self.model, record) for record in self.data)
 
     def validate(self, data: FrequencyData | Sequence[FrequencyData]) -> FrequencyValidation:
@@ -253,24 +252,24 @@ class FrequencyIdentification:
         Parameters
         ----------
         data
-            Records of the model's outputs and inputs.
+            Records of outputs and inputs of the model.
 
         Raises
         ------
         DataError
-            Records of other signals.
+            A record has other signals.
         """
         others = tuple(placed(self.model, record) for record in as_frequency_data(data))
         errors = tuple(error_of(self.model, record) for record in others)
         return FrequencyValidation(others, errors, self._judged(errors, others))
 
     def verdict(self, validation: FrequencyValidation | None = None) -> Verdict:
-        """Whether to trust the model.
+        """Return the verdict on the model.
 
-        "do not use": numbers that the data do not tell, a model that misses half of a response or more, or one that
-        grows without bound. "with care": residuals that follow the frequency or exceed stated deviations, numbers that
-        are hardly told, a fit that did not stand still or ended on a bound, a validation that misses three times as
-        much as its own data (and over 2 %), or no validation.
+        "do not use": parameters that are not identifiable, an error of half of a response or more, or an unstable
+        model. "with care": residuals that are not white or exceed the stated standard deviations, uncertain parameters,
+        a fit that did not converge or ended on a bound, a validation error above 2 % and three times the estimation
+        error, or no validation.
         """
         return self._judged(None) if validation is None else validation.verdict
 
@@ -304,7 +303,7 @@ class FrequencyIdentification:
         return Verdict(TRUST, f"it predicts what it was not fitted to (error {shown}), residuals are noise")
 
     def _grows(self) -> str:
-        """Words for poles with a positive real part; none where there are none."""
+        """Return a text about poles with a positive real part; empty if there are none."""
         with contextlib.suppress(FtlmError):
             stable = self.model.stability(coupling="simulated")
             if math.isnan(stable.unstable_poles):
@@ -315,7 +314,7 @@ class FrequencyIdentification:
         return ""
 
     def summary(self, validation: FrequencyValidation | None = None) -> str:
-        """The first screen: verdict, equations, numbers, what the model does, how well it fits, warnings."""
+        """Return the summary: verdict, equations, parameters, modes, errors and warnings."""
         from ftlm.report.text_summary import behaviour_in_words, concerns_in_words, equations_in_words
 
         lines = [*wrapped(str(self.verdict(validation))), "", *equations_in_words(self.model), ""]
@@ -356,21 +355,21 @@ class FrequencyIdentification:
         return [*lines, "  (± is one standard error, in brackets the 95 % interval)"]
 
     def figures(self) -> list[Figure]:
-        """Bode and Nyquist charts with the measured points, and what is left over."""
+        """Return Bode and Nyquist charts with the measured points, and residual charts."""
         model = self.model
         return [f for r in self.data for f in (*bode_of(model, r), locus_of(model, r), misses_of(model, r))]
 
     def report(
         self, path: str | os.PathLike[str], *, validation: FrequencyValidation | None = None, force: bool = False
     ) -> Path:
-        """Write a page that opens offline: verdict, equations, numbers, Bode and Nyquist with the measured points.
+        """Write an HTML page that opens offline: verdict, equations, parameters, Bode and Nyquist charts.
 
         Parameters
         ----------
         path
             File to write.
         validation
-            What :meth:`validate` returned.
+            Result of :meth:`validate`.
         force
             Overwrite an existing file.
 
@@ -416,7 +415,7 @@ class FrequencyIdentification:
         )
 
     def to_dict(self) -> dict[str, Any]:
-        """For JSON."""
+        """Return the result as a dictionary for JSON."""
 
         def ends(pair: tuple[float, float]) -> list[float | None]:
             return [v if math.isfinite(v) else None for v in pair]
@@ -449,7 +448,7 @@ class FrequencyIdentification:
 
 
 def placed(model: Model, record: FrequencyData) -> FrequencyData:
-    """A record with the names of the response of a model that it is compared with."""
+    """Return a record with the output and input names of the model it is compared with."""
     inputs = response_inputs(model, coupled=True)
     out = {"output": record.output, "input": record.input}
     for side, known in (("output", model.outputs), ("input", inputs)):
@@ -464,7 +463,7 @@ def placed(model: Model, record: FrequencyData) -> FrequencyData:
 
 
 def modelled(model: Model, record: FrequencyData, omega: Floats | None = None) -> Complex:
-    """Response of a model at the frequencies of a record, or at others."""
+    """Return the model response at the frequencies of a record, or at `omega`."""
     response = frequency_response(model, record.frequency if omega is None else omega)
     inputs = response_inputs(model, coupled=True)
     values: Complex = response[model.outputs.index(record.output), inputs.index(record.input)]
@@ -472,7 +471,7 @@ def modelled(model: Model, record: FrequencyData, omega: Floats | None = None) -
 
 
 def error_of(model: Model, record: FrequencyData) -> ResponseError:
-    """How far a model is from one record."""
+    """Return the error of a model on one record."""
     size = np.abs(record.response)
     missed = np.abs(modelled(model, record) - record.response) / np.where(size > 0, size, np.max(size) or 1.0)
     at = int(np.argmax(missed))

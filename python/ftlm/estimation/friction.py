@@ -1,4 +1,4 @@
-"""A body that slides and rests by itself, by least squares: what drives, brakes and rubs it, each with its own sign."""
+"""Linear least squares for one body with friction, under sign constraints on the coefficients."""
 
 from __future__ import annotations
 
@@ -24,23 +24,24 @@ from ftlm.utils.resources import memory_limit, stop
 from ftlm.utils.statistics import noise_of
 from ftlm.utils.validation import Floats
 
-#: Steps of a run over which its velocity is told, as a share of all, and the deviations of noise that it must exceed.
+#: Span over which the velocity is measured, as a fraction of the run, and its smallest size in noise standard
+#: deviations.
 PACE, SEEN = 0.01, 5.0
-#: Turns in which what friction holds at rest is taken from what drives.
+#: Iterations in which the friction force at rest is recomputed from the input forces.
 TURNS = 4
 
 
 def slid(runs: Sequence[Run], alone: Structure) -> dict[str, float]:
-    """Coefficients of one equation with friction, its orders numbers, that explain its integrals on all runs best.
+    """Fit the coefficients of one equation with friction, at fixed orders, to its integrals on all runs.
 
-    Own terms pull back and friction brakes; what drives has any sign. The sign of the velocity is that of the measured
-    one where it stands out of its noise, elsewhere the body rests, and friction is what drives it. Each run has a
-    level, a velocity and a constant of its own.
+    Own terms restore and friction dissipates; inputs may have any sign. The friction sign is that of the measured
+    velocity where it exceeds the noise. Elsewhere the body rests and friction balances the input forces. Each run has
+    its own level, velocity and constant.
 
     Returns
     -------
     dict
-        By name; empty where no such numbers are finite.
+        Coefficients by name; empty if no finite solution exists.
     """
     item = alone.equations[0]
     if item.friction is None or not isinstance(item.friction.coefficient, str):
@@ -66,7 +67,7 @@ _Part = tuple[list[Floats], Floats, Floats, dict[int, Floats], float]
 
 
 def _regressors(run: Run, alone: Structure) -> _Part:
-    """Integrals of every term, the output's means, the sign of its velocity, drives by term, and the step."""
+    """Return integrals of all terms, output means, velocity signs, input forces and the step."""
     item, m = alone.equations[0], run.length - 1
     rec = record(run, alone, m, filtered=False)
     alpha, means = item.order.constant, rec.of(item.output)
@@ -82,20 +83,20 @@ def _regressors(run: Run, alone: Structure) -> _Part:
 
 
 def _integral(means: Floats, step: float, order: float) -> Floats:
-    """Pulse means of the integral of this order, above 0."""
+    """Return block-pulse means of the fractional integral of positive order."""
     signals = np.stack([np.zeros_like(means), means])
     found: Floats = _core.respond((step, signals, None), [((0, order, [(1, 0.0)]), [1.0])], [False, True], [[]])[0]
     return found
 
 
 def _value(item: Equation, k: int, found: Mapping[str, float]) -> float:
-    """A term's coefficient with its factor."""
+    """Return the coefficient of a term, multiplied by its factor."""
     term = item.terms[k]
     return term.fixed if term.fixed is not None else term.factor * found[str(term.coefficient)]
 
 
 def _best(item: Equation, parts: Sequence[_Part], signs: Sequence[Floats]) -> dict[str, float]:
-    """The best numbers of which none has the wrong sign: least squares without each set of those that might have."""
+    """Return the least-squares solution with correct signs, trying each set of coefficients fixed at 0."""
     alpha, rubs = item.order.constant, item.friction
     assert rubs is not None
     target, rows = [], []
@@ -129,35 +130,35 @@ def _best(item: Equation, parts: Sequence[_Part], signs: Sequence[Floats]) -> di
     return best[1]
 
 
-#: Samples of the coarse fits that compare starts, evaluations of one, and fits that lead to others.
+#: Samples of the coarse fits, evaluations of one such fit, and number of survivors that seed further fits.
 COARSE_SAMPLES, FIRST_LAP, FINALISTS = 1200, 15, 3
 #: Highest order of a body with friction.
 HIGHEST = 2.0
-#: Friction at a start as shares of the force that drives the body, from next to none upwards.
+#: Initial Coulomb friction as fractions of the force that acts on the body.
 SHARES = (0.01, 0.05, 0.2, 0.5)
-#: The same as shares of what the measured sign of the velocity says.
+#: Initial Coulomb friction as multiples of the estimate with the measured sign of the velocity.
 MULTIPLES = (1.0, 0.3)
-#: Stribeck friction at a start as shares of Coulomb's, and its speed as shares of that of the body.
+#: Initial Stribeck friction as fractions of Coulomb friction, and its speed as fractions of the speed of the body.
 NEAR = (0.02, 0.2, 1.0)
 FALLS = (0.05, 0.2, 0.6)
-#: What hangs on a body at a start, as shares of the body's own inertia.
+#: Initial inertia of the attached bodies as fractions of the inertia of the body.
 CARRIED = (0.1, 0.3, 1.0, 3.0)
-#: Starts at most of several bodies each of which carries a share of its own.
+#: Largest number of initial guesses in which each body carries a load of its own.
 MOST_CARRIED = 64
-#: Orders of two terms of an equation and its counter-equation that lie nearer are action and reaction.
+#: Largest difference of two orders that are taken for action and reaction of two coupled equations.
 ALIKE = 0.5
-#: A body that moves by less than this many deviations of its noise, peak to peak, has not moved.
+#: Smallest peak-to-peak motion of a body, in standard deviations of its noise.
 STILL = 10.0
 
 
 def race_with_friction(
     alike: Grid, floor: float, threads: int, progress: Callable[[int, int], None] | None
 ) -> _core.JointRace:
-    """Coarse fits of bodies with friction, best first, every output weighing alike.
+    """Rank initial guesses of bodies with friction by coarse fits, with equal weight for every output.
 
-    The sign of the measured velocity makes the equation linear; where the body rests it is noise, and so are its
-    numbers, but they are near enough. Beside them stand those without friction, with some of it put in. Friction that
-    falls with speed starts where friction that does not ends, with some more of it near rest.
+    With the measured sign of the velocity the equation is linear. Where the body rests, the sign is noise, but the
+    estimates are close enough. Fits without friction add guesses with several amounts of friction. Stribeck friction
+    starts from the best fits with Coulomb friction.
     """
     problem, runs = alike.problem, alike.runs
     structure = problem.structure
@@ -191,15 +192,15 @@ def race_with_friction(
 
 
 def rubbing(structure: Structure) -> list[tuple[Equation, Friction]]:
-    """Equations with friction, and theirs."""
+    """Return the equations with friction, each with its friction term."""
     return [(e, e.friction) for e in structure.equations if e.friction is not None]
 
 
 def skeletons(problem: FreeProblem) -> list[dict[str, float]]:
-    """Orders at which a machine is put together: whole ones, and those beside them that are natural for it.
+    """Return the order sets of the linear initial fits: integer orders and natural orders of the hints.
 
-    Orders that equations share tell too little of each by itself, and an overdamped body, whose drive and brake nearly
-    cancel, is another one at every order.
+    Equations that share orders determine each of them poorly. An overdamped body has a different optimum at every
+    order.
     """
     ends = dict(zip(problem.orders, problem.bounds, strict=True))
     natural = (problem.structure.hints or Hints()).natural
@@ -212,7 +213,10 @@ def skeletons(problem: FreeProblem) -> list[dict[str, float]]:
 
 
 def hanging(alike: Grid, orders: dict[str, float], floor: float, threads: int) -> dict[str, float]:
-    """The orders, and coefficients of equations without friction, each driven by what was measured; others are 0."""
+    """Fit each equation without friction by itself, with measured signals as inputs.
+
+    Returns the orders and the coefficients; coefficients of the other equations are 0.
+    """
     structure = alike.problem.structure
     values = orders | dict.fromkeys(structure.coefficient_names, 0.0)
     for item, weight in zip(structure.equations, alike.weights, strict=True):
@@ -227,11 +231,11 @@ def hanging(alike: Grid, orders: dict[str, float], floor: float, threads: int) -
 def carrying(
     problem: FreeProblem, runs: Sequence[Run], values: dict[str, float], *, together: bool = True
 ) -> list[Attempt]:
-    """Starts of bodies by themselves, with what hangs on them put back as action and reaction ask for.
+    """Return initial guesses of isolated bodies with the coupling forces of the attached bodies added.
 
-    The others are as they are when measured bodies drive them; a body itself, driven by measured others, may be
-    explained by what they tell of its motion, without what drives it and without friction. Several bodies carry
-    the same share of their inertia, or each its own.
+    Coupling forces follow from action and reaction. A body driven by measured neighbors may be explained by their
+    motion alone, without its input and its friction, so each body is fitted in isolation first. All bodies carry the
+    same fraction of their inertia, or each its own.
     """
     structure = problem.structure
     bounds = dict(zip(problem.orders, problem.bounds, strict=True))
@@ -261,7 +265,7 @@ def by_itself(
     values: dict[str, float],
     bounds: dict[str, tuple[float, float]],
 ) -> tuple[dict[str, float], dict[str, float]]:
-    """Orders of a body with friction that nothing hangs on, and coefficients by which it follows what drives it."""
+    """Return orders and coefficients of an isolated body with friction, fitted to its inputs."""
     # A filter's lag is no part of a start.
     alone = replace(structure, sensor_filter=None).equation(item.output)
     kept = tuple(t for t in alone.equations[0].terms if t.signal not in structure.outputs or t.signal == item.output)
@@ -280,7 +284,7 @@ def by_itself(
 
 
 def reacting(structure: Structure, item: Equation, values: dict[str, float], share: float) -> dict[str, float]:
-    """Coefficients by which others act on a body: against what moves them, by their inertia over its own."""
+    """Return the coefficients by which attached bodies act on a body, scaled by the inertia ratio."""
     out: dict[str, float] = {}
     for other in structure.equations:
         if other is item:
@@ -301,13 +305,13 @@ def reacting(structure: Structure, item: Equation, values: dict[str, float], sha
 
 
 def raced(alike: Grid, floor: float, threads: int, progress: Callable[[int, int], None] | None) -> _core.JointRace:
-    """Where the starts of a problem without friction get, every output weighing alike."""
+    """Run the multistart of a problem without friction, with equal weight for every output."""
     runs = Asked(alike.problem, alike.runs).core(progress)
     return _core.joint_race(alike.problem.core, runs, alike.weights, floor, (threads, memory_limit()), stop())
 
 
 def on_coarse_grids(coarse: Grid, starts: Sequence[Attempt], threads: int) -> _core.JointRace:
-    """Where starts get on coarse grids, best first."""
+    """Refine initial guesses on coarse grids and return them ranked, best first."""
     runs = Asked(coarse.problem, coarse.runs).core()
     return _core.joint_grids(
         coarse.problem.core,
@@ -321,7 +325,7 @@ def on_coarse_grids(coarse: Grid, starts: Sequence[Attempt], threads: int) -> _c
 
 
 def check_moves(runs: Sequence[Run], structure: Structure) -> None:
-    """Refuse runs in none of which a body moves."""
+    """Raise DataError if a body with friction moves in no run."""
     for item, _ in rubbing(structure):
         output = item.output
         if all(float(np.ptp(read(run[output]))) <= STILL * noise_of(run[output]) for run in runs):
@@ -332,18 +336,18 @@ def check_moves(runs: Sequence[Run], structure: Structure) -> None:
 
 
 def with_friction(structure: Structure, other: Callable[[Friction], Friction | UnsetType]) -> Structure:
-    """The structure with other friction of each body that has some, or none."""
+    """Return the structure with each friction term replaced by `other(friction)`."""
     equations = [e if e.friction is None else replace(e, coulomb=other(e.friction)) for e in structure.equations]
     return replace(structure, equations=tuple(equations))
 
 
 def without_friction(structure: Structure) -> Structure:
-    """The structure of bodies that slide freely."""
+    """Return the structure without friction."""
     return with_friction(structure, lambda _: UNSET)
 
 
 def with_measured_sign(structure: Structure) -> Structure:
-    """The structure with the signs of measured velocities as signals in the place of friction."""
+    """Return the structure with friction replaced by the sign of the measured velocity as a signal."""
 
     def signed(item: Equation) -> Equation:
         if item.friction is None:
@@ -355,7 +359,7 @@ def with_measured_sign(structure: Structure) -> Structure:
 
 
 def started(coarse: Grid, values: dict[str, float], origin: str) -> list[Attempt]:
-    """Starts at numbers of a linear fit, with friction as it says, and as shares of the force that drives each body."""
+    """Return initial guesses of Coulomb friction from a linear fit and from fractions of the input force."""
     problem = coarse.problem
     free = [(e.output, rubs, rubs.coefficient) for e, rubs in rubbing(problem.structure)]
     named = [(output, rubs, name) for output, rubs, name in free if isinstance(name, str)]
@@ -379,7 +383,7 @@ def started(coarse: Grid, values: dict[str, float], origin: str) -> list[Attempt
 
 
 def falling(coarse: Grid, values: dict[str, float], origin: str) -> list[Attempt]:
-    """Starts at numbers of a fit with Coulomb friction alone, with some more of it at low speeds of each body."""
+    """Return initial guesses of Stribeck friction from a fit with Coulomb friction alone."""
     problem = coarse.problem
     plain = FreeProblem.of(without_friction(problem.structure))
     sizes: dict[str, float] = {}
@@ -404,26 +408,26 @@ def falling(coarse: Grid, values: dict[str, float], origin: str) -> list[Attempt
 
 
 def speed_of(coarse: Grid, output: str) -> float:
-    """Root mean square of a body's measured speed, over intervals that noise does not fill."""
+    """Return the root-mean-square speed of a body, over sample intervals long enough to exceed the noise."""
     parts = [np.diff(read(run[output])[:: coarse.decimation]) / (run.step * coarse.decimation) for run in coarse.runs]
     return float(np.sqrt(np.mean(np.concatenate(parts) ** 2)))
 
 
 def at(problem: FreeProblem, values: dict[str, float], origin: str) -> Attempt:
-    """A start at named values."""
+    """Return an initial guess at named values."""
     orders, coefficients, inputs = problem.split([values[n] for n in problem.names])
     return Attempt(orders, coefficients, origin, {}, inputs)
 
 
 def identified_body(problem: FreeProblem, output: str, values: dict[str, float]) -> Equation:
-    """The equation of a body that may stick, without its friction, at named values."""
+    """Return the equation of a body without its friction, at named values."""
     coefficients = problem.named([values[n] for n in problem.coefficients])
     item = next(e for e in problem.structure.equations if e.output == output)
     return item.with_coefficients({n: coefficients[n] for n in item.coefficient_names})
 
 
 def driving(runs: Sequence[Run], item: Equation) -> float:
-    """Root mean square of the largest force that another signal exerts by itself [unit of D^alpha y]."""
+    """Return the largest root-mean-square force of one input, in the unit of D^alpha y."""
     sizes = [0.0]
     for term in item.terms:
         if term.signal == item.output or term.order.names or term.order.constant != 0:

@@ -1,4 +1,4 @@
-"""The genetic baseline of the paper's Tables 6 and 7: orders and coefficients together, by PyGAD, on criterion (45)."""
+"""Genetic algorithm (PyGAD) and differential evolution (SciPy) as baselines."""
 
 from __future__ import annotations
 
@@ -21,25 +21,24 @@ from ftlm.structure.order_grid import Lattice
 from ftlm.structure.structure import Structure
 from ftlm.utils.validation import Floats, check_threads, whole_number
 
-#: Orders are coded in steps of this, the digits that the paper prints and fewer; regressors are then shared.
+#: Increment of the coded orders. It is as fine as the paper prints, so regressors are shared.
 RESOLUTION = 0.001
-#: Bounds of a coefficient whose value the maker states: plus and minus this many times it.
+#: Bounds of a coefficient with a nominal value: plus and minus this multiple of it.
 STATED_RANGE = 2.0
-#: Bounds of any other: this many times what would make its term alone, at the middle orders, as large as the output.
+#: Bounds of any other coefficient: this multiple of the value at which its term alone is as large as the output.
 SCALE_RANGE = 4.0
-#: A population keeps this share of itself, which are also the parents.
+#: Fraction of the population that survives and mates.
 PARENTS = 0.25
-#: Spread of simulated binary crossover and of polynomial mutation, and the share of children that are crossed: the
-#: values that Deb and Agrawal (Complex Systems 1995) and the libraries that follow them use.
+#: Distribution indices of simulated binary crossover and of polynomial mutation, and the crossover probability: the
+#: values of Deb and Agrawal (Complex Systems 1995).
 CROSSOVER_SPREAD, MUTATION_SPREAD, CROSSED = 15.0, 20.0, 0.9
-#: Copies of parents are not evaluated again, so it takes more generations to spend all evaluations: at most this
-#: many times as many.
+#: Copies of parents are not evaluated again. The number of generations may exceed the nominal one by this factor.
 MOST_COPIES = 4
-#: Evaluations took between these multiples of what those of the first generation take: most are left sooner.
+#: Range of the time estimate, relative to the first generation: most later candidates are abandoned early.
 FOLLOWED = (0.1, 1.5)
-#: Fitness of what diverges or has no chance of being a parent: PyGAD takes finite numbers only.
+#: Fitness of candidates that diverge or cannot become parents. PyGAD accepts finite numbers only.
 HOPELESS = -1e300
-#: Most evaluations that are not asked for by number: the lattice of a stage under its law has millions.
+#: Largest number of evaluations used without an explicit request: an order grid under an order law has millions.
 MOST_EVALUATIONS = 1_000_000
 
 
@@ -89,10 +88,10 @@ class Genetic:
 
 @dataclass(frozen=True)
 class GeneticRun:
-    """What the algorithm came to: the best candidate of all seeds, and what each seed came to, within which bounds.
+    """Result of the genetic algorithm: the best candidate, and error and evaluations of each seed.
 
-    Errors are (45), or RMSE (46) for the norm ``"l2"``; under an order law the sum of each output's divided by its
-    spread.
+    Errors are criterion (45), or RMSE (46) for the norm ``"l2"``. Under an order law they are the sum over outputs,
+    each divided by the standard deviation of the output.
     """
 
     orders: dict[str, float]
@@ -104,7 +103,10 @@ class GeneticRun:
 
 @dataclass(frozen=True)
 class _Rows:
-    """One equation's candidates from genes: alpha, orders, coefficients = genes @ weights + constants."""
+    """Linear map from genes to the candidates of one equation: genes @ weights + constants.
+
+    Columns are alpha, orders and coefficients.
+    """
 
     points: _core.Points
     weights: Floats
@@ -113,7 +115,7 @@ class _Rows:
     scale: float
 
     def candidates(self, genes: Floats, *, repaired: bool) -> Floats:
-        """Rows for the core; repaired ones have no order above what alpha allows."""
+        """Return the rows for the core; `repaired` limits each order to the largest that alpha allows."""
         rows = genes @ self.weights + self.constants
         if repaired:
             highest = rows[:, :1] - np.where(self.own, RESOLUTION, 0.0)
@@ -123,16 +125,16 @@ class _Rows:
 
 
 class Problem:
-    """Genes and what they are worth.
+    """Genetic coding of a structure and the evaluation of candidates.
 
     Parameters
     ----------
     records, structure, lattice, settings
-        As :func:`genetic_search` has them.
+        See :func:`genetic_search`.
     norm
         ``"l1"`` or ``"l2"``.
     threads
-        Of the free runs.
+        Number of threads that simulate.
     """
 
     def __init__(
@@ -183,21 +185,21 @@ class Problem:
         return _Rows(points, weights, constants, own, scale)
 
     def _candidates(self, structure: Structure, records: list[Record], values: Mapping[str, tuple[float, ...]]) -> int:
-        """Size of the lattice; under a law an upper bound of it."""
+        """Return the size of the order grid; under an order law an upper bound of it."""
         if self.law:
             return math.prod(len(v) for v in values.values())
         orders = lattice_tuple(structure.equations[0], records[0].signals, values)
         return _core.lattice_size(orders, list(records[0].inputs))
 
     def tidy(self, genes: Floats) -> Floats:
-        """Orders in whole steps."""
+        """Round the orders to the order resolution."""
         tidied = np.array(genes, dtype=np.float64)
         n = len(self.order_names)
         tidied[:, :n] = np.round(tidied[:, :n] / RESOLUTION) * RESOLUTION
         return tidied
 
     def errors(self, genes: Floats, limit: float) -> Floats:
-        """What each row of genes is worth; infinite above the limit."""
+        """Return the error of each row of genes, or infinity above the limit."""
         tidied, total = self.tidy(genes), np.zeros(genes.shape[0])
         for part in self.rows:
             rows = np.ascontiguousarray(part.candidates(tidied, repaired=not self.law))
@@ -205,7 +207,7 @@ class Problem:
         return np.where(total <= limit, total, np.inf)
 
     def named(self, genes: Floats) -> tuple[dict[str, float], dict[str, float]]:
-        """Orders and coefficients by name."""
+        """Return orders and coefficients by name."""
         tidied = self.tidy(genes[None, :])
         n = len(self.order_names)
         values = dict(zip(self.names, tidied[0].tolist(), strict=True))
@@ -223,7 +225,7 @@ class Problem:
 def default_bounds(
     name: str, records: Sequence[Record], structure: Structure, values: Mapping[str, tuple[float, ...]]
 ) -> tuple[float, float]:
-    """Bounds of a coefficient, see :class:`Genetic`."""
+    """Return the default bounds of a coefficient; see :class:`Genetic`."""
     stated = structure.reference.get(name, 0.0)
     if stated:
         return -STATED_RANGE * abs(stated), STATED_RANGE * abs(stated)
@@ -250,16 +252,16 @@ def genetic_search(
     threads: int | None = None,
     progress: Callable[[int, int], None] | None = None,
 ) -> GeneticRun:
-    """Minimise the error of the free run over orders and coefficients of one equation, or several under an order law.
+    """Minimize the simulation error over orders and coefficients of one equation or under an order law.
 
-    The ends of the lattice bound the orders, its size is the default number of evaluations; progress counts these over
-    all seeds. The result is the same for any number of threads.
+    The order grid bounds the orders. Its size is the default number of evaluations. Progress counts evaluations over
+    all seeds. The result does not depend on the number of threads.
 
     Raises
     ------
     ModelError
-        PyGAD is not installed, a record that does not start at rest, bounds of a number that is not free, a lattice
-        so large that the number of evaluations must be given.
+        PyGAD is not installed, a record does not start at rest, a bound names no free parameter, or the order grid is
+        so large that `evaluations` must be given.
     """
     try:
         import pygad  # type: ignore[import-untyped]  # noqa: PLC0415 — an extra; only this baseline needs it
@@ -303,7 +305,7 @@ def genetic_search(
 
 
 def _seconds(problem: Problem, population: int, evaluations: int) -> tuple[float, float]:
-    """Least and most time of so many evaluations [s], as the first generation tells: later ones are left sooner."""
+    """Return the shortest and longest expected time [s], extrapolated from the first generation."""
     low, high = np.array([problem.bounds[n] for n in problem.names]).T
     genes = low + np.random.default_rng(0).random((population, low.size)) * (high - low)
     begun = time.perf_counter()
@@ -315,10 +317,10 @@ def _seconds(problem: Problem, population: int, evaluations: int) -> tuple[float
 def _evolved(
     algorithm: Any, problem: Problem, population: int, seed: int, wanted: int, told: Callable[[int], None]
 ) -> _Kept:
-    """Run the algorithm from one seed until it has spent its evaluations.
+    """Run the genetic algorithm from one seed until its evaluations are spent.
 
-    Real-coded: simulated binary crossover, polynomial mutation, truncation selection whose survivors are the next
-    generation's parents. A candidate that cannot be among those is left as soon as its partial error says so, which
+    Real-coded genes, simulated binary crossover, polynomial mutation and truncation selection; survivors are the
+    parents of the next generation. A candidate is abandoned once its partial error excludes it from the parents, which
     changes no generation.
     """
     parents = max(2, round(PARENTS * population))
@@ -363,7 +365,7 @@ def _evolved(
 
 
 def simulated_binary(parents: Floats, size: tuple[int, int], random: Any) -> Floats:
-    """Children between and around pairs of parents, gene by gene (Deb and Agrawal, Complex Systems 9, 1995)."""
+    """Return children by simulated binary crossover (Deb and Agrawal, Complex Systems 9, 1995)."""
     pairs = (size[0] + 1) // 2
     first, second = (parents[random.randint(0, parents.shape[0], pairs)] for _ in range(2))
     u = random.random_sample(first.shape)
@@ -376,7 +378,7 @@ def simulated_binary(parents: Floats, size: tuple[int, int], random: Any) -> Flo
 
 
 def polynomial(children: Floats, low: Floats, high: Floats, random: Any) -> Floats:
-    """Children with one gene in their number moved, on average, and all within bounds (Deb and Goyal 1996)."""
+    """Return children after polynomial mutation, about one gene each (Deb and Goyal 1996)."""
     u = random.random_sample(children.shape)
     power = 1.0 / (MUTATION_SPREAD + 1.0)
     move = np.where(u < 0.5, (2.0 * u) ** power - 1.0, 1.0 - (2.0 * (1.0 - u)) ** power)
@@ -385,7 +387,7 @@ def polynomial(children: Floats, low: Floats, high: Floats, random: Any) -> Floa
 
 
 class _Kept:
-    """The smallest errors met so far, as many as there are parents: who exceeds the largest is no parent."""
+    """Error threshold of the parents: the smallest errors so far, as many as there are parents."""
 
     def __init__(self, parents: int) -> None:
         self._errors = np.full(parents, np.inf)
@@ -395,11 +397,11 @@ class _Kept:
 
     @property
     def limit(self) -> float:
-        """The largest of them."""
+        """Largest error among the current parents."""
         return float(self._errors[-1])
 
     def take(self, errors: Floats, genes: Floats) -> None:
-        """Learn of a generation."""
+        """Add the errors of one generation."""
         self.count += errors.size
         first = int(np.argmin(errors))
         if errors[first] < self.best:
@@ -407,9 +409,9 @@ class _Kept:
         self._errors = np.sort(np.concatenate([self._errors, errors]))[: self._errors.size]
 
 
-#: Candidates a generation for each gene: SciPy's own.
+#: Candidates of one generation for each gene: the default of SciPy.
 EACH = 15
-#: Logarithm of an error that is not finite: above those of all that are.
+#: Logarithm that replaces an error that is not finite; larger than that of any finite error.
 DIVERGED = 1e3
 
 
@@ -423,15 +425,15 @@ def differential_evolution_search(
     threads: int | None = None,
     progress: Callable[[int, int], None] | None = None,
 ) -> GeneticRun:
-    """Minimise the error of the free run by differential evolution, within what the genetic baseline is given.
+    """Minimize the simulation error by differential evolution, with the options of the genetic baseline.
 
-    Seeds, evaluations and bounds are those of `settings`; everything else is as SciPy has it (best1bin, 15 candidates a
-    gene), with as many whole generations as the evaluations are enough for, and no local search at the end.
+    Seeds, evaluations and bounds come from `settings`. Everything else is the default of SciPy: best1bin, 15 candidates
+    for each gene, no final local search. The number of generations is the largest that the evaluations allow.
 
     Raises
     ------
     ModelError
-        SciPy is not installed, a record that does not start at rest, no candidate with a finite error.
+        SciPy is not installed, a record does not start at rest, or no candidate has a finite error.
     """
     try:
         from scipy.optimize import differential_evolution  # type: ignore[import-untyped]  # noqa: PLC0415 — an extra; only this rival needs it

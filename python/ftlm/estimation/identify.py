@@ -1,4 +1,4 @@
-"""Whether equations have an offset: decided from the runs where that is asked for, spoken of where it is not."""
+"""Decision about offsets of the equations: tested on request, otherwise reported by a warning."""
 
 from __future__ import annotations
 
@@ -34,15 +34,15 @@ from ftlm.validation.comparison import Comparison, compared_samples, finite, fre
 from ftlm.validation.information_criteria import InformationCriteria, information_criteria
 from ftlm.validation.residual_tests import LAGS, Residuals, residual_warnings, tested_residuals
 
-#: Samples in all runs beyond which nobody is told of an offset that was not asked for: the test holds a sensitivity of
-#: each number at every sample.
+#: Largest number of samples with which an offset is tested without request: the test stores a sensitivity of each
+#: parameter at every sample.
 MOST_SAMPLES = 400_000
 
 
 def with_decided_offset(runs: Sequence[Run], structure: Structure, estimate: Callable[[Structure], Fit]) -> Fit:
-    """The fit of a structure; under ``offset="auto"`` with a constant if the runs ask for one, and without if not.
+    """Fit a structure; under ``offset="auto"`` with a constant if the offset test is significant.
 
-    The constant is fitted first: a fit that lacks it where it belongs may end anywhere.
+    The constant is fitted first, because a fit that lacks a needed constant may end anywhere.
     """
     if structure.offset != "auto":
         fit = estimate(structure)
@@ -69,7 +69,10 @@ def with_decided_offset(runs: Sequence[Run], structure: Structure, estimate: Cal
 
 
 def _in_place_of_a_past(fit: Fit) -> list[str]:
-    """Say where a constant explains what a history was taken for: powers of time do not go with the model, it would."""
+    """Return a warning if a constant explains the data as well as a history of initial terms.
+
+    A constant is part of the model, whereas initial terms hold for one run only.
+    """
     joint, structure = fit.joint, fit.task.structure
     if joint is None or structure.initial != "auto" or not isinstance(joint.initial, History):
         return []
@@ -85,7 +88,7 @@ def _in_place_of_a_past(fit: Fit) -> list[str]:
 
 
 def same_as_offset(runs: Sequence[Run], structure: Structure) -> str | None:
-    """An input with a free coefficient that does on every run what an offset does, if there is one."""
+    """Return an input with a free coefficient that is constant on every run, or None."""
     for item in structure.equations:
         for term in item.terms:
             plain = term.fixed is None and not term.order.names and term.order.constant == 0
@@ -95,7 +98,7 @@ def same_as_offset(runs: Sequence[Run], structure: Structure) -> str | None:
 
 
 def tested(fit: Fit) -> OffsetTest | None:
-    """The test for an offset at a fit, with or without one; None where there is none."""
+    """Return the offset test at a fit, with or without an offset; None if not available."""
     structure = replace(fit.task.structure, offset="none")
     if fit.joint is not None:
         values = dict(zip(fit.joint.names, fit.joint.values.tolist(), strict=True))
@@ -143,10 +146,10 @@ def identify(
 ) -> Identification:
     """Identify a structure from measured runs.
 
-    By output error, orders and coefficients are continuous and found together, with intervals, from an automatic start.
-    By the equation-error methods, free orders are searched on the lattice: each equation on its own, or all under their
-    order law; at the orders found, or given, the coefficients are those of the estimator. An option that the
-    method does not use is refused; None is an option that is not given.
+    ``"output-error"`` estimates continuous orders and coefficients together, with confidence intervals and automatic
+    initialization. The equation-error methods search free orders on the order grid: each equation by itself, or all
+    together under an order law. They then estimate the coefficients at these orders. An option that the method does not
+    use raises ModelError; None means that an option is not given.
 
     Parameters
     ----------
@@ -304,7 +307,7 @@ def identify(
 
 
 def _check_friction(structure: Structure, method: str, reference: str | None) -> None:
-    """Refuse what does not know friction."""
+    """Raise ModelError for options that do not support friction."""
     words = f"the equation of {structure.outputs[structure.sticks[0]]} has friction, which"
     if method != "output-error":
         raise ModelError(f"{words} method={method!r} does not know; use method='output-error'")
@@ -318,7 +321,7 @@ def _check_friction(structure: Structure, method: str, reference: str | None) ->
 
 
 def judged(fit: Fit) -> Identification:
-    """Both errors, residual tests, information criteria and everything that makes a fit doubtful."""
+    """Validate a fit: both errors, residual tests, information criteria and warnings."""
     runs, model = as_runs(fit.task.runs), fit.model
     free = free_runs(model, runs)
     comparison = compared_samples(model, runs, free, m=model.m or default_m(runs, power_of_two=False))
@@ -359,7 +362,7 @@ def judged(fit: Fit) -> Identification:
 
 
 def _residual_warnings(fit: Fit, tests: Residuals) -> list[str]:
-    """Failed tests; of a joint fit it is said already that residuals are coloured, and what that means."""
+    """Return warnings of failed residual tests; a joint fit already reports colored residuals."""
     if "reference" in fit.settings:
         # The loop is known, and its noise is no part of what the model was estimated from.
         tests = replace(tests, outputs={n: replace(o, loops={}) for n, o in tests.outputs.items()})
@@ -371,7 +374,7 @@ def _residual_warnings(fit: Fit, tests: Residuals) -> list[str]:
 def _estimate(
     fit: Fit, comparison: Comparison, criteria: InformationCriteria | None, warnings: tuple[str, ...]
 ) -> Estimate:
-    """What a model's file keeps of its identification."""
+    """Return the estimate that the model file stores."""
     joint, values, errors = fit.joint, dict(fit.model.orders), {}
     if joint is not None:
         values = dict(zip(joint.names, joint.values.tolist(), strict=True))
@@ -393,7 +396,7 @@ def _estimate(
 
 @dataclass(frozen=True)
 class Identified:
-    """What became of one of many.
+    """Result of one item of a batch identification.
 
     Parameters
     ----------
@@ -402,7 +405,7 @@ class Identified:
     result
         The identification, or None.
     error
-        Why there is none, or None.
+        The error that stopped it, or None.
     """
 
     name: str
@@ -416,7 +419,7 @@ class Identified:
 def one_of_many(
     runs: Run | Sequence[Run], structure: Structure, options: dict[str, Any]
 ) -> tuple[Identification | None, FtlmError | None]:
-    """Identify; an error of ftlm is a result like another."""
+    """Identify one item and return its result or error."""
     try:
         return identify(runs, structure, **options), None
     except FtlmError as error:
@@ -433,32 +436,31 @@ def identify_many(
     progress: Callable[[int, int], None] | None = None,
     **options: Any,
 ) -> list[Identified]:
-    """Identify each of many runs by itself.
+    """Identify each of many runs separately.
 
     Parameters
     ----------
     runs
-        Runs, or sequences of runs that are one fit together.
+        Runs, or sequences of runs that are fitted together.
     structure
-        What all of them are identified as.
+        Structure to identify, the same for all.
     executor
-        Any :class:`concurrent.futures.Executor`, such as processes or ``dask.distributed.Client(…).get_executor()``; a
-        run is sent to the worker that takes it. Each fit has one thread then unless `threads` says otherwise. None: one
-        after the other, here.
+        Any :class:`concurrent.futures.Executor`, such as processes or ``dask.distributed.Client(…).get_executor()``.
+        Each run is sent to one worker, with one thread by default. None: one after the other in this process.
     progress
-        Called with (runs done, runs in all).
+        Callback with (runs done, total runs).
     **options
-        Of :func:`ftlm.identify`, but for `store`, which keeps one identification.
+        Options of :func:`ftlm.identify` except `store`.
 
     Returns
     -------
-    list of Identified
-        In the order of the runs, each with its result or the error that stopped it.
+    list of BatchResult
+        Results in the order of the runs, each an identification or an error.
 
     Raises
     ------
     ModelError
-        No runs, or something else among them; a store.
+        No runs, an item that is no run, or a store.
     KeyboardInterrupt
         Ctrl-C.
     """
@@ -500,7 +502,7 @@ def identify_many(
 
 
 def _pair(future: Future[Any]) -> tuple[Identification | None, FtlmError | None]:
-    """What a worker made of its run, or that it was lost."""
+    """Return the result of a worker, or a ConvergenceError if the executor failed."""
     try:
         pair: tuple[Identification | None, FtlmError | None] = future.result()
     except (Exception, CancelledError) as error:

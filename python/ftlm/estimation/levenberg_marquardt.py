@@ -1,4 +1,4 @@
-"""Damped least squares (Levenberg, Marquardt) under linear inequalities, for problems of few numbers."""
+"""Levenberg-Marquardt least squares under linear inequality constraints, for few parameters."""
 
 from __future__ import annotations
 
@@ -9,15 +9,15 @@ import numpy as np
 
 from ftlm.utils.validation import Floats
 
-#: What a direction may leave of the residuals' cosine with their slopes at an optimum.
+#: Largest cosine between the residuals and any feasible direction of their Jacobian at an optimum.
 FLAT = 1e-10
-#: Damping at the start, and its ends.
+#: Initial, smallest and largest damping factor.
 DAMPING, LEAST, MOST = 1e-2, 1e-12, 1e12
 
 
 @dataclass(frozen=True)
 class Fitted:
-    """Where a fit ended: numbers, sum of squares, whether it stood still, evaluations, inequalities that hold it."""
+    """Result of a constrained fit: parameters, cost, convergence, evaluations, active constraints."""
 
     values: Floats
     cost: float
@@ -36,22 +36,22 @@ def damped(
     floor: float = 0.0,
     most: int = 120,
 ) -> Fitted:
-    """Least sum of squares from a start within ``rows @ values <= limits``.
+    """Minimize a sum of squares under the constraints ``rows @ values <= limits``.
 
     Parameters
     ----------
     residuals
-        Residuals and their slopes (a column a number).
+        Function that returns the residuals and their Jacobian (one column a parameter).
     cost_of
-        Sum of squares alone; not finite where there is none.
+        Function that returns the sum of squares alone; not finite where it is undefined.
     start
-        Within the inequalities.
+        Feasible initial guess.
     rows, limits
-        The inequalities.
+        Linear inequality constraints.
     floor
-        Sum of squares below which residuals are rounding, and the fit has ended.
+        Sum of squares at rounding level, below which the fit has converged.
     most
-        Most evaluations.
+        Maximum number of evaluations.
     """
     values, held = start.copy(), list[int]()
     left, slopes = residuals(values)
@@ -101,7 +101,7 @@ def damped(
 
 
 def _basis(rows: Floats, held: list[int], unit: Floats) -> Floats:
-    """Orthonormal directions, in scaled numbers, along which inequalities that hold stay as they are."""
+    """Return orthonormal directions, in scaled parameters, that keep the active constraints active."""
     if not held:
         return np.eye(unit.size)
     normals = rows[held] / unit
@@ -111,7 +111,7 @@ def _basis(rows: Floats, held: list[int], unit: Floats) -> Floats:
 
 
 def _released(left: Floats, slopes: Floats, unit: Floats, rows: Floats, held: list[int]) -> tuple[list[int], Floats]:
-    """Inequalities that still push against the descent, and the directions that they leave."""
+    """Return the active constraints with a nonnegative multiplier, and a basis of the free directions."""
     while held:
         normals = (rows[held] / unit).T
         push = np.linalg.lstsq(normals, -(slopes / unit).T @ left, rcond=None)[0]
@@ -141,7 +141,7 @@ def _step(left: Floats, slopes: Floats, unit: Floats, free: Floats, damping: flo
 
 
 def _reach(values: Floats, step: Floats, rows: Floats, limits: Floats, held: list[int]) -> tuple[float, int | None]:
-    """How much of a step stays within the inequalities, and which ends it."""
+    """Return the largest feasible fraction of a step, and the constraint that limits it."""
     towards, room = rows @ step, limits - rows @ values
     towards[held] = 0.0
     # What cannot move but for rounding ends nothing.

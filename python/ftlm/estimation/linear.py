@@ -1,4 +1,4 @@
-"""Coefficients at given orders: least squares, multi-innovation, instrumental variables."""
+"""Coefficients at given orders: least squares, multi-innovation, instrumental variables, streaming."""
 
 from __future__ import annotations
 
@@ -20,20 +20,21 @@ from ftlm.svg.figure import Figure
 from ftlm.svg.line_chart import line_chart
 from ftlm.utils.validation import Floats, whole_number
 
-#: Most steps of refined instrumental variables, and the relative change of a coefficient that ends them.
+#: Maximum number of iterations of refined instrumental variables, and the relative change of a coefficient below which
+#: the iteration has converged.
 REFINEMENTS = 40
 STILL = 1e-8
-#: A coefficient that the prior moves by more than this share is not the data's alone.
+#: Largest relative change of a coefficient by the prior covariance that is not reported.
 PULLED = 0.05
-#: Fewest pulses on which the effect of the step is looked at.
+#: Fewest block pulses with which the effect of the step is estimated.
 LEAST_PULSES = 32
-#: Standard errors that the step may move a coefficient by before it is said.
+#: Largest discretization bias of a coefficient, in standard errors, that is not reported.
 STEP_BIAS = 0.5
 
 
 @dataclass(frozen=True)
 class CoefficientFit:
-    """Coefficients at given orders by name, their standard errors where known, on what, and what to beware of."""
+    """Coefficients at given orders: values, standard errors if known, number of pulses and warnings."""
 
     m: int
     initial: Initial
@@ -45,7 +46,7 @@ class CoefficientFit:
 def estimate_coefficients(
     runs: Sequence[Run], structure: Structure, settings: Settings, m: int | None
 ) -> CoefficientFit:
-    """Coefficients at given orders by the estimator that the settings name."""
+    """Estimate the coefficients at given orders by the method that the settings name."""
     records = prepare(runs, structure, m, power_of_two=settings.needs_haar)
     fit = CoefficientFit(records[0].m, records[0].initial)
     if settings.coefficients == "instrumental-variables":
@@ -66,23 +67,24 @@ def estimate_coefficients(
 def _linear(
     item: Equation, records: list[Record]
 ) -> tuple[list[Any], Any, list[bool], list[float | None], InitialTuple]:
-    """One equation and its records as the estimators that are linear in the coefficients take them."""
+    """Return one equation and its records as arguments of the linear estimators of the core."""
     first = records[0]
     fixed, structure = [t.fixed for t in item.terms], structure_tuple(item, first.signals)
     return [r.core() for r in records], structure, list(first.inputs), fixed, first.start
 
 
 def _multi_innovation(item: Equation, records: list[Record], settings: Settings, prior: float) -> list[float]:
-    """Coefficients by (44) in closed form."""
+    """Return the coefficients by the closed form of equation (44)."""
     haar = settings.rows == "haar"
     (raw, *_), _ = _core.multi_innovation(*_linear(item, records), settings.innovation_length, prior, haar, False)
     return raw
 
 
 def _instrumental(fit: CoefficientFit, structure: Structure, records: list[Record]) -> None:
-    """Fill in coefficients by refined instrumental variables, their standard errors at these orders, and warnings.
+    """Fill in coefficients, standard errors and warnings by refined instrumental variables.
 
-    Equations that drive each other are simulated together, so that every instrument follows from the inputs alone.
+    Coupled equations are simulated together, so every instrument depends on the inputs alone. The standard errors hold
+    at the given orders.
     """
     initial, inputs = records[0].start, list(records[0].inputs)
     groups = [structure.equations] if structure.coupling == "simulated" else [(e,) for e in structure.equations]
@@ -113,9 +115,9 @@ def _instrumental(fit: CoefficientFit, structure: Structure, records: list[Recor
 
 
 def step_bias(runs: Sequence[Run], structure: Structure, settings: Settings, fit: CoefficientFit) -> list[str]:
-    """Say so where the step of the pulses moves coefficients by more than noise does.
+    """Return a warning if the step changes a coefficient by more than its standard error allows.
 
-    The scheme is of second order, so of the move from twice the step a third is left (Richardson).
+    The scheme has order 2. One third of the change from twice the step therefore remains (Richardson).
     """
     if not fit.errors or fit.m < 2 * LEAST_PULSES:
         return []
@@ -139,7 +141,7 @@ def step_bias(runs: Sequence[Run], structure: Structure, settings: Settings, fit
 
 
 def _pulled(output: str, raw: list[float], weak: list[float], settings: Settings) -> list[str]:
-    """Say so where the prior, not the data, decides the size of a coefficient."""
+    """Return a warning if the prior covariance, not the data, determines the size of a coefficient."""
     shares = [abs(a - b) / abs(b) for a, b in zip(raw, weak, strict=True) if b]
     worst = max(shares, default=0.0)
     if worst <= PULLED:
@@ -153,7 +155,7 @@ def _pulled(output: str, raw: list[float], weak: list[float], settings: Settings
 
 @dataclass(frozen=True)
 class Trace:
-    """How the recursion (44) converged on one equation.
+    """Convergence of the multi-innovation recursion (44) on one equation.
 
     Parameters
     ----------
@@ -183,7 +185,7 @@ def multi_innovation_trace(
     m: int | None = None,
     every: int = 1,
 ) -> Trace:
-    """Run the recursion (44) step by step: coefficients, and error (45) of the model they make, after every step.
+    """Run the multi-innovation recursion (44) and return coefficients and error (45) after every step.
 
     Parameters
     ----------
@@ -244,7 +246,7 @@ def multi_innovation_trace(
 
 
 def trace_chart(traces: Sequence[tuple[str, Trace]], *, title: str, log_x: bool = False) -> Figure:
-    """Error (45) of the free run after every step of the recursion (44), as in the paper's Figure 4(b).
+    """Draw the simulation error (45) after every step of the recursion (44), as in Figure 4(b).
 
     Parameters
     ----------
@@ -278,7 +280,7 @@ def trace_chart(traces: Sequence[tuple[str, Trace]], *, title: str, log_x: bool 
 
 
 class Streaming:
-    """Coefficients of a structure after every sample of a run that starts at rest.
+    """Online estimator of the coefficients of a structure for a run that starts at rest.
 
     Each sample costs the same, whatever the length of the run: the past is held by about a hundred numbers a signal.
     After the last sample the coefficients are those of ``identify(method="multi-innovation", rows="time")`` at the
@@ -342,7 +344,7 @@ class Streaming:
         self._core = _core.Streaming(step, rows, known, equations, innovation_length, prior_covariance)
 
     def push(self, samples: Floats) -> None:
-        """Takes samples, shape (n, len(signals)), in SI units and in the order of `signals`.
+        """Process samples of shape (n, len(signals)), in SI units and in the order of `signals`.
 
         Raises
         ------
@@ -357,13 +359,13 @@ class Streaming:
 
     @property
     def coefficients(self) -> dict[str, float]:
-        """By name, after the newest sample."""
+        """Coefficients by name, after the newest sample."""
         values = zip(self.structure.equations, self._core.coefficients, strict=True)
         return {name: c for item, raw in values for name, c in named_coefficients(item, raw).items()}
 
     @property
     def pulses(self) -> int:
-        """Rows of (44) so far: samples less one."""
+        """Number of rows of (44) so far: samples minus one."""
         return self._core.pulses
 
     def __str__(self) -> str:

@@ -1,4 +1,4 @@
-"""What makes an identified model doubtful, in words."""
+"""Checks of an identified model: identifiability, bounds, residuals, excitation and stability."""
 
 from __future__ import annotations
 
@@ -24,31 +24,30 @@ from ftlm.utils.validation import Floats
 from ftlm.validation.comparison import Comparison, compare, validation_warnings
 from ftlm.validation.data_advice import dead, excitation_for
 
-#: Two parameters more correlated than this cannot be told apart where neither is known by itself.
+#: Largest correlation of two separately identifiable parameters, unless one of them is well determined.
 INSEPARABLE = 0.995
-#: A coefficient or delay is not known by itself where its standard error exceeds this share of its value, an order
-#: where it exceeds this much. However correlated two numbers are, both are usable if each is within a tenth: then its
-#: 95 % interval spans less than half its value, and an order's less than the steps of 0.5 in which mechanisms differ.
+#: Largest relative standard error of a well-determined coefficient or delay, and largest standard error of an order.
+#: Its 95 % interval then spans less than half its value, or less than the increment of 0.5 between common mechanisms.
 VAGUE = 0.1
-#: Outliers are worth a word from so many on, and from this share of all residuals on; fewer, where they hold this share
-#: of the squares: they double the variance of every number then.
+#: Outliers are reported from this number and this fraction of all residuals, or if they hold this fraction of the
+#: squares, which doubles the variance of every parameter.
 FEWEST_OUTLIERS = 3
 OUTLIERS = 2e-3
 DECISIVE = 0.5
-#: Noise of this share of a step shakes an output over its steps; with less, residuals are the rounding itself.
+#: Quantization step in noise standard deviations above which residuals are dominated by rounding.
 COARSE = 2.0
-#: Share of a step by which multiples of it may be off.
+#: Largest deviation of a value from a multiple of the quantization step, as a fraction of the step.
 ROUNDED = 0.01
-#: Share of its range by which an output must move within a sample to count as moving.
+#: Smallest change within a sample that counts as motion, as a fraction of the range of the output.
 TURNED = 1e-6
-#: Fewer intervals than this in which a body moves at less than so many times vs tell nothing of how friction falls.
+#: Fewest intervals at less than SLOW_SPEED_RATIO times vs that determine the Stribeck term.
 FEWEST_SLOW, SLOW = 5, 2.0
-#: Two coefficients further apart than this share do not obey the coefficient law.
+#: Largest relative deviation of two coefficients from the coefficient law.
 LAW_BROKEN = 0.05
 
 
 def uncertain(joint: JointFit, problem: FreeProblem) -> list[str]:
-    """Say what the runs cannot tell."""
+    """Return warnings about convergence and about parameters that the runs do not determine."""
     warnings = []
     if not joint.converged:
         warnings.append("the fit ended before it stood still; its figures are provisional")
@@ -101,7 +100,7 @@ def uncertain(joint: JointFit, problem: FreeProblem) -> list[str]:
 
 
 def _growth(joint: JointFit) -> list[str]:
-    """Say what was made of an optimum whose free run grows."""
+    """Return warnings about an unstable optimum and the choice made."""
     if joint.growth is None or joint.growth.excess <= 0.0:
         # One that costs more than the stable one was none.
         return []
@@ -123,12 +122,12 @@ def _growth(joint: JointFit) -> list[str]:
 
 
 def _bounded(joint: JointFit, name: str) -> bool:
-    """Whether the profile of the likelihood has both ends of a number's interval."""
+    """Whether the profile-likelihood interval of a parameter is bounded on both sides."""
     return name in joint.profiles and not joint.profiles[name].is_open
 
 
 def unbounded_ends(joint: JointFit, unseen: Sequence[str]) -> list[str]:
-    """Say which numbers have an interval without an end."""
+    """Return a warning about parameters with an unbounded interval."""
     sides = {
         n: [s for s, end in (("below", p.low), ("above", p.high)) if math.isinf(end)]
         for n, p in joint.profiles.items()
@@ -145,7 +144,7 @@ def unbounded_ends(joint: JointFit, unseen: Sequence[str]) -> list[str]:
 
 
 def irregular(runs: Sequence[Run], joint: JointFit, problem: FreeProblem) -> list[str]:
-    """Say what in the samples harms the figures: outliers, quantisation, times that could not be honoured."""
+    """Return warnings about outliers, quantization and interpolated nonuniform samples."""
     warnings = []
     for output in problem.structure.outputs:
         size = math.sqrt(float(np.mean([np.nanvar(run[output]) for run in runs])))
@@ -166,7 +165,7 @@ def irregular(runs: Sequence[Run], joint: JointFit, problem: FreeProblem) -> lis
 
 
 def _outliers(runs: Sequence[Run], joint: JointFit, output: str) -> str | None:
-    """Residuals far beyond the usual ones, where nothing was done about them."""
+    """Return a warning about outliers, unless a robust loss was used."""
     if joint.robust is not None:
         return None
     every = read(np.concatenate([part[output] for part in joint.residuals]))
@@ -192,7 +191,7 @@ def _outliers(runs: Sequence[Run], joint: JointFit, output: str) -> str | None:
 
 
 def _quantised(runs: Sequence[Run], structure: Structure, output: str, noise: float) -> str | None:
-    """An output whose steps are coarser than anything that would shake it over them."""
+    """Return a warning about an output whose quantization step exceeds its noise."""
     steps = [quantum(read(compared_values(run, structure, output))) for run in runs]
     coarse = [(step, run) for step, run in zip(steps, runs, strict=True) if step > COARSE * noise]
     if not coarse:
@@ -206,7 +205,7 @@ def _quantised(runs: Sequence[Run], structure: Structure, output: str, noise: fl
 
 
 def quantum(values: Floats) -> float:
-    """Step of which all values are whole multiples; 0 where there is none."""
+    """Return the step of which all values are multiples; 0 if there is none."""
     levels = np.unique(values)
     gaps = np.diff(levels)
     gaps = gaps[gaps > 1e-9 * max(float(np.abs(levels).max()), float(np.ptp(levels)))] if gaps.size else gaps
@@ -219,7 +218,7 @@ def quantum(values: Floats) -> float:
 
 
 def inseparable(joint: JointFit) -> list[str]:
-    """Say which numbers trade for each other, a line a group: correlated, and none of them known by itself."""
+    """Return warnings about groups of parameters that are not separately identifiable, one line a group."""
     errors, correlation = joint.standard_errors, np.abs(joint.correlation)
     sizes = {n: abs(v) for n, v in zip(joint.names, joint.values.tolist(), strict=True)}
     # Negated so that a standard error that is not a number counts as too large.
@@ -239,7 +238,7 @@ def inseparable(joint: JointFit) -> list[str]:
 
 
 def _trade(joint: JointFit, correlation: Floats, i: int, j: int) -> bool:
-    """Whether two vague numbers move together; those without a finite error do, whatever their correlation."""
+    """Whether two uncertain parameters are correlated, or both have an infinite standard error."""
     errors = joint.standard_errors
     if not any(math.isfinite(errors[joint.names[k]]) for k in (i, j)):
         return True
@@ -247,19 +246,19 @@ def _trade(joint: JointFit, correlation: Floats, i: int, j: int) -> bool:
 
 
 def unexcited(runs: Sequence[Run], structure: Structure) -> list[str]:
-    """Say so where no run alone has inputs rich enough for the free numbers of an equation."""
+    """Return warnings about equations whose free parameters no run excites."""
     lacking = [{f.signal: f.sentence for f in excitation_for(run, structure)} for run in runs]
     return [sentence for output, sentence in lacking[0].items() if all(output in other for other in lacking)]
 
 
 def silent(runs: Sequence[Run], structure: Structure) -> list[str]:
-    """Say where a measured channel was off: a fit takes what it shows then for motion."""
+    """Return warnings about measured channels that are dead, which a fit would take for motion."""
     channels = [(r.bridged(), n) for r in runs for n in r.outputs if n in structure.signals]
     return [f"run {run.name}: {found.sentence}" for run, name in channels for found in dead(run, name)]
 
 
 def broken_law(model: Model) -> list[str]:
-    """Distance of freely estimated coefficients from the coefficient law, in words."""
+    """Return warnings about freely estimated coefficients that violate the coefficient law."""
     law, values = model.structure.coefficient_law, model.coefficients
     warnings = []
     for name, sign, factors in law:
@@ -288,10 +287,10 @@ def broken_law(model: Model) -> list[str]:
 
 
 def discretisation(model: Model, comparison: Comparison) -> list[str]:
-    """Warn where the block-pulse scheme itself is unstable at this number of pulses.
+    """Return warnings if the block-pulse scheme itself is unstable with this number of pulses.
 
-    An own-output order alpha - nu > 1 of a stiff equation gives the scheme a mode at its Nyquist frequency that the
-    model does not have.
+    A stiff equation with alpha - nu > 1 for an own term gives the scheme a mode at its Nyquist frequency that the model
+    does not have.
     """
     warnings = []
     for item in model.equations:
@@ -310,7 +309,7 @@ def discretisation(model: Model, comparison: Comparison) -> list[str]:
 
 
 def one_sided(model: Model, free: Sequence[Sampled]) -> list[str]:
-    """Warn where friction and an offset do the same: the body slides in one direction only."""
+    """Return warnings if friction and an offset are collinear (sliding in one direction only)."""
     if not model.structure.has_friction or model.structure.offset == "none":
         return []
 
@@ -327,7 +326,7 @@ def one_sided(model: Model, free: Sequence[Sampled]) -> list[str]:
 
 
 def unslowed(model: Model, runs: Sequence[Run], free: Sequence[Sampled]) -> list[str]:
-    """Warn where no run tells what friction has near rest from what it has at speed."""
+    """Return warnings if no run distinguishes the friction near rest from that at speed."""
     said = []
     for item in model.equations:
         near = None if item.friction is None else item.friction.stribeck
@@ -352,7 +351,7 @@ def unslowed(model: Model, runs: Sequence[Run], free: Sequence[Sampled]) -> list
 
 
 def growing(model: Model) -> list[str]:
-    """Warn of poles with a positive real part: within one run the input may hide what they do, later nothing does."""
+    """Return a warning about poles with a positive real part, which a short run may hide."""
     if model.structure.has_friction:
         # Friction holds what would grow slowly; no poles say so.
         return []
@@ -363,7 +362,7 @@ def growing(model: Model) -> list[str]:
 
 
 def validate(result: Judged, runs: Run | Sequence[Run]) -> Comparison:
-    """Both errors on other runs, with what they say against the model; see :meth:`ftlm.Identification.validate`."""
+    """Compare a result with other runs and add warnings; see :meth:`ftlm.Identification.validate`."""
     there = compare(result.model, runs)
     words = [*there.warnings, *validation_warnings(result.comparison, there), *discretisation(result.model, there)]
     return replace(there, warnings=tuple(dict.fromkeys(words)))

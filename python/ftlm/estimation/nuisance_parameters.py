@@ -1,4 +1,4 @@
-"""The output error around a point: what an offset would explain there, and what free orders add to intervals."""
+"""Nuisance parameters: tests whether the data require offsets and initial terms."""
 
 from __future__ import annotations
 
@@ -27,33 +27,32 @@ from ftlm.utils.statistics import LEVEL, ROUNDING, autoregression, chi_squared
 from ftlm.utils.validation import Floats
 from ftlm.validation.residual_tests import LAGS
 
-#: Pulses a sample interval where the fit does not say how many it needed.
+#: Block pulses a sample interval if the fit does not state its refinement.
 EVERY = 2
-#: Share of what an offset does that other unknowns must leave for it to be told from them.
+#: Relative size of the offset sensitivity below which it is collinear with the other parameters.
 TOLD_APART = 1e-6
-#: What explains less of an output than this share of its deviation nobody would miss.
+#: Smallest reported effect of an offset, as a fraction of the standard deviation of the output.
 VISIBLE = 1e-3
-#: Share of records without an offset in which one is spoken of that nobody asked for.
+#: Significance level of the warning about an offset that was not requested.
 UNASKED = 1e-4
-#: Evaluations from the lattice's point to the optimum between its points.
+#: Maximum number of evaluations from the grid point to the nearby optimum.
 EVALUATIONS = 40
 
 
 @dataclass(frozen=True)
 class OffsetTest:
-    """Whether unknown constants in the equations explain more than noise does.
+    """Score test for unknown constants in the equations.
 
     Parameters
     ----------
     statistic
-        Squared sizes of the constants in units of their variances under the colour of the residuals; chi-squared where
-        there is no offset.
+        Score statistic under colored residuals; chi-squared distributed without an offset.
     degrees
-        How many constants the runs tell, over all equations and runs; 0 where they tell none from the other unknowns.
+        Number of identifiable constants over all equations and runs; 0 if none is identifiable.
     share
-        Share of the residuals' sum of squares that the constants explain.
+        Fraction of the residual sum of squares that the constants explain.
     size
-        What they explain as a share of the outputs' deviations, root mean square: far below 1, it is rounding.
+        Root-mean-square effect relative to the standard deviation of the output; far below 1 it is rounding.
     """
 
     statistic: float
@@ -62,17 +61,17 @@ class OffsetTest:
     size: float
 
     def exceeds(self, level: float = LEVEL, *, size: float = ROUNDING) -> bool:
-        """Whether a record without an offset comes to this with a probability below ``level``, rounding set aside."""
+        """Whether the statistic is significant at `level` and the effect is larger than `size`."""
         return self.degrees > 0 and self.size > size and self.statistic > chi_squared(self.degrees, level)
 
     @property
     def figures(self) -> str:
-        """The statistic and its 99 % limit in words."""
+        """Statistic and 99 % limit as text."""
         return f"chi-squared {self.statistic:.4g} of {self.degrees}, 99 % limit {chi_squared(self.degrees, LEVEL):.4g}"
 
     @property
     def decision(self) -> str:
-        """What ``offset="auto"`` makes of it, in words."""
+        """Decision of ``offset="auto"`` as text."""
         if not self.degrees:
             return "none: these runs do not tell one from the other unknowns"
         if self.exceeds():
@@ -83,7 +82,7 @@ class OffsetTest:
 def at_point(
     runs: Sequence[Run], structure: Structure, values: Mapping[str, float], every: int
 ) -> tuple[Grid, Attempt]:
-    """The output error at given numbers, each output weighing as its residuals ask for."""
+    """Evaluate the output error at given parameters, with output weights from the residuals."""
     problem = FreeProblem.of(replace(structure, initial=decided_together(runs, structure)))
     orders, coefficients, inputs = problem.split([values[n] for n in problem.names])
     start = Attempt(orders, coefficients, "given", {}, inputs)
@@ -102,11 +101,11 @@ def at_point(
 def offset_test(
     runs: Sequence[Run], structure: Structure, values: Mapping[str, float], *, every: int = EVERY
 ) -> OffsetTest | None:
-    """Test for an unknown constant in each equation on each run, at given numbers; None where it cannot be computed.
+    """Test for an unknown constant in each equation and run, at given parameters; None if not computable.
 
-    What an input of ones would do joins the sensitivities of everything that is free, initial terms projected out, with
-    a coefficient of 0. It is a score test made insensitive to errors of the other numbers (Neyman's C(alpha)), so that
-    any consistent estimate will do. Its variance is that of residuals of their own colour, an autoregression.
+    The response to a constant input is added to the sensitivities of all free parameters, initial terms projected out,
+    with coefficient 0. This is a score test that is insensitive to errors of the other parameters (Neyman's C(alpha)),
+    so any consistent estimate will do. Its variance uses an autoregressive model of the residuals.
     """
     taken = {*structure.signals, *structure.coefficient_names, *structure.order_names, *runs[0].signals}
     one = next(n for n in ("one", *(f"one{k}" for k in range(len(taken) + 1))) if n not in taken)
@@ -162,7 +161,7 @@ def offset_test(
 
 
 def without_stand_ins(initial: Initial, structure: Structure, values: Mapping[str, float]) -> Initial:
-    """Caputo's terms at given numbers without powers of t that do what an offset does; others as they are."""
+    """Return Caputo's initial terms without powers of t that act like an offset; others unchanged."""
     if initial != "caputo":
         return initial
     kept: set[float] = set()
@@ -173,7 +172,7 @@ def without_stand_ins(initial: Initial, structure: Structure, values: Mapping[st
 
 
 def _blocks(grid: Grid) -> list[list[tuple[int, int]]]:
-    """First and last place of the residuals of every output, by run."""
+    """Return first and last index of the residuals of every output, by run."""
     blocks, at = [], 0
     for _, count in grid.counts:
         own = []
@@ -185,7 +184,7 @@ def _blocks(grid: Grid) -> list[list[tuple[int, int]]]:
 
 
 def _coloured(directions: Floats, noise: Floats, blocks: list[list[tuple[int, int]]], degrees: int) -> Floats:
-    """Covariance of what directions see of noise, each output's an autoregression over all runs."""
+    """Return the covariance of projections onto directions under autoregressive noise of each output."""
     total: Floats = np.zeros((directions.shape[1], directions.shape[1]))
     scale = noise.size / max(degrees, 1)
     for output in range(len(blocks[0])):
@@ -206,7 +205,7 @@ def _coloured(directions: Floats, noise: Floats, blocks: list[list[tuple[int, in
 
 
 def unasked_offset(test: OffsetTest | None, outputs: Sequence[str]) -> list[str]:
-    """Say so where an offset that nobody asked for explains what a model misses."""
+    """Return a warning if an offset that was not requested would explain the residuals."""
     if test is None or not test.exceeds(UNASKED, size=VISIBLE):
         return []
     return [
@@ -219,11 +218,11 @@ def unasked_offset(test: OffsetTest | None, outputs: Sequence[str]) -> list[str]
 def errors_with_orders(
     runs: Sequence[Run], structure: Structure, values: Mapping[str, float], *, every: int = EVERY
 ) -> dict[str, float] | None:
-    """Standard errors of orders and coefficients found on a lattice; None where they cannot be computed.
+    """Return standard errors of orders and coefficients from an order search; None if not computable.
 
-    Instruments refined at the optimum make instrumental variables as precise as the output error, so the errors are
-    those of the output error with all orders free, robust to colour, at the optimum between the lattice's points; the
-    way there is what the lattice is off, and counts as an error as well.
+    Refined instruments make instrumental variables as precise as output error at the optimum. The errors are therefore
+    those of output error with free orders, robust to colored residuals. The distance from the grid point to the optimum
+    is added as an error.
     """
     try:
         grid, here = at_point(runs, replace(structure, coefficient_law=()), values, every)
@@ -248,12 +247,11 @@ def fit_any_start(
     known: Sequence[Mapping[str, float]] = (),
     alone: bool = False,
 ) -> JointFit:
-    """Fit a structure on runs whose initial terms look like `start`, and decide by the fit where it leaves them open.
+    """Fit a structure to runs with unknown initial conditions, and select the initial terms.
 
-    Alone, the first of what is known is the only start.
-
-    A fit with a history is kept unless Caputo's terms leave residuals that are as good; a fit from rest unless a
-    history makes them much better. Which terms were fitted is in the result.
+    With `alone`, the first known value set is the only initial guess. A fit with a history (past inputs) is kept unless
+    Caputo initial terms leave residuals as small. A fit from rest is kept unless a history improves it significantly.
+    The result states which terms were fitted.
     """
 
     def fitted(initial: Initial, *, refine: bool = True, raced: _core.JointRace | None = None) -> JointFit:
@@ -283,7 +281,7 @@ def fit_any_start(
 
 
 def _shorter(joint: JointFit, runs: Sequence[Run], structure: Structure, loss: Loss, *, refine: bool) -> JointFit:
-    """The fit with Caputo's terms where they are enough, else the one with a history."""
+    """Return the fit with Caputo initial terms if they suffice, otherwise the fit with a history."""
     try:
         few = _from(joint, runs, replace(structure, initial="caputo"), loss, refine=refine)
     except FtlmError:
@@ -293,13 +291,13 @@ def _shorter(joint: JointFit, runs: Sequence[Run], structure: Structure, loss: L
 
 
 def _from(joint: JointFit, runs: Sequence[Run], structure: Structure, loss: Loss, *, refine: bool = False) -> JointFit:
-    """A fit of another structure from where one ended; where it is not refined, on a grid as coarse as it allows."""
+    """Fit another structure from an earlier optimum; without `refine` on the coarsest grid that it allows."""
     values = dict(zip(joint.names, joint.values.tolist(), strict=True))
     return fit_output_error(runs, structure, start=values, loss=loss, refine=refine)
 
 
 def instead_of_history(joint: JointFit, runs: Sequence[Run], structure: Structure) -> JointFit | None:
-    """A fit with Caputo's terms and a constant in each equation that leaves no more than one with a history, if any."""
+    """Return a fit with Caputo terms and a constant if it replaces a history, otherwise None."""
     asked = replace(structure, offset="constant")
     loss: Loss = "squares" if joint.robust is None else "huber"
     try:
@@ -313,7 +311,7 @@ def instead_of_history(joint: JointFit, runs: Sequence[Run], structure: Structur
 
 
 def asks_for_history(few: JointFit, many: JointFit, runs: Sequence[Run], structure: Structure) -> bool:
-    """Whether a fit with few initial terms leaves more than one with a history."""
+    """Whether a fit with few initial terms has significantly larger residuals than one with a history."""
     outputs = structure.outputs
     ours, theirs = (
         [fit.noise[o] * np.concatenate([part[o] for part in fit.residuals]) for o in outputs] for fit in (few, many)
@@ -323,7 +321,7 @@ def asks_for_history(few: JointFit, many: JointFit, runs: Sequence[Run], structu
 
 
 def _moved(joint: JointFit, runs: Sequence[Run], structure: Structure) -> bool:
-    """Whether what a fit from rest leaves over asks for a history."""
+    """Whether the residuals of a fit from rest require nonzero initial conditions."""
     problem = FreeProblem.of(structure)
     numbers = problem.named(list(joint.coefficients.values()))
     return in_motion(structure.with_orders(joint.orders).with_coefficients(numbers).with_inputs(joint.inputs), runs)

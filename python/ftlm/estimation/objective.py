@@ -1,4 +1,4 @@
-"""Runs sampled for a joint fit, points in the space of its parameters, and the descents between them."""
+"""Output-error objective on sampled runs: residuals, minimization and covariance."""
 
 from __future__ import annotations
 
@@ -27,7 +27,7 @@ from ftlm.structure.structure import Structure
 from ftlm.utils.resources import stop
 from ftlm.utils.validation import Floats
 
-#: A descent ends where a whole step would lower the cost by a smaller share than this.
+#: Relative cost reduction of a full step below which the minimization has converged.
 TOLERANCE = 1e-9
 
 
@@ -40,10 +40,9 @@ def experiment(
     decimation: int = 1,
     shares: Floats | None = None,
 ) -> tuple[Any, ...]:
-    """A run as the core compares with it: ``every`` pulses a sample interval, each ``decimation``-th sample.
+    """Convert a run for the core, with `every` pulses a sample interval and each `decimation`-th sample.
 
-    ``shares`` are those of the weights with which the compared samples of each output count; what was not read counts
-    for nothing anyway.
+    `shares` are the robust weights of the compared samples, one row an output. Missing samples have weight 0.
     """
     # What is free of inputs is the core's to apply, to inputs as they were given.
     structure = problem.structure.as_given()
@@ -70,7 +69,7 @@ def experiment(
 def _at_own_times(
     run: Run, structure: Structure, rec: Record, weights: Sequence[float], decimation: int, shares: Floats | None
 ) -> tuple[Any, ...]:
-    """The same of a run whose rows have times of their own; the very first sample shows only where it starts."""
+    """Convert a run with nonuniform sample times. The first sample only gives the initial value."""
     times = compared_times(run, structure)
     kept = np.flatnonzero(times > 0.0)[::decimation]
     at = Instants.of(run, rec, structure, times[kept])
@@ -86,14 +85,14 @@ def _at_own_times(
 
 
 def _output_filter(structure: Structure, rec: Record) -> tuple[Floats | None, list[bool]] | None:
-    """The filter that simulated outputs pass before they are compared; None where all signals are behind it already."""
+    """Return the sensor filter of the simulated outputs, or None if all signals are filtered already."""
     if structure.sensor_filter is None or rec.sensor is not None:
         return None
     return sensor_series(structure, rec.m, rec.step), [structure.measured_through(o) for o in structure.outputs]
 
 
 def _counted(samples: Floats, compared: slice, shares: Floats | None) -> tuple[Floats, Floats | None]:
-    """Samples without gaps, and the shares with which the compared ones count; None where all count alike."""
+    """Return samples without gaps, and the weights of the compared samples; None if all weights are 1."""
     unread = np.isnan(samples)
     counted = shares
     if unread.any():
@@ -105,10 +104,10 @@ def _counted(samples: Floats, compared: slice, shares: Floats | None) -> tuple[F
 def _instant(
     run: Run, structure: Structure, rec: Record, name: str, every: int, decimation: int
 ) -> tuple[Floats | None, bool]:
-    """What a signal is at the samples, after it changed there, and whether it holds in between.
+    """Return a signal at the sample times, after any jump there, and whether it is held between samples.
 
-    None where it has no jump or corner of its own at the samples: behind a sensor filter, or made of other signals; nor
-    where it was not read throughout, for then it drives nothing.
+    None if the signal has no jump or slope discontinuity at the samples (behind a sensor filter, or computed from other
+    signals), and if it has missing samples.
     """
     if name not in run or name in run.missing or (rec.sensor is not None and not structure.measured_through(name)):
         return None, False
@@ -125,7 +124,7 @@ def _instant(
 
 @dataclass
 class Attempt:
-    """A point in the space of parameters, where it comes from, and what the core said about it."""
+    """Point in parameter space with its origin and the result of its evaluation by the core."""
 
     orders: list[float]
     coefficients: list[float]
@@ -135,17 +134,17 @@ class Attempt:
 
     @property
     def values(self) -> Floats:
-        """Orders, coefficients, numbers of inputs."""
+        """Orders, coefficients and input parameters."""
         return np.array(self.orders + self.coefficients + self.inputs)
 
     @property
     def level(self) -> float:
-        """Cost per residual: 1 at the noise floor if the weights are right."""
+        """Cost per residual: 1 at the noise level if the weights are right."""
         return 2.0 * float(self.outcome["cost"]) / len(self.outcome["residuals"])
 
     @property
     def converged(self) -> bool:
-        """Whether the gradient vanished, but for what pushes out of a bound; a fit stopped at a wall has not."""
+        """Whether the gradient vanishes, apart from active bounds; False at another constraint."""
         return bool(self.outcome["status"] == "converged")
 
 
@@ -160,10 +159,10 @@ def descend(
     tolerance: float = TOLERANCE,
     steady: bool = False,
 ) -> Attempt:
-    """Levenberg-Marquardt from an attempt; numbers, by their places, may be held where they are.
+    """Minimize the cost by Levenberg-Marquardt; parameters with an index in `held` stay fixed.
 
-    A steady one goes from a free run that dies away to none that grows. What runs of bodies that may stick start with
-    is no projection, and goes on from where it was.
+    With `steady`, no step leads from a stable model to an unstable one. Initial states of bodies with friction are not
+    projected out and continue from the last values.
     """
     states = attempt.outcome.get("states", []) if isinstance(attempt.outcome, dict) else []
     outcome = problem.core.descend(
@@ -182,10 +181,10 @@ def descend(
 
 @dataclass(frozen=True)
 class Grid:
-    """A problem on its runs, what each output weighs, pulses a sample interval, and of how many samples one counts.
+    """Output-error objective on sampled runs: problem, output weights, pulses a sample, decimation.
 
-    Shares of these weights by run, a row an output, are those of a robust loss. On a steady one no descent goes from a
-    free run that dies away to one that grows.
+    `robust_weights` holds the weights of a robust loss by run, one row an output. With `prefer_stable`, no step leads
+    from a stable model to an unstable one.
     """
 
     problem: FreeProblem
@@ -198,7 +197,7 @@ class Grid:
 
     @cached_property
     def experiments(self) -> list[Any]:
-        """The runs as the core compares with them."""
+        """Runs in the form that the core compares with."""
         return [
             experiment(
                 run,
@@ -213,7 +212,7 @@ class Grid:
 
     @cached_property
     def finer(self) -> Grid:
-        """The same on half the step."""
+        """The same objective with half the step."""
         return replace(self, every=2 * self.every)
 
     def descend(
@@ -225,7 +224,7 @@ class Grid:
         held: int | Sequence[int] = (),
         tolerance: float = TOLERANCE,
     ) -> Attempt:
-        """Levenberg-Marquardt from an attempt; see :func:`descend`."""
+        """Minimize the cost by Levenberg-Marquardt; see :func:`minimize_cost`."""
         return descend(
             self.problem,
             self.experiments,
@@ -238,11 +237,11 @@ class Grid:
         )
 
     def evaluated(self, attempt: Attempt) -> Attempt:
-        """An attempt with its residuals and its cost on this grid, without derivatives."""
+        """Evaluate residuals and cost at a point, without derivatives."""
         return self.descend(attempt, 0)
 
     def residuals(self, attempt: Attempt) -> list[dict[str, Floats]]:
-        """Residuals of an attempt over the noise by run and output, whatever their shares; NaN where none was read."""
+        """Return unweighted residuals in noise deviations by run and output; NaN for missing samples."""
         residuals = np.asarray(attempt.outcome["residuals"])
         parts, at = [], 0
         for shares, count in self.counts:
@@ -257,55 +256,64 @@ class Grid:
 
     @property
     def counts(self) -> list[tuple[Floats | None, int]]:
-        """Shares and number of the compared samples of each run."""
+        """Robust weights and number of compared samples of each run."""
         return [(e[6], e[2].shape[1] - (2 if e[7] is None else 0)) for e in self.experiments]
 
     @property
     def every_share(self) -> Floats:
-        """Share of every residual, as the core strings them together."""
+        """Robust weight of every residual, in the order of the core."""
         outputs = len(self.problem.structure.outputs)
         return np.concatenate(
             [np.ones(outputs * count) if shares is None else shares.ravel() for shares, count in self.counts]
         )
 
     def levels(self, attempt: Attempt) -> dict[str, float]:
-        """Root mean square of the weighted residuals by output, over all runs; infinite beyond the numbers."""
+        """Return the root mean square of the weighted residuals by output, over all runs.
+
+        Infinite on overflow.
+        """
         with np.errstate(over="ignore"):
             return {o: float(np.sqrt(np.mean(e**2))) for o, e in self.pooled(attempt).items()}
 
     def pooled(self, attempt: Attempt) -> dict[str, Floats]:
-        """Weighted residuals that are there by output, all runs one after another."""
+        """Return the weighted residuals by output, all runs concatenated, missing samples left out."""
         parts = self.residuals(attempt)
         return {o: read(np.concatenate([p[o] for p in parts])) for o in self.problem.structure.outputs}
 
 
 @dataclass(frozen=True)
 class Asked:
-    """A problem's runs; questions come on the thread that called the core."""
+    """Converter of the runs of a joint fit to the forms that the core requests.
+
+    The core calls these methods on the thread that called it.
+    """
 
     problem: FreeProblem
     runs: Sequence[Run]
 
     def sampled(self, every: int, decimation: int, first: int | None) -> list[Any]:
-        """The runs with so many pulses a sample interval, of every so many samples one, or their first intervals."""
+        """Return the runs with `every` block pulses a sample interval, decimated by `decimation`.
+
+        With `first`, only the first `first` sample intervals of each run are used.
+        """
         weights = [1.0] * len(self.problem.structure.outputs)
         runs = self.runs if first is None else [run.slice(None, (first + 0.5) * run.step) for run in self.runs]
         return [experiment(run, self.problem, weights, every=every, decimation=decimation) for run in runs]
 
     def records(self, m: int, inputs: Sequence[float]) -> list[Any]:
-        """Records of so many pulses, driven by what was measured, inputs acting with these numbers."""
+        """Return block-pulse records with `m` pulses, measured inputs and given input parameters."""
         names = (item.name for item in self.problem.inputs)
         structure = self.problem.structure.with_inputs(dict(zip(names, inputs, strict=True)))
         structure = replace(structure, coupling="measured")
         return [record(run, structure, m).core() for run in self.runs]
 
     def read(self, signal: int) -> list[Floats]:
-        """A signal of each run at regular times; NaN where it was not read."""
+        """Return one signal of each run at regular sample times; missing samples are NaN."""
         name = self.problem.structure.signals[signal]
         return [np.ascontiguousarray(run[name]) for run in self.runs]
 
     def core(self, told: Callable[[int, int], None] | None = None) -> tuple[Any, ...]:
-        """The runs as the core takes them, and who is told how far it is."""
+        """Return this object, sampling spans, intersample behavior of each signal, progress callback."""
 
         def between(name: str) -> str | None:
             if name not in self.runs[0].inputs:
@@ -316,10 +324,10 @@ class Asked:
 
 
 def covariance(attempt: Attempt, grid: Grid) -> Floats:
-    """Covariance of the parameters: classical where residuals are white, robust to their colour where not.
+    """Return the covariance of the parameters, robust to autocorrelation if residuals are not white.
 
-    Nothing is truncated: a parameter that takes part in a direction which the runs do not see has an infinite variance.
-    Under a robust loss it is that of an M-estimator.
+    Nothing is truncated: a parameter in a direction that the data do not determine has infinite variance. Under a
+    robust loss the covariance is that of an M-estimator.
     """
     series = [residuals for part in grid.residuals(attempt) for residuals in part.values()]
     shares = None if grid.shares is None else grid.every_share
@@ -327,20 +335,20 @@ def covariance(attempt: Attempt, grid: Grid) -> Floats:
 
 
 def covariance_of(jacobian: Floats, series: Sequence[Floats], squares: float) -> Floats:
-    """Covariance from a Jacobian (a row a parameter), residuals by run and output, and the sum of their squares.
+    """Return the covariance from a Jacobian (row a parameter), residual series and their sum of squares.
 
-    Residuals are NaN where nothing was read. Covariances with a parameter of infinite variance are not numbers.
+    Missing residuals are NaN. Covariances with a parameter of infinite variance are NaN.
     """
     return _core.covariance_of(jacobian, series, squares)
 
 
 def long_run(jacobian: Floats, series: Sequence[Floats]) -> Floats:
-    """Covariance of sums of scores with Bartlett weights: the middle of the sandwich (doi:10.2307/1913610)."""
+    """Return the long-run covariance of scores with Bartlett weights (doi:10.2307/1913610)."""
     return _core.long_run(jacobian, series)
 
 
 def deviation(slopes: Floats, spread: Floats) -> Floats:
-    """Standard errors, to first order, of numbers whose slopes are the rows, infinite where a parameter's is."""
+    """Return standard errors by first-order propagation, infinite if a variance involved is infinite."""
     unseen = np.isinf(np.diag(spread))
     known = slopes[:, ~unseen]
     variance = np.einsum("ij,jk,ik->i", known, spread[np.ix_(~unseen, ~unseen)], known)

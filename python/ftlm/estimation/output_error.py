@@ -1,4 +1,4 @@
-"""An optimum whose free run grows, beside one whose free run dies away."""
+"""Comparison of an unstable optimum with the best stable one."""
 
 from __future__ import annotations
 
@@ -32,17 +32,17 @@ from ftlm.utils.validation import Floats
 
 @dataclass(frozen=True)
 class Growth:
-    """An optimum whose free run grows beside the best one found whose free run does not.
+    """Unstable optimum compared with the best stable optimum.
 
     Parameters
     ----------
-    kept
-        Whether the growing one is the fit's, because the runs force it or there was no other.
-    excess
-        Share by which residuals of the other one are larger (root mean square); infinite where there was none, below 0
-        where the growing one was no optimum.
-    at_limit
-        Whether the other one stands where free runs begin to grow, no optimum of its own.
+    is_accepted
+        Whether the fit is the unstable optimum, because the data require it or no stable one exists.
+    residual_excess
+        Relative excess of the root-mean-square residuals of the stable optimum. Infinite if there is none; negative if
+        the unstable point is no optimum.
+    at_stability_limit
+        Whether the stable point lies on the stability limit and is no optimum of its own.
     """
 
     kept: bool
@@ -52,7 +52,9 @@ class Growth:
 
 @dataclass(frozen=True)
 class ProfileInterval:
-    """The values of a number at which the cost, all others fitted anew, rises by no more than noise explains.
+    """Interval of a parameter on which the profiled cost rises by no more than the noise explains.
+
+    At each value all other parameters are refitted.
 
     Parameters
     ----------
@@ -76,7 +78,7 @@ class ProfileInterval:
 
     @property
     def is_open(self) -> bool:
-        """Whether an end is infinite."""
+        """Whether the interval is unbounded on either side."""
         return not (math.isfinite(self.low) and math.isfinite(self.high))
 
     def __contains__(self, value: float) -> bool:
@@ -86,22 +88,22 @@ class ProfileInterval:
         return f"{unbounded(self.low, '.6g')} to {unbounded(self.high, '.6g')}"
 
 
-#: Residuals beyond so many deviations are outliers: of normal noise one in two millions is.
+#: Outlier threshold in standard deviations: exceeded by one of two million samples of normal noise.
 FAR = 5.0
 
 
 @dataclass(frozen=True)
 class Robust:
-    """What a robust loss did.
+    """Number of residuals that a robust loss downweighted, and number of outliers.
 
     Parameters
     ----------
     lowered
-        Residuals beyond 1.345 deviations, which count less; of normal noise 18 % are.
+        Residuals beyond 1.345 standard deviations, which are downweighted (18 % of normal noise).
     outliers
-        Those beyond five.
+        Residuals beyond five standard deviations.
     samples
-        Residuals in all.
+        Total number of residuals.
     """
 
     lowered: int
@@ -109,61 +111,62 @@ class Robust:
     samples: int
 
 
-#: Share of a fit's course at whose end the race is, and of what is left of that what each of its sweeps takes.
+#: Fraction of the progress at which the multistart ends, and fraction of the remainder that each of its passes takes.
 RACED, SWEEP = 0.5, 0.3
-#: Residual that costs 1 in a coarse fit, as a share of an output's size.
+#: Residual of cost 1 in a coarse fit, as a fraction of the standard deviation of the output.
 COARSE_SHARE = 0.01
-#: Two costs closer than this share are the same optimum.
+#: Largest relative difference of the costs of one and the same optimum.
 SAME_COST = 1e-3
 
 
 @dataclass(frozen=True)
 class JointFit:
-    """An optimum of the joint output error.
+    """Optimum of the joint output error.
 
     Parameters
     ----------
     orders, coefficients
-        Free orders and free coefficients by name; under a coefficient law the free ones of the law.
+        Free orders and free coefficients by name; under a coefficient law those that the law leaves free.
     covariance
-        Of orders, coefficients, then numbers of inputs, robust to coloured residuals. Variances of what takes part in
-        a direction that the runs do not see are infinite, their covariances not numbers.
+        Covariance of orders, coefficients and input parameters, robust to colored residuals. Variances are infinite for
+        parameters that the data do not determine, and their covariances NaN.
     noise
-        Standard deviation of the residuals by output; under a robust loss from the median of their sizes.
+        Standard deviation of the residuals by output; under a robust loss from their median absolute value.
     cost
         Half the sum of squared weighted residuals.
     samples
-        Number of residuals, of samples that were read.
+        Number of residuals, without missing samples.
     refinement
-        Pulses a sample interval on the finest grid; the estimates are the limit that it and the next coarser one tell.
-    settled
-        Whether halving the step moved no estimate by a tenth of its standard error.
+        Block pulses a sample interval on the finest grid. The estimates are extrapolated from it and the next coarser
+        one.
+    step_converged
+        Whether halving the step moved every estimate by less than a tenth of its standard error.
     converged
-        Whether the gradient of the cost vanished, but for what pushes out of a bound. False where the evaluations ran
-        out, where no step lowered the cost, and where the way down led to what the grid does not carry.
+        Whether the gradient vanishes, apart from active bounds. False if the evaluations ran out, no step lowered the
+        cost, or the path left the range that the grid can represent.
     starts
-        Coarse cost (per residual) and origin of every start, best first.
+        Coarse cost (per residual) and origin of every initial guess, best first.
     residuals
-        By run and output, over the noise; NaN where nothing was read.
+        Residuals in noise standard deviations by run and output; NaN for missing samples.
     products
         Coefficients that the coefficient law gives: sign and factors by name.
     inputs
-        Estimated delays [s] and limits of inputs by name, such as ``delay_u`` and ``sat_u``; in covariance and errors
-        they stand last.
+        Estimated delays [s], saturations and dead zones by name, such as ``delay_u`` and ``sat_u``; last in the
+        covariance.
     initial, initial_terms
-        Initial terms that were fitted, and how many coefficients they have on all runs together.
+        Fitted initial terms, and their number of coefficients over all runs.
     robust
-        What a robust loss did; None for squares.
-    shares
-        With which share of its weight each sample counted under it, by run, a row an output.
-    on_grid
+        Summary of a robust loss; None for squares.
+    robust_weights
+        Robust weight of each sample by run, one row an output.
+    finest_grid_values
         Parameters at the optimum of the finest grid, in the order of the covariance.
     origin
-        Where the fit came from, if it had no starts of its own.
+        Origin of the fit if it had no multistart.
     profiles
-        95 % intervals by profile likelihood, of the parameters that have one.
-    growth
-        Where an optimum's free run grows: whether it is this one, and what one that dies away leaves beside it.
+        95 % profile-likelihood intervals of the parameters that have one.
+    unstable_optimum
+        Comparison of an unstable optimum with a stable one; None if the optimum is stable.
     """
 
     orders: dict[str, float]
@@ -190,7 +193,7 @@ class JointFit:
 
     @property
     def choice(self) -> str:
-        """Why this optimum, in words: which start led to it, and how far behind the next other one was."""
+        """Description of the initial guess that led to this optimum, and of the cost of the next optimum."""
         if not self.starts:
             return f"from {self.origin}"
         level, origin = self.starts[0]
@@ -212,12 +215,12 @@ class JointFit:
 
     @property
     def names(self) -> list[str]:
-        """Parameters in the order of the covariance."""
+        """Parameter names, in the order of the covariance."""
         return [*self.orders, *self.coefficients, *self.inputs]
 
     @property
     def values(self) -> Floats:
-        """Parameters in the order of the covariance."""
+        """Parameter values, in the order of the covariance."""
         return np.array([*self.orders.values(), *self.coefficients.values(), *self.inputs.values()])
 
     @property
@@ -228,7 +231,7 @@ class JointFit:
 
     @property
     def intervals(self) -> dict[str, tuple[float, float]]:
-        """95 % interval of each parameter: by profile likelihood where there is one, else ± 1.96 standard errors."""
+        """95 % interval of each parameter: profile likelihood if available, else ± 1.96 standard errors."""
         errors = self.standard_errors
         pairs = zip(self.names, self.values.tolist(), strict=True)
         quadratic = {n: (v - NORMAL_95 * errors[n], v + NORMAL_95 * errors[n]) for n, v in pairs}
@@ -236,7 +239,7 @@ class JointFit:
 
     @property
     def correlation(self) -> Floats:
-        """Correlation matrix of the parameters; not a number where a variance is 0 or not finite."""
+        """Correlation matrix of the parameters; NaN for variances that are 0 or not finite."""
         with np.errstate(divide="ignore", invalid="ignore"):
             spread = np.sqrt(np.diag(self.covariance))
             scaled: Floats = self.covariance / np.outer(spread, spread)
@@ -245,7 +248,7 @@ class JointFit:
 
 @dataclass(frozen=True)
 class Outset:
-    """What is known before a first descent: the problem on its runs, and the size of each output."""
+    """Initialization of a joint fit: problem, runs and standard deviation of each output."""
 
     problem: FreeProblem
     runs: Sequence[Run]
@@ -253,7 +256,7 @@ class Outset:
 
     @classmethod
     def of(cls, runs: Sequence[Run], structure: Structure) -> Outset:
-        """Of runs that tell the free numbers of a structure; the errors are those of :func:`fit_output_error`."""
+        """Return the initialization; raises as :func:`fit_output_error` if the runs are too short."""
         problem, outputs = FreeProblem.of(structure), structure.outputs
         samples = sum(max(read(compared_values(run, structure, o)).size - 2, 0) for run in runs for o in outputs)
         if samples <= len(problem.names):
@@ -265,13 +268,13 @@ class Outset:
 
     @cached_property
     def noise(self) -> list[float]:
-        """A first guess of each output's."""
+        """Initial guess of the noise standard deviation of each output."""
         structure = self.problem.structure
         outputs = zip(structure.outputs, self.sizes, strict=True)
         return [first_noise(self.runs, structure, output, size) for output, size in outputs]
 
     def race(self, threads: int, progress: Callable[[int, int], None] | None) -> _core.JointRace:
-        """Where the starts of this problem get; fits of the same structure to the same runs go on from there."""
+        """Run the multistart of this problem. Later fits of the same structure to the same runs may reuse it."""
         shares = [noise / (COARSE_SHARE * size) for noise, size in zip(self.noise, self.sizes, strict=True)]
         floor = float(np.mean([share**2 for share in shares]))
         weights = [1.0 / (COARSE_SHARE * size) for size in self.sizes]
@@ -282,7 +285,7 @@ class Outset:
 
 
 def output_sizes(runs: Sequence[Run], structure: Structure) -> list[float]:
-    """Root of the mean variance of each output on all runs."""
+    """Return the standard deviation of each output, as the root of the mean variance over all runs."""
     return [math.sqrt(float(np.mean([np.nanvar(run[o]) for run in runs]))) for o in structure.outputs]
 
 
@@ -299,20 +302,20 @@ def fit_output_error(
     near: JointFit | None = None,
     raced: _core.JointRace | None = None,
 ) -> JointFit:
-    """Fit all equations of a structure on all runs by output error, from an automatic start.
+    """Fit all equations of a structure to all runs by output error, with automatic initialization.
 
-    A coefficient law that the structure states is imposed; its initial terms must be decided. A start gives values of
-    everything free by name, and is the only one; known ones stand beside the automatic ones; `near` is a fit of the
-    same structure to nearly the same runs, to go on from on its grid and with its weights; `raced` is the race of its
-    starts where that was run already. Without `refine` the grid is not refined below the samples. Progress is told
-    (parts done, parts in all). The loss decides between optima on all samples, not between starts.
+    A coefficient law of the structure is imposed, and its initial terms must be decided. `start` gives values of all
+    free parameters by name and replaces the automatic initial guesses; `known` adds to them. `near` is a fit of the
+    same structure to nearly the same runs, whose grid and weights are reused. `raced` is the result of an earlier
+    multistart. Without `refine` the grid is not refined below the samples. Progress is called with (parts done, total
+    parts). The loss ranks optima on all samples, but not the initial guesses.
 
     Raises
     ------
     DataError
-        Fewer samples than free numbers.
+        Fewer samples than free parameters.
     ConvergenceError
-        No start has a finite free run, or one whose squares are numbers.
+        No initial guess has a finite simulation or a finite sum of squares.
     """
     outset = Outset.of(runs, structure)
     problem, outputs = outset.problem, structure.outputs
@@ -364,22 +367,22 @@ def fit_output_error(
 
 
 def given(problem: FreeProblem, values: Mapping[str, float]) -> Attempt:
-    """A start by name."""
+    """Return an initial guess from values by name."""
     orders, coefficients, inputs = problem.split([values[n] for n in problem.names])
     return Attempt(orders, coefficients, "given start", {}, inputs)
 
 
 def first_noise(runs: Sequence[Run], structure: Structure, output: str, size: float) -> float:
-    """A first guess of an output's noise, from second differences, but not below a share of its size."""
+    """Return an initial noise level of an output from second differences, bounded below."""
     return max(float(np.median([noise_of(compared_values(run, structure, output)) for run in runs])), 1e-3 * size)
 
 
-#: Orders keep this distance from bounds of their own: derivatives are taken at them, and nothing is fitted.
+#: Distance of an order from its own bounds, so that derivatives exist there. Nothing is fitted.
 ROOM = 0.5
 
 
 def freedom(joint: JointFit, structure: Structure) -> Freedom:
-    """What a joint fit of a structure found together."""
+    """Return the free parameters of a joint fit, with their covariance and noise."""
     orders = [order for e in structure.equations for order in (e.order, *(t.order for t in e.terms))]
     spread = joint.covariance
     return Freedom(
@@ -393,12 +396,12 @@ def freedom(joint: JointFit, structure: Structure) -> Freedom:
 
 
 def freedom_of(model: Solved) -> Freedom:
-    """What was free in the fit that a model is of.
+    """Return the set of free parameters that a model file stores.
 
     Raises
     ------
     ModelError
-        A model of another method, one that was written down, or one of a file that does not say so.
+        The model was not estimated, comes from another method, or its file does not list the free parameters.
     """
     known = None if model.estimate is None else model.estimate.free
     if known is None or isinstance(known, UnsetType):
@@ -411,12 +414,12 @@ def freedom_of(model: Solved) -> Freedom:
 
 
 def problem_of(model: Solved) -> tuple[FreeProblem, list[float]]:
-    """The problem of a model's fit for a run that begins at rest, and the values of its free numbers.
+    """Return the estimation problem of a model for a run that starts at rest, and its parameter values.
 
     Raises
     ------
     ModelError
-        A model that does not say what was free; orders that are none, or others than its equations have.
+        The model does not list its free parameters, or its orders do not fit its equations.
     """
     known, estimate = freedom_of(model), model.estimate
     values = {} if estimate is None else estimate.values

@@ -1,4 +1,4 @@
-"""From the fitted coefficients of a flexible link to its physical parameters, with their uncertainty."""
+"""Physical parameters of the flexible arm from identified coefficients, with uncertainty."""
 
 from __future__ import annotations
 
@@ -31,7 +31,7 @@ GRADIENT_STEP = 1e-6
 
 @dataclass(frozen=True)
 class PhysicalParameter:
-    """One physical parameter with its uncertainty.
+    """Physical parameter with its uncertainty.
 
     Parameters
     ----------
@@ -55,7 +55,7 @@ class PhysicalParameter:
 
 
 def physical_parameters(joint: JointFit, known: Mapping[str, float]) -> dict[str, PhysicalParameter]:
-    """Physical parameters of a link from coefficients under the coefficient law, once one a stage is known.
+    """Compute the physical parameters of a link from its coefficients, given one parameter a stage.
 
     a = K_s/J_1, b = -B_1/J_1, d = B_2/J_1, g = K_tau/J_1 and r = (J_1 + J_2)/J_2 (paper (16)-(21)), or j = J_1/J_2, fix
     five ratios of six parameters. Standard errors follow from the joint covariance to first order; the known value is
@@ -122,7 +122,7 @@ def physical_parameters(joint: JointFit, known: Mapping[str, float]) -> dict[str
 
 
 def _physical(coefficients: NDArray[np.float64], name: str, value: float, stage: int) -> NDArray[np.float64]:
-    """K_s, J_1, J_2, B_1, B_2, K_tau from a, b, d, g, r and one of them."""
+    """Return K_s, J_1, J_2, B_1, B_2 and K_tau from a, b, d, g, r and one of them."""
     a, b, d, g, r = coefficients
     # Every parameter in units of J_1.
     shares = np.array([a, 1.0, 1.0 / (r - 1.0), -b, d, g])

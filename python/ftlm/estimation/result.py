@@ -1,4 +1,4 @@
-"""The record of an identification: a model, what it was asked from, and everything that is known about it."""
+"""Data of an identification: model, task, fit, errors and residual tests."""
 
 from __future__ import annotations
 
@@ -31,16 +31,16 @@ if TYPE_CHECKING:
 
 @dataclass(frozen=True)
 class Task:
-    """What was asked for: from it, reports draw what the result alone does not hold.
+    """Identification task: runs, structure and order grid.
 
     Parameters
     ----------
     runs
-        The runs.
+        Estimation runs.
     structure
-        What was identified, its free orders and coefficients still free.
-    lattice
-        Of the order search; None for the default.
+        Structure to identify, with free orders and coefficients.
+    order_grid
+        Grid of the order search; None for the default.
     """
 
     runs: tuple[Run, ...]
@@ -48,13 +48,13 @@ class Task:
     lattice: Lattice | None = None
 
     def lattice_of(self, part: Structure) -> Lattice:
-        """The lattice of one searched part of the structure."""
+        """Return the order grid of one independently searched part of the structure."""
         return lattice_of(self.lattice, part) or Lattice()
 
 
 @dataclass(frozen=True)
 class Judged:
-    """An identified model and all figures; its fields are those of :class:`ftlm.Identification`."""
+    """Data of an identification; the fields are those of :class:`ftlm.Identification`."""
 
     model: Model
     method: str
@@ -77,8 +77,8 @@ class Judged:
     def standard_errors(self) -> dict[str, float]:
         """Standard errors by name.
 
-        Of orders and coefficients by output error and by instrumental variables, robust to coloured residuals; where
-        all orders were given, of the coefficients. Empty for the equation-error methods.
+        Available for output error and instrumental variables, robust to colored residuals; with all orders given, of
+        the coefficients. Empty for the other equation-error methods.
         """
         if self.joint is None:
             return dict(self.coefficient_errors)
@@ -86,10 +86,10 @@ class Judged:
 
     @property
     def intervals(self) -> dict[str, tuple[float, float]]:
-        """95 % intervals by name, of what has standard errors.
+        """95 % intervals by name.
 
-        Value ± 1.96 standard errors, or, where the quadratic picture fails for a number of a joint fit, those of the
-        profile likelihood: neither symmetric nor always finite.
+        Value ± 1.96 standard errors. Parameters of a joint fit with a nonquadratic cost have profile-likelihood
+        intervals, which may be asymmetric or unbounded.
         """
         values = {**self.orders, **self.coefficients, **({} if self.joint is None else self.joint_values)}
         errors = self.standard_errors
@@ -98,23 +98,23 @@ class Judged:
 
     @property
     def profiles(self) -> dict[str, ProfileInterval]:
-        """95 % intervals by profile likelihood, where they are used; see :meth:`ftlm.Identification.profile`."""
+        """95 % profile-likelihood intervals in use; see :meth:`ftlm.Identification.profile`."""
         return {} if self.joint is None else dict(self.joint.profiles)
 
     @property
     def delays(self) -> dict[str, float]:
-        """Delays of inputs [s] by input, estimated or known."""
+        """Delays of inputs [s] by input, estimated or fixed."""
         return dict(self.model.structure.delay)
 
     @property
     def limits(self) -> dict[str, float]:
-        """Saturations (``sat_u``) and dead zones (``dead_u``) of inputs in their units, estimated or known."""
+        """Saturations (``sat_u``) and dead zones (``dead_u``) of inputs in their units, estimated or fixed."""
         known = [(limit.name, limit.value) for limit in self.model.structure.limits]
         return {n: float(v) for n, v in known if not isinstance(v, tuple)}
 
     @property
     def joint_values(self) -> dict[str, float]:
-        """Orders, coefficients and numbers of inputs of the joint fit by name; empty without one."""
+        """Parameters of the joint fit by name: orders, coefficients and input parameters; empty without one."""
         return {} if self.joint is None else dict(zip(self.joint.names, self.joint.values.tolist(), strict=True))
 
     @property
@@ -124,52 +124,52 @@ class Judged:
 
     @property
     def equation_error(self) -> dict[str, Metrics]:
-        """Figures of the equation error by output."""
+        """Metrics of the equation error by output."""
         return self.comparison.equation_error
 
     @property
     def output_error(self) -> dict[str, Metrics]:
-        """Figures of the free run by output."""
+        """Metrics of the simulation error by output."""
         return self.comparison.output_error
 
     @property
     def fit_percent(self) -> dict[str, float]:
-        """Fit of the free run in percent, by output."""
+        """Fit of the simulation in percent, by output."""
         return self.comparison.fit_percent
 
 
 class Identification(Judged):
-    """An identified model with everything that is known about it.
+    """Result of an identification: model, fit, residuals, settings and verdict.
 
     Parameters
     ----------
     model
-        The model.
+        Identified model.
     method
         Estimator of the coefficients.
     comparison
-        Both errors on the runs it was identified from.
+        Simulation error and equation error on the estimation runs.
     searches
-        The order searches that gave its orders: by output, or under ``"stage"`` for a search under the order law;
-        empty where all orders were given.
+        Order searches that gave the orders: by output, or under ``"stage"`` for a search under the order law; empty if
+        all orders were given.
     settings
-        Of the estimator.
+        Settings of the estimator.
     warnings
-        What makes the model doubtful, in words.
-    joint
-        The optimum of the joint output error with its covariance; None for the equation-error methods.
+        Warnings about the model.
+    fit
+        Optimum of the joint output error with its covariance; None for the equation-error methods.
     residuals
-        Residual tests on the runs it was identified from; None where these are too short.
+        Residual tests on the estimation runs; None if these are too short.
     information
-        Information criteria, orders counted as parameters; None where there are no residuals.
+        Information criteria, with orders counted as parameters; None without residuals.
     task
-        The runs and the structure as they were given.
+        Runs and structure as given.
     coefficient_errors
-        Standard errors of coefficients, and of orders that were found, where the method gives no joint covariance.
+        Standard errors of coefficients, and of searched orders, for methods without a joint covariance.
     """
 
     def physical(self, **known: float) -> dict[str, PhysicalParameter]:
-        """Physical parameters of a flexible link once one of them is known; see :func:`ftlm.physical_parameters`.
+        """Return the physical parameters of a flexible link; see :func:`ftlm.physical_parameters`.
 
         Parameters
         ----------
@@ -197,13 +197,12 @@ class Identification(Judged):
         threads: int | None = None,
         progress: Callable[[int, int], None] | None = None,
     ) -> dict[str, ProfileInterval]:
-        """Intervals by profile likelihood: what a number may be if all others are fitted anew for each of its values.
+        """Compute profile-likelihood intervals: at each value of a parameter all others are refitted.
 
-        Where the cost is a parabola they are estimate ± standard errors; where it is a bent valley they are neither
-        symmetric nor always finite, and standard errors mean little. The cost may rise by the square of the normal
-        quantile times the noise's variance, widened for coloured residuals as the standard errors are; with a robust
-        loss, at the shares of the fit. Each end is followed from the optimum without a gap, so another optimum beyond a
-        ridge is not seen.
+        If the cost is a parabola, they equal estimate ± standard errors. In a curved valley they may be asymmetric or
+        unbounded, and standard errors mean little. The cost may rise by the square of the normal quantile times the
+        noise variance, widened for colored residuals; a robust loss keeps the weights of the fit. Each bound is
+        followed continuously from the optimum, so another optimum beyond a ridge is not found.
 
         It takes two to four refits an end where the picture is nearly quadratic, up to forty in a valley without end:
         some ten to two hundred free runs a number, each as long as one evaluation on the fit's finest grid. Ends are
@@ -239,11 +238,11 @@ class Identification(Judged):
         return profile(self, names, level, check_threads(threads), progress)
 
     def resid(self, runs: Run | Sequence[Run], *, lags: int = 25) -> Residuals:
-        """Residual tests on other runs; see :func:`ftlm.resid`."""
+        """Run residual tests on other runs; see :func:`ftlm.resid`."""
         return resid(self.model, runs, lags=lags)
 
     def validate(self, runs: Run | Sequence[Run]) -> Validation:
-        """Both errors on runs that the model was not identified from, with what they say against the model.
+        """Compute both errors on runs that the model was not identified from, with a verdict.
 
         Parameters
         ----------
@@ -269,7 +268,7 @@ class Identification(Judged):
     def report(
         self, path: str | os.PathLike[str], *, validation: Run | Sequence[Run] | None = None, force: bool = False
     ) -> Path:
-        """Write everything about this result as one HTML file that opens offline.
+        """Write everything about this result to one HTML file that opens offline.
 
         Parameters
         ----------
@@ -296,7 +295,7 @@ class Identification(Judged):
         return identification_page(self, path, validation=validation, force=force)
 
     def to_frame(self) -> Any:
-        """Orders and coefficients as a pandas frame: value, standard error, 95 % interval, stated value by name."""
+        """Return the parameters as a pandas frame: value, standard error, 95 % interval, nominal value."""
         values = {**self.orders, **self.joint_values, **self.coefficients}
         errors, intervals = self.standard_errors, self.intervals
         none = (math.nan, math.nan)
@@ -314,7 +313,7 @@ class Identification(Judged):
         return to_frame(rows, ["parameter"])
 
     def to_dict(self) -> dict[str, Any]:
-        """For JSON."""
+        """Return the result as a dictionary for JSON."""
         return {
             "method": self.method,
             "settings": self.settings,
@@ -335,7 +334,7 @@ class Identification(Judged):
         }
 
     def verdict(self, validation: Comparison | None = None) -> Verdict:
-        """Whether to trust this model: ``"trust"``, ``"with care"`` or ``"do not use"``, with one reason.
+        """Return the verdict ``"trust"``, ``"with care"`` or ``"do not use"``, with one reason.
 
         Parameters
         ----------
@@ -380,7 +379,7 @@ class Identification(Judged):
         return verdict(self, validation)
 
     def summary(self, validation: Comparison | None = None) -> str:
-        """The first screen, as print shows it: verdict, equations, numbers, gain, modes, fit, three warnings.
+        """Return the printed summary: verdict, equations, parameters, gain, modes, fit and three warnings.
 
         Parameters
         ----------
@@ -393,7 +392,7 @@ class Identification(Judged):
         return summary(self, validation)
 
     def details(self) -> str:
-        """All that is known as text: settings, both errors, criteria, searches, initial terms, every warning."""
+        """Return all results as text: settings, errors, criteria, searches, initial terms and warnings."""
         from ftlm.report.text_summary import settings_in_words
 
         lines = [f"{self.model.structure.name}: {self.method}, {settings_in_words(self.settings)}"]
@@ -438,7 +437,7 @@ class Identification(Judged):
 
 
 def _initial_in_words(comparison: Comparison) -> list[str]:
-    """Initial terms of every run that has some, a line an output."""
+    """Return one line for each output with initial terms, by run."""
     lines = []
     for (run, _, _), initial in zip(comparison.per_run, comparison.initial, strict=True):
         for output, terms in initial.items():

@@ -1,4 +1,4 @@
-"""Whether an identified model is to be trusted, with one reason, by rules that can be read here."""
+"""Verdict on an identified model, by explicit rules, with one reason."""
 
 from __future__ import annotations
 
@@ -24,29 +24,28 @@ from ftlm.validation.residual_tests import NEGLIGIBLE
 
 TRUST = "trust"
 NOT_TRIED = "no run that it was not fitted to has been tried"
-#: A coefficient that is known to no more than this share of itself, an order to no more than this: half of what its
-#: 95 % interval spans is then as large as itself, or as the steps of 0.5 in which mechanisms differ.
+#: Largest relative standard error of a well-determined coefficient, and largest standard error of an order. Half the 95
+#: % interval then equals the coefficient, or the increment of 0.5 between common mechanisms.
 VAGUE_SHARE, VAGUE_ORDER = 0.5, 0.25
-#: A validation leaves far more than estimation did where it is this many times as much, and more than so many percent;
-#: the less it is in all, the more of it may be noise beside a smaller signal.
+#: Limits of the validation loss: ratio to the estimation loss, and percentage below which the ratio does not matter.
 FAR_MORE = ((3.0, 10.0), (5.0, 5.0))
 _KINDS = {kind.name: kind for kind in KINDS}
 
 
 @dataclass(frozen=True)
 class Verdict:
-    """Whether to trust a model.
+    """Verdict on a model.
 
     Parameters
     ----------
     level
         ``"trust"``, ``"with care"`` or ``"do not use"``.
     reason
-        The most serious one, in a sentence.
+        Most serious reason, as a sentence.
     remedy
-        What to do about it.
+        Suggested remedy.
     reasons
-        All that speaks against the model, most serious first; the first is ``reason``.
+        All reasons, most serious first; the first is ``reason``.
     """
 
     level: str
@@ -56,16 +55,16 @@ class Verdict:
 
     @property
     def trusted(self) -> bool:
-        """Whether nothing speaks against the model."""
+        """Whether the level is ``"trust"``."""
         return self.level == TRUST
 
     def to_dict(self) -> dict[str, Any]:
-        """For JSON."""
+        """Return the verdict as a dictionary for JSON."""
         return asdict(self) | {"reasons": list(self.reasons)}
 
     @property
     def sentence(self) -> str:
-        """The reason, and what to do."""
+        """Reason and remedy."""
         return self.reason + (f"; {self.remedy}" if self.remedy else "")
 
     def __str__(self) -> str:
@@ -74,16 +73,17 @@ class Verdict:
 
 @dataclass(frozen=True)
 class Validation(Comparison):
-    """A comparison with runs that a model was not identified from, and what it makes of the model.
+    """Comparison with runs that the model was not identified from, and the resulting verdict.
 
     Parameters
     ----------
-    output_error, equation_error, per_run, simulated, measured, step, m, initial, warnings, times, sampled, offsets
+    output_error, equation_error, per_run, simulated, measured, step, m, initial, warnings, times, output_samples,
+    offsets
         See :class:`ftlm.Comparison`.
-    unequated
+    without_equation_error
         See there.
     verdict
-        Whether to trust the model after this.
+        Verdict on the model after this validation.
     """
 
     verdict: Verdict | None = None
@@ -97,12 +97,12 @@ class Validation(Comparison):
 
 
 def verdict_html(judged: Verdict) -> Markup:
-    """A verdict as a paragraph."""
+    """Return a verdict as an HTML paragraph."""
     return Markup("<p><strong>{}</strong>: {}.</p>").format(judged.level.capitalize(), judged.sentence)
 
 
 def validated(result: Judged, comparison: Comparison) -> Validation:
-    """A comparison of a result's model with other runs, with the verdict of both."""
+    """Return a comparison on other runs with the verdict of estimation and validation."""
     own = {f.name: getattr(comparison, f.name) for f in fields(Comparison)}
     return Validation(**own, verdict=verdict(result, comparison))
 
@@ -112,7 +112,7 @@ def _against(level: str, reason: str, remedy: str) -> Against:
 
 
 def verdict(result: Judged, validation: Comparison | None = None) -> Verdict:
-    """Judge a result by what is known of it, by the rules that :meth:`ftlm.Identification.verdict` states.
+    """Return the verdict on a result, by the rules of :meth:`ftlm.Identification.verdict`.
 
     Warnings of weight that no rule names count in the order of :data:`ftlm.validation.findings.KINDS`.
     """
@@ -128,7 +128,7 @@ def verdict(result: Judged, validation: Comparison | None = None) -> Verdict:
 def _most_serious(
     own: Sequence[Against], before: Mapping[str, float], runs: Sequence[Comparison], tried: bool
 ) -> Verdict | None:
-    """The verdict of what speaks against a model by itself and on other runs; None where nothing does."""
+    """Return the verdict from all findings, by itself and on other runs; None without findings."""
     found = [a for a in own if a.level == BAD]
     for comparison in runs:
         found += _useless("the validation run of ", comparison)
@@ -144,7 +144,7 @@ def _most_serious(
 
 
 def saved_verdict(model: Model, validation: Sequence[Comparison]) -> Verdict:
-    """Judge a saved model by what its file knows of its identification, and by runs that it is compared with."""
+    """Return the verdict on a saved model, from its file and from comparisons with runs."""
     known, own = model.estimate, [*_growing(model)]
     if known is None:
         own.append(_against(CARE, "its file says nothing of how it was identified", "compare it with measured runs"))
@@ -161,7 +161,7 @@ def saved_verdict(model: Model, validation: Sequence[Comparison]) -> Verdict:
 
 
 def against_saved(known: Estimate) -> list[Against]:
-    """What speaks against a model whose file says no more than warnings and standard errors."""
+    """Return the findings about a model whose file stores only warnings and standard errors."""
     found = []
     unseen = [n for n, e in known.standard_errors.items() if e is None]
     if unseen:
@@ -177,7 +177,7 @@ def against_saved(known: Estimate) -> list[Against]:
 
 
 def against_result(result: Judged) -> list[Against]:
-    """What speaks against a result by itself, whatever it is compared with, in the order of weight within a level."""
+    """Return the findings about a result by itself, most serious first within a level."""
     return [*_rules(result)]
 
 
@@ -222,7 +222,7 @@ def _rules(result: Judged) -> Iterator[Against]:
 
 
 def _free_runs(result: Judged) -> Iterator[Against]:
-    """What free runs say: whether they stay, and what they explain."""
+    """Yield findings about simulations: overflow, instability and poor fit."""
     if not all(math.isfinite(f.nr) for f in result.output_error.values()):
         yield _against(BAD, _KINDS["range"].what, _KINDS["range"].remedy)
     yield from _growing(result.model)
@@ -230,9 +230,9 @@ def _free_runs(result: Judged) -> Iterator[Against]:
 
 
 def _growing(model: Model) -> Iterator[Against]:
-    """Poles with a positive real part, and swings that never die away; with friction no poles say what a body does.
+    """Yield findings about unstable poles and undamped modes; none with friction.
 
-    A pole at the origin is an integrator, which machines are.
+    A pole at the origin is an integrator, which is common in machines and no fault.
     """
     if model.structure.has_friction:
         return
@@ -249,7 +249,7 @@ def _growing(model: Model) -> Iterator[Against]:
 
 
 def _undamped(model: Model) -> Iterator[Against]:
-    """Swings of which nothing says that they die away: no term damps them, or hardly anything tells how much."""
+    """Yield findings about oscillatory modes whose damping is not significantly positive."""
     for mode in modes(model, coupling=model.structure.coupling):
         if mode.swings and mode.damping - NORMAL_95 * (mode.damping_error or 0.0) <= 0.0:
             spread = "" if mode.damping_error is None else f" ± {mode.damping_error:.2g}"
@@ -260,7 +260,10 @@ def _undamped(model: Model) -> Iterator[Against]:
 
 
 def _useless(where: str, comparison: Comparison) -> Iterator[Against]:
-    """Outputs that the free run explains by less than half, over all runs or on one: a large run hides a small one."""
+    """Yield outputs that the simulation explains by less than half, over all runs or on one.
+
+    Each run is tested too, because a large run hides a small one.
+    """
     for run, errors in _each(comparison):
         useless = [o for o, f in errors.items() if not f.nr <= USELESS]
         if useless:
@@ -270,7 +273,7 @@ def _useless(where: str, comparison: Comparison) -> Iterator[Against]:
 
 
 def _each(comparison: Comparison) -> Iterator[tuple[str, Mapping[str, Metrics]]]:
-    """Errors of the free run over all runs, and where there are several on each."""
+    """Yield the metrics of the simulation error over all runs, and of each run if there are several."""
     yield "", comparison.output_error
     if len(comparison.per_run) > 1:
         for name, _, errors in comparison.per_run:
@@ -278,7 +281,7 @@ def _each(comparison: Comparison) -> Iterator[tuple[str, Mapping[str, Metrics]]]
 
 
 def _lost(before: Mapping[str, float], validation: Comparison) -> Iterator[Against]:
-    """Outputs whose fit on validation is far below that on estimation: by points, or by how much more is left over."""
+    """Yield outputs whose validation fit is far below the estimation fit."""
     for run, errors in _each(validation):
         for output, figures in errors.items():
             if output not in before:
@@ -291,7 +294,7 @@ def _lost(before: Mapping[str, float], validation: Comparison) -> Iterator[Again
 
 
 def _of_noise(warning: str, fits: Mapping[str, float]) -> bool:
-    """Whether a warning is of residuals that are next to nothing, which decide as little as they do in a result."""
+    """Whether a warning concerns residuals of negligible size."""
     if kind_of(warning).name not in ("residuals", "loop"):
         return False
     named = [o for o in fits if re.search(rf"(?<!\w){re.escape(o)}(?!\w)", warning)]
@@ -299,7 +302,7 @@ def _of_noise(warning: str, fits: Mapping[str, float]) -> bool:
 
 
 def _residuals(result: Judged) -> Iterator[Against]:
-    """What residual tests say: a loop, an input that they follow, a colour."""
+    """Yield findings of residual tests: feedback, dependence on an input, color."""
     if result.residuals is None:
         yield _against(CARE, "the runs are too short for residual tests", "record a longer run")
         return
@@ -322,7 +325,7 @@ def _residuals(result: Judged) -> Iterator[Against]:
 
 
 def _is_vague(result: Judged, name: str) -> bool:
-    """Whether a number is hardly known, by its profile where there is one."""
+    """Whether a parameter is poorly determined, by its profile if available."""
     error = result.standard_errors[name]
     numbers = {**result.coefficients, **({} if result.joint is None else result.joint.coefficients)}
     if name in result.orders:
@@ -337,7 +340,7 @@ def _is_vague(result: Judged, name: str) -> bool:
 
 
 def _is_of_input(result: Judged, name: str) -> bool:
-    """Whether a number is a delay, a saturation or a dead zone: each may well be 0, and none may have no end."""
+    """Whether a parameter is a delay, a saturation or a dead zone, which may be 0 but must be bounded."""
     structure = result.model.structure
     return name in {f"delay_{s}" for s in structure.delay} | {limit.name for limit in structure.limits}
 
@@ -348,12 +351,12 @@ def _vague(result: Judged, name: str) -> str:
 
 
 def _is_other(validation: Comparison) -> bool:
-    """Whether a validation is one: no run of it is one that the model was fitted to."""
+    """Whether no validation run was used for estimation."""
     return not any(c.kind.name == "same" for c in concerns(validation.warnings))
 
 
 def _first(warning: str) -> str:
-    """The first clause of a warning."""
+    """Return the first clause of a warning."""
     return warning.partition(";")[0].partition(" (")[0]
 
 

@@ -1,1 +1,1 @@
-"""The next experiment: which input would tell the numbers of an identified model best."""
+"""Experiment design: optimal inputs for the identification of parameters."""

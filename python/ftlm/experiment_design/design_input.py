@@ -1,4 +1,4 @@
-"""Inputs to begin with: squares, sweeps, random switching, sums of sines with the best spectrum and a low crest."""
+"""Initial inputs of an input design: square waves, sweeps, random switching, and multisines with a low crest factor."""
 
 from __future__ import annotations
 
@@ -27,21 +27,21 @@ from ftlm.utils.resources import between, expected, stop
 from ftlm.utils.statistics import NORMAL_95
 from ftlm.utils.validation import Floats, check_seed, nearest, real_number, shown
 
-#: Rounds in which the crest of a sum of sines is cut and its spectrum put back.
+#: Iterations that clip the crest of a multisine and restore its spectrum.
 CREST_ROUNDS = 200
-#: What is cut of a crest in each.
+#: Clipping level as a fraction of the peak.
 CUT = 0.85
-#: Shares of the best spectrum's power below which its lowest and its highest frequency lie.
+#: Quantiles of the power of the best spectrum that define its low, middle and high frequency.
 LOW, MIDDLE, HIGH = 0.05, 0.5, 0.95
 
 
 def square(rows: int, period: int) -> Floats:
-    """A square of size 1 that begins high, period in samples."""
+    """Square wave of amplitude 1 that starts high; period in samples."""
     return np.where((np.arange(rows) % period) * 2 < period, 1.0, -1.0)
 
 
 def shapes(spectrum: Spectrum, inputs: int, rows: int, step: float, seed: int) -> Iterator[tuple[str, Floats]]:
-    """Name and commands, shape (inputs, rows), of size 1 at most; motors get different ones where chance decides."""
+    """Yield name and commands, shape (inputs, rows), of amplitude at most 1; random signals differ between inputs."""
     rng = np.random.default_rng(seed)
     sines = multisine(spectrum, inputs, rows, step, rng)
     yield "multisine", sines
@@ -64,7 +64,7 @@ def shapes(spectrum: Spectrum, inputs: int, rows: int, step: float, seed: int) -
 
 
 def quantiles(spectrum: Spectrum, duration: float) -> tuple[float, float, float]:
-    """Where the power of a spectrum lies [Hz]: its low end, its middle and its high end."""
+    """Low, median and high frequency of the power of a spectrum [Hz]."""
     order = np.argsort(spectrum.lines.frequencies)
     frequencies, power = spectrum.lines.frequencies[order], spectrum.power[order]
     total = np.cumsum(power)
@@ -75,10 +75,10 @@ def quantiles(spectrum: Spectrum, duration: float) -> tuple[float, float, float]
 
 
 def multisine(spectrum: Spectrum, inputs: int, rows: int, step: float, rng: np.random.Generator) -> Floats:
-    """A sum of sines with the powers of a spectrum, of size 1, phases such that its crest is low.
+    """Multisine with the powers of a spectrum, amplitude 1, and phases that give a low crest factor.
 
-    Schroeder's phases (doi:10.1109/TIT.1970.1054411) for a start; then its peaks are cut and its spectrum is put back,
-    time and again (Van der Ouderaa, Schoukens & Renneboog, 1988).
+    Starts from Schroeder's phases (doi:10.1109/TIT.1970.1054411), then clips peaks and restores the spectrum in turn
+    (Van der Ouderaa, Schoukens & Renneboog, 1988).
     """
     points = len(spectrum.power)
     of_input = np.argmax(spectrum.lines.costs[:inputs] > 0, axis=0) if points else np.zeros(0, int)
@@ -109,23 +109,23 @@ def _chirp(time: Floats, low: float, high: float) -> Floats:
     return np.asarray(np.sin(2 * math.pi * low * duration / growth * np.expm1(growth * time / duration)))
 
 
-#: Fewest and most rows of a run that is designed.
+#: Minimum and maximum number of samples of a designed run.
 FEWEST, MOST = 32, 50_000
-#: Holds of a run in a first search, and how many times finer ones become.
+#: Number of holds of a run in the first search, and divisors of the hold length in the later ones.
 HOLDS, FINER = 125, (1, 2, 4)
-#: Designs took between these multiples of what their rows and numbers let expect: how many exchanges pay turns out.
+#: Range of measured over estimated computing time. The number of exchanges is not known in advance.
 CAME_TO = (0.4, 4.0)
-#: Inputs from which holds are exchanged.
+#: Maximum number of initial inputs for the exchange algorithm.
 BEGUN = 4
-#: Periods of the square that a design is set beside: the paper's ten seconds have five.
+#: Periods of the reference square wave: five, as in the ten-second runs of the paper.
 PERIODS = 5
-#: A model whose own uncertainty moves its answer by more than this share of it is none to design on.
+#: Maximum output standard deviation due to parameter uncertainty, relative to the output's RMS value.
 VAGUE = 0.5
 
 
 @dataclass(frozen=True)
 class Wanted:
-    """What was asked for, checked."""
+    """Arguments of an input design after all checks."""
 
     laid: Laid
     step: float
@@ -153,20 +153,21 @@ def design_input(
     seed: int = 0,
     progress: Callable[[int, int], None] | None = None,
 ) -> DesignedInput:
-    """Lay out the experiment that tells an identified model's numbers best within the limits of a machine.
+    """Design the input that identifies the parameters of a model best within the limits of a machine.
 
-    What any input tells follows from the exact derivatives of the free run, those of the fit, over the noise that the
-    fit left. A convex problem gives the best periodic spectrum and proves it; from its sum of sines, sweeps, squares
-    and random switching, levels are then exchanged one after another until no exchange tells more. It takes seconds to
-    a minute, the longer the more rows and numbers.
+    The Fisher information of any input follows from the exact output sensitivities, those of the fit, over the noise
+    standard deviation of the fit. A convex problem gives the best periodic spectrum with a certificate. Its multisine,
+    sweeps, square waves and random switching sequences are the initial inputs of an exchange algorithm over
+    piecewise-constant levels, which stops at a local optimum. Computing time is seconds to a minute and grows with
+    samples and parameters.
 
     Parameters
     ----------
     model : Identification or Model
         Of method ``"output-error"``; a saved model will do.
     like : Run, optional
-        A run that the machine is known to bear: what is not said is as in it, the largest output included. Default of
-        an identification its first run.
+        An admissible run of the machine. It gives the defaults of the other arguments, the largest output included.
+        Default of an identification: its first run.
     duration, step : float, optional
         Of the run [s].
     peak : float or mapping, optional
@@ -176,24 +177,24 @@ def design_input(
     limits : mapping, optional
         Largest size of outputs by name, in the model's units; infinity for none.
     names : sequence of str, optional
-        Numbers to be told; default all free orders, or all numbers where no order is free.
+        Parameters of interest; default all free orders, or all parameters if no order is free.
     criterion : {"D", "E"}, default "D"
-        ``"D"``: the smallest ellipsoid of confidence of these numbers. ``"E"``: its widest axis as short as can be,
+        ``"D"``: smallest volume of the confidence ellipsoid of these parameters. ``"E"``: shortest widest axis, with
         coefficients in units of their values.
     noise : mapping, optional
-        Standard deviation of each output's noise; default what the fit left.
+        Noise standard deviation of each output; default that of the fit.
     period : float, optional
-        Of the square that the design is set beside [s]; default a fifth of the duration, as in the paper.
+        Period of the reference square wave [s]; default a fifth of the duration, as in the paper.
     seed : int
-        Of the random inputs among those to begin with.
+        Seed of the random initial inputs.
     progress : callable, optional
-        Called with parts done and parts in all.
+        Called with the number of steps done and their total.
 
     Returns
     -------
     DesignedInput
-        Commands, predicted intervals beside those of the model and of the square, limits that bind; ``.save`` writes
-        what a rig is given.
+        Commands, predicted intervals, those of the model and of the reference square wave, active constraints.
+        ``.save`` writes the commands for a rig.
 
     Raises
     ------
@@ -255,7 +256,7 @@ def design_input(
 
 
 def _tried(wanted: Wanted, known: Sensitivities, spectrum: Spectrum, course: Course) -> list[Design]:
-    """Every input that was tried, best first: shapes as they are, and what exchanges made of the best of them."""
+    """Return all candidate inputs, best first: initial signals, and the exchange results of the best of them."""
     laid, bounds, goal, rows = wanted.laid, wanted.bounds, wanted.criterion, wanted.rows - 1
     ended = stop()
 
@@ -375,7 +376,7 @@ def _wanted(
 
 
 def _check_signals(laid: Laid, like: Run | None) -> None:
-    """Refuse a model that nobody can drive, and a run without its inputs."""
+    """Raise if a model has no usable input, or a run lacks its inputs."""
     if not laid.inputs:
         raise ModelError("the model has no input, so there is nothing to design; give one with an input")
     if laid.problem.structure.behind_filter:
@@ -403,7 +404,7 @@ def _positive(name: str, value: object, what: str) -> float:
 
 
 def _largest(run: Run, names: Sequence[str], *, moved: bool) -> dict[str, float]:
-    """How far signals of a run go, outputs from where they begin; without those that it lacks or that stand still."""
+    """Largest size of signals of a run, of outputs from their first value; omits missing and constant signals."""
     out = {}
     for name in names:
         if name in run:
@@ -416,7 +417,7 @@ def _largest(run: Run, names: Sequence[str], *, moved: bool) -> dict[str, float]
 
 
 def _chosen(laid: Laid, names: Sequence[str] | None) -> tuple[int, ...]:
-    """Places of the numbers to be told."""
+    """Return the indices of the parameters of interest."""
     if isinstance(names, str):
         names = [names]
     if names is None:
@@ -438,7 +439,7 @@ def _chosen(laid: Laid, names: Sequence[str] | None) -> tuple[int, ...]:
 
 
 def _check_stable(laid: Laid, bounds: Bounds) -> None:
-    """Refuse what runs away, and what drifts without a limit."""
+    """Raise if a model is unstable, or integrates without a limit of its output."""
     found = stability(laid.model)
     if found.unstable_poles != 0 or found.on_axis:
         raise ModelError(
@@ -454,7 +455,7 @@ def _check_stable(laid: Laid, bounds: Bounds) -> None:
 
 
 def _check_known_enough(laid: Laid, step: float, length: float) -> None:
-    """Refuse a model that is known so badly that what is best for it says nothing of the machine."""
+    """Raise if the model is too uncertain: an input optimal for it may be poor for the machine."""
     spread = laid.covariance
     errors = np.sqrt(np.diag(spread))
     vague = [
@@ -480,7 +481,7 @@ def _check_known_enough(laid: Laid, step: float, length: float) -> None:
 
 
 def _too_wide(laid: Laid, why: str, times: tuple[float, float] | None) -> None:
-    """Refuse, with the experiment that comes first."""
+    """Raise with a recommended first experiment."""
     low, high = (0.1, 10.0) if times is None else (1.0 / times[1], 0.1 / times[0])
     try:
         own = [abs(m.pole) / (2 * math.pi) for m in modes(laid.model)]
@@ -498,7 +499,7 @@ def _too_wide(laid: Laid, why: str, times: tuple[float, float] | None) -> None:
 
 
 def _within(wanted: Wanted, known: Sensitivities, commands: Floats) -> float:
-    """Factor that keeps outputs within their limits over the model's intervals, not only at its values."""
+    """Factor that keeps outputs within their limits over the confidence intervals of the model."""
     moved, slopes = known.moved(commands), known.derivatives(commands)
     spread = np.einsum("pot,pq,qot->ot", slopes, wanted.laid.covariance, slopes)
     noise = np.array([wanted.laid.noise[o] for o in wanted.laid.outputs])[:, None]
@@ -507,7 +508,7 @@ def _within(wanted: Wanted, known: Sensitivities, commands: Floats) -> float:
 
 
 def _errors(laid: Laid, reference: Run, run: Run) -> dict[str, Floats]:
-    """Standard errors as the model has them, and as fits of runs are predicted to have them."""
+    """Standard errors of the model, and predicted ones of fits of the designed and of the reference run."""
     now, new = laid.covariance, laid.predicted(run)
     size = np.sqrt(np.diag(now))
     told = np.linalg.inv(now / np.outer(size, size)) + np.linalg.inv(new / np.outer(size, size))
@@ -527,7 +528,7 @@ def _reached(run: Run, bounds: Bounds) -> tuple[Reached, ...]:
 
 
 def _shape(best: Design, run: Run, wanted: Wanted) -> str:
-    """The designed input in words."""
+    """Describe the designed input."""
     if not best.name.endswith("exchanged"):
         return best.name
     first = next(iter(wanted.laid.inputs))

@@ -1,4 +1,4 @@
-"""The best switching of an input that holds each of its levels for some samples: one hold exchanged after another."""
+"""Exchange algorithm for piecewise-constant inputs: the best switching sequence, one or two holds at a time."""
 
 from __future__ import annotations
 
@@ -13,30 +13,30 @@ from ftlm.experiment_design.problem import Bounds, Criterion
 from ftlm.experiment_design.sensitivity import Sensitivities
 from ftlm.utils.validation import Complex, Floats
 
-#: Levels of a command, in units of its peak.
+#: Levels of a command, as fractions of its peak.
 LEVELS = (-1.0, 0.0, 1.0)
-#: Changes of a level, and how many holds later another one may change by as much in the other direction.
+#: Changes of a level, and distances in holds at which a second hold may change by the opposite amount (0: none).
 STEPS, GAPS = (-2.0, -1.0, 1.0, 2.0), (1, 2, 4, 8)
-#: Exchanges that are looked at closely, those with the largest slope first.
+#: Maximum number of exchanges with the largest linearized gain that are evaluated exactly.
 FOLLOWED = 200
-#: Most exchanges, and what one has to add.
+#: Maximum number of exchanges, and minimum gain in score of one.
 MOST, LEAST = 400, 1e-7
 
 
 @dataclass(frozen=True)
 class Design:
-    """Commands and what they say.
+    """Commands of a designed input and their score.
 
     Parameters
     ----------
     name
-        How they came to be.
+        Origin of the commands.
     commands
         Shape (inputs, rows), within all limits.
     score
-        What they say.
+        Value of the criterion.
     exchanges
-        How many holds were exchanged.
+        Number of exchanges made.
     """
 
     name: str
@@ -46,7 +46,7 @@ class Design:
 
 
 def judged(name: str, commands: Floats, known: Sensitivities, criterion: Criterion, bounds: Bounds) -> Design:
-    """Commands made so small that all limits are kept, and what they say then."""
+    """Return commands scaled down until all limits hold, with their score."""
     scale = bounds.scale(commands, known.moved(commands))
     score = float(criterion.score(known.information(known.derivatives(commands)))) + math.log(scale)
     return Design(name, scale * commands, score)
@@ -60,11 +60,11 @@ def exchanged(
     bounds: Bounds,
     stopped: Callable[[], None] = lambda: None,
 ) -> Design:
-    """Fedorov's exchange (Theory of Optimal Experiments, 1972) of the holds of an input, one or two at a time.
+    """Exchange holds of an input, one or two at a time (Fedorov, Theory of Optimal Experiments, 1972).
 
-    The information is quadratic in the commands, so that what every exchange comes to follows from convolutions, and is
-    exact. The best one that the limits bear is made, until none adds anything: no change of one hold is better, nor one
-    that takes from a hold what it gives to another near it, though other switching may be.
+    The information is quadratic in the commands, so its change by every exchange follows exactly from convolutions. The
+    best feasible exchange is made until none improves the score. The result is a local optimum: no change of one hold
+    is better, nor an opposite change of two holds near each other. Another switching sequence may be better.
     """
     inputs, rows = begin.commands.shape
     starts = np.arange(0, rows, hold)
@@ -123,12 +123,12 @@ def exchanged(
 
 
 def _over(moved: Floats, limits: Floats) -> float:
-    """Logarithm of how far outputs are over their limits; 0 within."""
+    """Logarithm of the largest ratio of outputs to their limits; 0 if all limits hold."""
     return math.log(max(1.0, float(np.max(np.abs(moved) / limits))))
 
 
 def _allowed(level: Floats, step: float, gap: int) -> NDArray[np.bool_]:
-    """Where a hold may be changed by a step, and the one a gap later by as much in the other direction."""
+    """Mask of the holds that may change by a step, with the hold one gap later changed by the opposite amount."""
     there: NDArray[np.bool_] = np.abs(level + step) < LEVELS[-1] + 0.5
     if gap:
         there[:-gap] &= np.abs(level[gap:] - step) < LEVELS[-1] + 0.5
@@ -138,20 +138,20 @@ def _allowed(level: Floats, step: float, gap: int) -> NDArray[np.bool_]:
 
 @dataclass(frozen=True)
 class Hold:
-    """What one held level of an input does, at its peak.
+    """Response to one hold of an input at its peak level.
 
     Parameters
     ----------
     starts
-        Samples at which holds begin.
-    block, shown
-        Derivatives, shape (numbers, outputs, rows), and outputs from a hold's start on.
+        Samples at which holds start.
+    block, response
+        Derivatives, shape (parameters, outputs, rows), and outputs from the start of a hold.
     spectrum
-        Transform of the derivatives.
+        Fourier transform of the derivatives.
     offsets
-        What a hold shares with offsets of the run, by its start.
+        Projection of a hold onto the offsets of the run, by its start.
     own
-        Information of one hold by its start, and of one less another that begins a gap later, by gap.
+        Information of one hold by its start, and of one minus another that starts a gap later, by gap.
     """
 
     starts: NDArray[np.int64]
@@ -163,7 +163,7 @@ class Hold:
 
     @classmethod
     def of(cls, known: Sensitivities, place: int, hold: int, starts: NDArray[np.int64], peak: float) -> Hold:
-        """Of one input."""
+        """Compute the response of one input."""
         block, shown = _held(known.kernels[place], hold) * peak, _held(known.answers[place], hold) * peak
         spectrum = np.fft.rfft(block, known.length)
         offsets = _at_starts(known, known.nuisance.reshape(-1, *block.shape[1:]), spectrum, starts)
@@ -182,7 +182,7 @@ class Hold:
         return cls(starts, block, shown, spectrum, offsets, own)
 
     def mixed(self, known: Sensitivities, derivatives: Floats) -> Iterator[tuple[int, Floats, Floats]]:
-        """Of each gap how the information grows with an exchange, to first order and to second, by its start."""
+        """Yield for each gap the first- and second-order change of the information by an exchange, by its start."""
         shared = _at_starts(known, derivatives, self.spectrum, self.starts)
         if len(known.nuisance):
             flat = derivatives.reshape(len(derivatives), -1) @ known.nuisance.T
@@ -196,7 +196,7 @@ class Hold:
             yield gap, pair, own
 
     def after(self, series: Floats, at: int, gap: int, step: float, *, shown: bool) -> Floats:
-        """Derivatives, or outputs, after an exchange."""
+        """Return derivatives, or outputs, after an exchange."""
         block, out = self.shown if shown else self.block, series.copy()
         for begins, size in ((self.starts[at], step), *(((self.starts[at + gap], -step),) if gap else ())):
             out[..., begins:] += size * block[..., : block.shape[-1] - begins]
@@ -204,20 +204,20 @@ class Hold:
 
 
 def _nearest(values: Floats) -> Floats:
-    """The nearest level of each value; from the middle between two, the outer one."""
+    """Return the nearest level of each value; a midpoint goes to the outer level."""
     levels = np.array(LEVELS)
     return np.asarray(levels[np.argmin(np.abs(values[..., None] * (1 + 1e-9) - levels), axis=-1)])
 
 
 def _held(kernel: Floats, hold: int) -> Floats:
-    """What a held level does from its start on, from what one sample does."""
+    """Response to a hold from the response to one sample."""
     total = np.cumsum(kernel, axis=-1)
     total[..., hold:] -= total[..., :-hold].copy()
     return total
 
 
 def _together(known: Sensitivities, one: Floats, other: Floats, starts: NDArray[np.int64]) -> Floats:
-    """Products of what two things do from their start to the end of the run, by that start."""
+    """Inner products of two responses from their common start to the end of the run, by that start."""
     grown = np.zeros((len(starts), len(one), len(other)))
     for p, row in enumerate(one):
         total = np.cumsum(np.einsum("ot,qot->qt", row, other), axis=-1)
@@ -226,7 +226,7 @@ def _together(known: Sensitivities, one: Floats, other: Floats, starts: NDArray[
 
 
 def _at_starts(known: Sensitivities, series: Floats, spectrum: Complex, starts: NDArray[np.int64]) -> Floats:
-    """Products of series (so many, outputs, rows) with holds that begin at given samples: (starts, numbers, series)."""
+    """Inner products of series with holds that start at given samples, shape (starts, parameters, series)."""
     out = np.zeros((len(starts), spectrum.shape[0], len(series)))
     for place, one in enumerate(np.fft.rfft(series, known.length)):
         product = np.einsum("of,pof->pf", one, np.conj(spectrum))

@@ -1,4 +1,4 @@
-"""How much an information says of chosen numbers, whatever the others are: one number to be made large."""
+"""Optimality criterion (D or E) and signal limits of an experiment."""
 
 from __future__ import annotations
 
@@ -13,24 +13,24 @@ from ftlm.errors import ModelError
 from ftlm.utils.validation import Floats, nearest, real_number, shown
 
 Kind = Literal["D", "E"]
-#: Kiefer's mean, taken for the widest axis where a derivative is needed: within s^(1/16) of it for s numbers.
+#: Exponent of Kiefer's mean, the smooth substitute of the widest axis: within s^(1/16) of it for s parameters.
 SHARP = 16
-#: A determinant below this, of an information in units of its own diagonal, is rounding.
+#: Determinant of the information, scaled to a unit diagonal, below which it is numerically singular.
 LOST = 1e-28
 
 
 @dataclass(frozen=True)
 class Criterion:
-    """The precision of chosen numbers, in their units, as a logarithm: twice the input is log 2 more.
+    """Log precision of the parameters of interest, in their units; twice the input adds ln 2.
 
     Parameters
     ----------
     kind
-        ``"D"``: the geometric mean of the axes of their ellipsoid of confidence. ``"E"``: its widest axis.
-    chosen
-        Places of the numbers.
+        ``"D"``: geometric mean of the axes of the confidence ellipsoid. ``"E"``: its widest axis.
+    indices
+        Indices of the parameters of interest.
     units
-        What counts as one of each of them.
+        Unit of each of them.
     """
 
     kind: Kind
@@ -39,11 +39,11 @@ class Criterion:
 
     @property
     def count(self) -> int:
-        """Chosen numbers."""
+        """Number of parameters of interest."""
         return len(self.chosen)
 
     def score(self, information: Floats) -> Floats:
-        """Of informations, shape (…, numbers, numbers); minus infinity where they do not tell the chosen numbers."""
+        """Score of information matrices, shape (…, p, p); -inf if the parameters are not identifiable."""
         spread = self._inverse(information)
         with np.errstate(divide="ignore", invalid="ignore"):
             if self.kind == "D":
@@ -55,7 +55,7 @@ class Criterion:
         return np.where(np.isfinite(spread[..., 0, 0]), found, -np.inf)
 
     def mean(self, information: Floats) -> float:
-        """The same, but of the widest axis Kiefer's mean, which has a derivative and is at least as good."""
+        """Differentiable score: for E, Kiefer's mean in place of the widest axis; never below :meth:`score`."""
         if self.kind == "D":
             return float(self.score(information))
         axes = np.linalg.eigvalsh(self._inverse(information))
@@ -64,7 +64,7 @@ class Criterion:
         return float(-0.5 * (np.log(axes[-1]) + np.log(np.mean((axes / axes[-1]) ** SHARP)) / SHARP))
 
     def slope(self, information: Floats) -> Floats:
-        """What, times a direction and summed up, is how :meth:`mean` doubled grows along it; 1 along itself."""
+        """Gradient of twice :meth:`smooth_score`, shape (p, p); its inner product with the information is 1."""
         p = len(information)
         size = np.sqrt(np.diag(information))
         whole = np.linalg.inv(information / np.outer(size, size)) / np.outer(size, size)
@@ -79,7 +79,7 @@ class Criterion:
         return np.asarray((lever * weights) @ lever.T).reshape(p, p)
 
     def _inverse(self, information: Floats) -> Floats:
-        """Covariance of the chosen numbers in their units; infinite where there is none."""
+        """Covariance of the parameters of interest in their units; infinite if the information is singular."""
         diagonal = np.diagonal(information, axis1=-2, axis2=-1)
         seen = np.all(diagonal > 0, axis=-1)
         size = np.sqrt(np.where(seen[..., None], diagonal, 1.0))
@@ -94,7 +94,7 @@ class Criterion:
         return np.where(good[..., None, None], inverse, np.inf)
 
 
-#: Sizes that a limit may have, or infinity: of others squares of their quotients are none.
+#: Range of a finite limit. Beyond it squares of ratios overflow.
 SIZES = (1e-50, 1e50)
 
 
@@ -105,11 +105,11 @@ class Bounds:
     Parameters
     ----------
     peaks
-        Largest size of each input.
+        Largest absolute value of each input.
     slews
-        Fastest change of each input, a second; infinite where there is none.
-    swings
-        Largest size of each output; infinite where there is none.
+        Largest rate of change of each input [unit/s]; infinite if unlimited.
+    output_limits
+        Largest absolute value of each output; infinite if unlimited.
     """
 
     peaks: Mapping[str, float]
@@ -117,11 +117,11 @@ class Bounds:
     swings: Mapping[str, float]
 
     def ramp(self, step: float) -> int:
-        """Samples over which a change from one peak to the other has to be spread."""
+        """Number of samples that a change from one peak to the other takes under the slew rates."""
         return max(1, *(math.ceil(min(2 * p / self.slews[n] / step, 1e18) - 1e-9) for n, p in self.peaks.items()))
 
     def scale(self, commands: Floats, moved: Floats) -> float:
-        """Factor, at most 1, by which commands within their peaks keep all outputs within theirs; rows by name."""
+        """Factor, at most 1, that keeps commands and outputs within their limits; rows in the order of names."""
         return min(
             1.0,
             *(
@@ -136,7 +136,7 @@ class Bounds:
 
 
 def by_name(what: str, given: object, names: Sequence[str], default: Mapping[str, float] | None) -> dict[str, float]:
-    """One positive number for all names, or some by name; what is not said is as the default says.
+    """Return one positive number for each name, from a number, a mapping, or the default.
 
     Raises
     ------

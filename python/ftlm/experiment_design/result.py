@@ -1,4 +1,4 @@
-"""What a designed experiment is: its input, what it is predicted to tell, and what binds it."""
+"""Result of an input design: the input, its predicted standard errors and its active constraints."""
 
 from __future__ import annotations
 
@@ -19,15 +19,15 @@ from ftlm.utils.statistics import NORMAL_95
 from ftlm.utils.validation import Floats
 from ftlm.validation.comparison import finite
 
-#: A limit is said to bind from this share of it on.
+#: A limit counts as active from this fraction of it on.
 BINDS = 0.98
-#: Inputs that were tried, of which so many are printed.
+#: Maximum number of candidate inputs in the printed text.
 SHOWN = 6
 
 
 @dataclass(frozen=True)
 class Reached:
-    """How far a signal of the designed run goes, and how far it may; ``slew`` of an input a second."""
+    """Extreme value predicted for a signal of the designed run, and its limit; slew rates are per second."""
 
     name: str
     largest: float
@@ -35,7 +35,7 @@ class Reached:
 
     @property
     def binds(self) -> bool:
-        """Whether the limit decides."""
+        """Whether the constraint is active."""
         return self.largest >= BINDS * self.limit
 
     def __str__(self) -> str:
@@ -45,39 +45,39 @@ class Reached:
 
 @dataclass(frozen=True)
 class DesignedInput:
-    """The input that is predicted to tell a model's numbers best within the limits of a machine.
+    """Input with the smallest predicted confidence intervals within the limits of a machine.
 
     Parameters
     ----------
     run
-        The designed run from rest: commands, held from row to row, and the model's answer to them.
+        Designed run from rest: commands (zero-order hold) and the simulated response of the model.
     reference
-        The square of the same length and peaks, likewise.
+        Run of the reference square wave of the same length and peaks.
     shape
-        How the input came to be, in words.
+        Description of the input.
     criterion
         ``"D"`` or ``"E"``.
-    chosen
-        Numbers that it was designed for.
+    parameters
+        Parameters of interest.
     values
-        Free numbers of the model.
+        Free parameters of the model.
     errors
-        Standard errors by number: ``"now"`` those of the model; ``"square"`` and ``"designed"`` predicted for a fit of
+        Standard errors by name: ``"now"`` those of the model; ``"square"`` and ``"designed"`` predicted for a fit of
         either run alone; ``"both"`` for one of the designed run together with those that the model came from.
     gain
-        How many times smaller the product of the chosen numbers' intervals is than with the square.
+        Ratio of the products of the intervals of these parameters, reference square wave over designed input.
     gains
-        The same of every input that was tried, best first, in the criterion's own measure: of D the volume of the
-        ellipsoid of confidence, of E its widest axis to the power of their count.
-    reached
-        How far inputs, their slews and outputs go, and may go.
+        The same ratio of every candidate input, best first, in the measure of the criterion: for D the volume of the
+        confidence ellipsoid, for E its widest axis to the power of the number of parameters.
+    predicted_extremes
+        Extremes of inputs, slew rates and outputs, with their limits.
     spectrum
         The best periodic input in steady state under the same limits.
     efficiency
-        Precision of the designed input over the most that a periodic input in steady state can have under the limits.
-        A run from rest tells something by its start, too, so that it may exceed 1.
+        Precision of the designed input over the largest one of a periodic input in steady state under the limits.
+        The start from rest adds information, so the ratio may exceed 1.
     warnings
-        What may make predictions wrong.
+        Reasons why predictions may be wrong.
     """
 
     run: Run
@@ -106,17 +106,17 @@ class DesignedInput:
 
     @property
     def intervals(self) -> dict[str, tuple[float, float]]:
-        """95 % intervals that a fit of the designed run alone is predicted to have, around the model's values."""
+        """95 % intervals predicted for a fit of the designed run alone, around the values of the model."""
         errors = self.errors["designed"]
         return {n: (v - NORMAL_95 * errors[n], v + NORMAL_95 * errors[n]) for n, v in self.values.items()}
 
     @property
     def binding(self) -> tuple[str, ...]:
-        """Limits that decide."""
+        """Names of the active constraints."""
         return tuple(r.name for r in self.reached if r.binds)
 
     def save(self, path: str | os.PathLike[str], *, force: bool = False) -> None:
-        """Write the designed run as csv: its commands are what ``ftlm record --input csv --file PATH`` gives a rig.
+        """Write the designed run as csv, the format of ``ftlm record --input csv --file PATH``.
 
         Parameters
         ----------
@@ -133,7 +133,7 @@ class DesignedInput:
         self.run.to_csv(path, force=force)
 
     def to_frame(self) -> Any:
-        """Numbers as a pandas frame: value, standard errors now, with the square, designed, with all runs together."""
+        """Return parameters as a pandas frame: value, and standard errors now and predicted."""
         rows = [
             {"parameter": n, "value": v, **{kind: errors[n] for kind, errors in self.errors.items()}}
             for n, v in self.values.items()
@@ -141,7 +141,7 @@ class DesignedInput:
         return to_frame(rows, ["parameter"])
 
     def to_dict(self) -> dict[str, Any]:
-        """For JSON, without the run."""
+        """Return a JSON-compatible dict without the run."""
         return {
             "shape": self.shape,
             "criterion": self.criterion,

@@ -1,4 +1,4 @@
-"""How the samples of a run move with a model's free numbers, for any input: by what one held sample of it does."""
+"""Sensitivity of outputs to parameters for any input, by superposition of responses to one zero-order-hold sample."""
 
 from __future__ import annotations
 
@@ -20,26 +20,26 @@ from ftlm.structure.order import Order
 from ftlm.utils.linalg import orthonormal, singular
 from ftlm.utils.validation import Complex, Floats
 
-#: Share below which a direction of what offsets do is rounding.
+#: Relative size below which a direction of the offset responses is rounding error.
 ROUNDING = 1e-10
-#: Relative change at which free runs that give sensitivities their level end.
+#: Relative change at which the step refinement of the simulations terminates.
 TOLERANCE = 1e-7
 
 
 @dataclass(frozen=True)
 class Laid:
-    """A model's fit as an experiment sees it: what is free, where it stands, and how loud each output is.
+    """Fit of a model as input design needs it: free parameters, their values, and the noise of each output.
 
     Parameters
     ----------
     model
-        The model, followed from its inputs alone.
+        Model, simulated from its inputs only.
     problem, values
-        Its fit for a run at rest, and its free numbers.
+        Estimation problem of a run at rest, and its free parameters.
     noise
-        Standard deviation of each output's noise.
-    every
-        Pulses a sample interval.
+        Noise standard deviation of each output.
+    refinement
+        Block pulses per sampling interval.
     """
 
     model: Solved
@@ -50,35 +50,35 @@ class Laid:
 
     @classmethod
     def of(cls, model: Solved, noise: Mapping[str, float]) -> Laid:
-        """Of a model that says what was free in its fit."""
+        """Build from a model that records which of its parameters were free."""
         problem, values = problem_of(model)
         whole = replace(model, structure=replace(model.structure, coupling="simulated", initial="rest"))
         return cls(whole, problem, tuple(values), noise, freedom_of(model).refinement)
 
     @property
     def names(self) -> tuple[str, ...]:
-        """Free numbers."""
+        """Names of the free parameters."""
         return tuple(self.problem.names)
 
     @property
     def outputs(self) -> tuple[str, ...]:
-        """Modelled outputs."""
+        """Names of the modeled outputs."""
         return self.problem.structure.outputs
 
     @property
     def inputs(self) -> tuple[str, ...]:
-        """Signals that drive the model as a whole."""
+        """Names of the inputs of the coupled model."""
         return tuple(s for s in self.problem.structure.signals if s not in self.outputs)
 
     @property
     def covariance(self) -> Floats:
-        """Of the free numbers, in their order, as the model's own runs left it."""
+        """Covariance of the free parameters, as estimated from the runs of the model."""
         known = freedom_of(self.model)
         at = [known.names.index(n) for n in self.names]
         return np.asarray(known.covariance)[np.ix_(at, at)]
 
     def run(self, commands: Floats, step: float, name: str) -> Run:
-        """What the model does on commands, a row an input."""
+        """Simulate the model for commands of shape (inputs, rows)."""
         blank = Run.from_arrays(
             step=step,
             inputs=dict(zip(self.inputs, commands, strict=True)),
@@ -90,10 +90,10 @@ class Laid:
         return blank.with_outputs({o: answer[o] for o in self.outputs})
 
     def jacobian(self, run: Run, *, offset: bool = True) -> Floats:
-        """Derivatives of a simulated run's samples over their noise, a row a number, outputs one after another.
+        """Return output sensitivities of a simulated run over the noise, shape (parameters, outputs * samples).
 
-        They are those of the fit itself, from the core and on its grid; the first and the last sample are not compared.
-        Offsets of each run, if the model has some, are projected out unless that is not asked for.
+        They are those of the fit, computed by the core on its grid. The first and the last sample are not compared.
+        Offsets of each run, if the model has any, are projected out unless ``offset`` is False.
         """
         problem = self.problem
         if not offset:
@@ -101,12 +101,12 @@ class Laid:
         return _derivatives(problem, self.values, run, [1.0 / self.noise[o] for o in self.outputs], self.every)
 
     def predicted(self, run: Run) -> Floats:
-        """Covariance of the free numbers that a fit of a simulated run alone would have, by its exact derivatives."""
+        """Return the covariance predicted for a fit of a simulated run alone, from exact derivatives."""
         return _inverse(self.jacobian(run))
 
 
 def _inverse(rows: Floats) -> Floats:
-    """Inverse of the information of derivatives over their noise; infinite variances where a number is not seen."""
+    """Inverse of the information of scaled derivatives; infinite variances if a parameter is not identifiable."""
     size = np.linalg.norm(rows, axis=1)
     scaled = rows / np.where(size > 0, size, 1.0)[:, None]
     _, sizes, right = singular(scaled.T)
@@ -126,25 +126,25 @@ def _derivatives(problem: FreeProblem, values: tuple[float, ...], run: Run, weig
 
 @dataclass(frozen=True)
 class Sensitivities:
-    """What one held sample of each input does, from which what any input does follows by convolution.
+    """Responses to one zero-order-hold sample of each input; those to any input follow by convolution.
 
-    All equations are linear in what drives them and begin at rest, so this is exact: the fit's own derivatives of a run
-    agree to rounding.
+    All equations are linear in their inputs and start at rest, so this is exact: it agrees with the derivatives of the
+    fit to rounding error.
 
     Parameters
     ----------
-    laid
-        The model and its fit.
+    fit
+        Model and its fit.
     step, rows
-        Of the run [s], and its compared rows: all but the last.
+        Sampling interval of the run [s], and its number of compared samples: all but the last.
     ramp
-        Samples over which a command changes: every input is a moving average of so many samples.
+        Samples over which a command changes: every input is a moving average over that many samples.
     kernels
-        Derivatives over the noise, shape (inputs, numbers, outputs, rows).
-    answers
+        Derivatives over the noise, shape (inputs, parameters, outputs, rows).
+    responses
         Outputs, shape (inputs, outputs, rows).
     nuisance
-        Orthonormal rows of what offsets of the run can do, shape (so many, outputs · rows).
+        Orthonormal basis of the responses to offsets of the run, shape (basis vectors, outputs · rows).
     """
 
     laid: Laid
@@ -157,7 +157,7 @@ class Sensitivities:
 
     @classmethod
     def of(cls, laid: Laid, step: float, rows: int, ramp: int) -> Sensitivities:
-        """Let a pulse of each input act on the model."""
+        """Simulate the response to one sample of each input."""
         kernels, answers, inputs = [], [], len(laid.inputs)
         for k in range(inputs):
             # The first sample of a run is not compared, so the pulse comes with the second.
@@ -172,27 +172,27 @@ class Sensitivities:
 
     @cached_property
     def length(self) -> int:
-        """Points of a transform that holds a convolution whole."""
+        """Length of the Fourier transform that avoids circular convolution."""
         return fast_length(2 * self.rows)
 
     @cached_property
     def spectra(self) -> tuple[Complex, Complex]:
-        """Transforms of the kernels and of the answers."""
+        """Fourier transforms of the kernels and of the responses."""
         return np.fft.rfft(self.kernels, self.length), np.fft.rfft(self.answers, self.length)
 
     def derivatives(self, commands: Floats) -> Floats:
-        """Derivatives over the noise, shape (numbers, outputs, rows), of commands of shape (inputs, rows)."""
+        """Derivatives over the noise, shape (parameters, outputs, rows), for commands of shape (inputs, rows)."""
         drive = np.fft.rfft(commands, self.length)
         total = np.einsum("ipof,if->pof", self.spectra[0], drive)
         return np.asarray(np.fft.irfft(total, self.length)[..., : self.rows])
 
     def moved(self, commands: Floats) -> Floats:
-        """Outputs, shape (outputs, rows)."""
+        """Outputs of the model, shape (outputs, rows), for commands of shape (inputs, rows)."""
         total = np.einsum("iof,if->of", self.spectra[1], np.fft.rfft(commands, self.length))
         return np.asarray(np.fft.irfft(total, self.length)[..., : self.rows])
 
     def information(self, derivatives: Floats) -> Floats:
-        """Fisher information of the free numbers, offsets of the run projected out."""
+        """Fisher information of the free parameters, with offsets of the run projected out."""
         flat = derivatives.reshape(len(derivatives), -1)
         told = flat @ flat.T
         if len(self.nuisance):
@@ -201,7 +201,7 @@ class Sensitivities:
         return np.asarray(told)
 
     def written(self, commands: Floats) -> Floats:
-        """What a rig is given, shape (inputs, rows + 1): ramps over a change, and a last row that nothing shows."""
+        """Commands for a rig, shape (inputs, rows + 1): changes as ramps, and a last row of zeros."""
         total = np.cumsum(commands, axis=1)
         before = np.pad(total, ((0, 0), (self.ramp, 0)))[:, : self.rows]
         smooth = commands if self.ramp == 1 else (total - before) / self.ramp
@@ -209,7 +209,7 @@ class Sensitivities:
 
 
 def _offsets(laid: Laid, step: float, rows: int) -> Floats:
-    """What unknown constants (and ramps) in the equations of one run do to its samples over their noise."""
+    """Responses, over the noise, to unknown constants (and ramps) in the equations of one run."""
     structure = laid.problem.structure
     drives = {"none": 0, "constant": 1, "ramp": 2}.get(structure.offset)
     if drives is None:
@@ -243,5 +243,5 @@ def _offsets(laid: Laid, step: float, rows: int) -> Floats:
 
 
 def fast_length(least: int) -> int:
-    """The least 2^a, 3·2^a, 5·2^a or 15·2^a from there on: transforms of such lengths are quick."""
+    """Smallest 2^a, 3·2^a, 5·2^a or 15·2^a that is at least ``least``: a fast length of a Fourier transform."""
     return min(f << max((least - 1) // f, 0).bit_length() for f in (1, 3, 5, 15))

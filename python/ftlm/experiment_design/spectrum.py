@@ -1,4 +1,4 @@
-"""The best spectrum of a periodic input: a convex problem, its optimum certified by the equivalence theorem."""
+"""Optimal spectrum of a periodic input: a convex problem whose optimum the equivalence theorem certifies."""
 
 from __future__ import annotations
 
@@ -14,27 +14,27 @@ from ftlm.experiment_design.sensitivity import Laid
 from ftlm.model.model import Solved
 from ftlm.utils.validation import Complex, Floats
 
-#: Most lines of a spectrum: between so many, information changes little.
+#: Maximum number of lines of a spectrum. Information changes little between neighboring lines.
 LINES = 240
-#: Highest line, as a share of the sampling frequency.
+#: Highest line, as a fraction of the sampling frequency.
 HIGHEST = 0.25
-#: Rounds of the algorithm with limits priced as they are, and prices found.
+#: Maximum number of weight iterations at fixed prices of the limits, and of price updates.
 ROUNDS, PRICES = 60, 40
-#: A design this close to the optimum, as a share of its precision, is one.
+#: Relative gap in precision at which a design counts as optimal.
 CLOSE = 1e-3
 
 
 @dataclass(frozen=True)
 class Lines:
-    """What a unit of power at each line of each input says, and what it costs of each limit.
+    """Information and use of each limit, per unit of power at each line of each input.
 
     Parameters
     ----------
     frequencies
-        Of the lines [Hz].
+        Frequencies of the lines [Hz].
     information
-        Shape (points, numbers, numbers): points are lines of the first input, then of the next, each at the mean square
-        of its peak.
+        Shape (points, parameters, parameters): points are lines of the first input, then of the next, each at the mean
+        square of its peak.
     costs
         Shape (limits, points): share of each limit's square that a point uses up, inputs first.
     """
@@ -46,18 +46,18 @@ class Lines:
 
 @dataclass(frozen=True)
 class Spectrum:
-    """The best distribution of power.
+    """Optimal distribution of power over lines.
 
     Parameters
     ----------
     lines
-        Of which points.
+        Lines of all inputs.
     power
         Mean square of each point, in units of its input's peak squared; within all limits.
     score
-        What it says.
+        Value of the criterion.
     bound
-        What no periodic input within the limits says more than.
+        Upper bound of the criterion over all periodic inputs within the limits.
     """
 
     lines: Lines
@@ -67,12 +67,12 @@ class Spectrum:
 
     @property
     def gap(self) -> float:
-        """Share of precision by which a better one may beat this one, at most."""
+        """Upper bound of the relative gain in precision of any better spectrum."""
         return math.expm1(self.bound - self.score)
 
 
 def lines_of(laid: Laid, bounds: Bounds, step: float, rows: int) -> Lines:
-    """Lines of a run that is one period, shared out among inputs so that no two have one."""
+    """Lines of a run that is one period, distributed among inputs so that no two share a line."""
     inputs = laid.inputs
     most = max(int(HIGHEST * rows), len(inputs) + 1)
     numbers = np.unique(np.round(np.geomspace(1, most, LINES * 4)).astype(np.int64))
@@ -100,7 +100,7 @@ def lines_of(laid: Laid, bounds: Bounds, step: float, rows: int) -> Lines:
 
 
 def _responses(laid: Laid, w: Floats, step: float) -> tuple[Complex, Complex]:
-    """Derivatives of the outputs' responses to held inputs, (outputs, inputs, W, numbers), and the responses."""
+    """Derivatives (outputs, inputs, W, parameters) of frequency responses to zero-order-hold inputs, and these."""
     held = np.exp(-0.5j * w * step) * np.sinc(w * step / (2 * math.pi))
     gains = frequency_response(laid.model, w)
     coupling = laid.problem.structure.coupling
@@ -133,7 +133,7 @@ def _responses(laid: Laid, w: Floats, step: float) -> tuple[Complex, Complex]:
 
 
 def _driven(model: Solved, w: Floats, coupling: str, drives: Complex, signals: Sequence[str]) -> Complex:
-    """What the outputs do, where equations follow together or are driven by what the others did."""
+    """Output responses for simulated coupling, or for measured coupling with given responses of the other signals."""
     if coupling == "simulated":
         return frequency_response(model, w)
     alone = frequency_response(model, w, coupling="measured")
@@ -144,11 +144,12 @@ def _driven(model: Solved, w: Floats, coupling: str, drives: Complex, signals: S
 
 
 def best_spectrum(lines: Lines, criterion: Criterion) -> Spectrum:
-    """The best share of power of each line under all limits.
+    """Optimal power of each line under all limits.
 
-    With a price for each limit the problem is one of weights that sum to one, which Titterington's multiplicative
-    algorithm solves (Silvey, Titterington & Torsney, 1978); whatever the prices, its optimum is above that of limits
-    themselves, and Kiefer & Wolfowitz's theorem says how far from it a design is at most. Prices follow what is used.
+    With a price for each limit the problem is one of weights that sum to one, solved by Titterington's multiplicative
+    algorithm (Silvey, Titterington & Torsney, 1978). For any prices its optimum is an upper bound of the original
+    problem, and the equivalence theorem of Kiefer & Wolfowitz bounds the distance of a design from it. Prices follow
+    the use of the limits.
     """
     limits, points = lines.costs.shape
     price = np.full(limits, 1.0 / limits)
@@ -185,7 +186,7 @@ def best_spectrum(lines: Lines, criterion: Criterion) -> Spectrum:
 
 
 def _gains(weights: Floats, told: Floats, criterion: Criterion) -> Floats | None:
-    """How much a little more power at each point adds, 1 on average; None where nothing tells the chosen numbers."""
+    """Derivative of the criterion with respect to the power of each point, 1 on average; None if not identifiable."""
     total = np.tensordot(weights, told, 1)
     if not np.isfinite(criterion.score(total)):
         return None

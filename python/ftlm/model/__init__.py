@@ -1,1 +1,1 @@
-"""The model that people hold, its file and its typesetting."""
+"""Models, their files and their typesetting."""

@@ -168,22 +168,22 @@ def check_solved(model: object) -> None:
 
 
 class Model(Solved):
-    """A structure whose orders and coefficients are numbers.
+    """Structure with numerical orders and coefficients.
 
     Parameters
     ----------
     structure
-        The structure, nothing free.
+        Structure without free parameters.
     orders
-        Free orders by name, as they were found.
+        Estimated values of the free orders by name.
     units
         SI units of the signals, where known.
     m
-        Number of block pulses on which the model was identified and is compared by default.
+        Number of block pulses of the identification, the default of comparisons.
     about
-        How the model came to be, for people.
+        Metadata about the origin of the model.
     estimate
-        Standard errors, covariance and warnings of the identification; None for a model that was written down.
+        Standard errors, covariance and warnings of the identification; None for a model defined by hand.
     """
 
     def simulate(
@@ -194,19 +194,19 @@ class Model(Solved):
         initial: Mapping[str, Mapping[float, float]] | None = None,
         largest_m: int = 1 << 22,
     ) -> Run:
-        """Free run on a run's inputs; see :func:`ftlm.simulate`."""
+        """Simulate the outputs from the inputs of a run; see :func:`ftlm.simulate`."""
         from ftlm.simulation.simulate import simulate
 
         return simulate(self, run, tolerance=tolerance, initial=initial, largest_m=largest_m)
 
     def compare(self, runs: Run | Sequence[Run], *, m: int | None = None) -> Comparison:
-        """Both errors on measured runs; see :func:`ftlm.compare`."""
+        """Compare with measured runs by equation error and output error; see :func:`ftlm.compare`."""
         from ftlm.validation.comparison import compare
 
         return compare(self, runs, m=m)
 
     def resid(self, runs: Run | Sequence[Run], *, lags: int = 25) -> Residuals:
-        """Whiteness of the residuals and their independence of the inputs; see :func:`ftlm.resid`."""
+        """Test residuals for whiteness and independence of the inputs; see :func:`ftlm.resid`."""
         from ftlm.validation.residual_tests import resid
 
         return resid(self, runs, lags=lags)
@@ -227,7 +227,7 @@ class Model(Solved):
         return step_response(self, time, tolerance=tolerance)
 
     def stability(self, *, coupling: str = "simulated") -> Stability:
-        """Whether the model is stable, and why not; see :func:`ftlm.analysis.stability`."""
+        """Test stability, with the reason for instability; see :func:`ftlm.analysis.stability`."""
         from ftlm.analysis.poles import stability
 
         return stability(self, coupling=coupling)
@@ -243,7 +243,7 @@ class Model(Solved):
         return poles(self, coupling=coupling)
 
     def modes(self, *, coupling: str = "simulated") -> tuple[Mode, ...]:
-        """Frequency, damping and time constant of every pole, whatever the orders; see :func:`ftlm.analysis.modes`."""
+        """Frequency, damping and time constant of every pole, for any orders; see :func:`ftlm.analysis.modes`."""
         from ftlm.analysis.poles import modes
 
         return modes(self, coupling=coupling)
@@ -255,12 +255,12 @@ class Model(Solved):
         return dcgain(self)
 
     def step(self, time: ArrayLike | None = None) -> Answer:
-        """Response to unit steps from rest, with its uncertainty: a record that prints and draws itself in a notebook.
+        """Response to unit steps from rest with its standard deviation, plotted in notebooks.
 
         Parameters
         ----------
         time
-            Regular instants from 0 [s], at least 3; by default until the model has settled.
+            Regular sample times from 0 [s], at least 3; by default until the response has settled.
 
         Returns
         -------
@@ -270,29 +270,29 @@ class Model(Solved):
         Raises
         ------
         DataError
-            Instants that are not regular from 0.
+            Sample times that are not regular from 0.
         ModelError
-            An input that saturates or has a dead zone.
+            An input with saturation or dead zone.
         ConvergenceError
-            A model so unstable that the response leaves the range of numbers.
+            An unstable model whose response overflows.
         """
         from ftlm.plot.model_charts import answer
 
         return answer(self, time, "step")
 
     def impulse(self, time: ArrayLike | None = None) -> Answer:
-        """Response to unit impulses, as the mean over each interval of the instants; else as :meth:`step`."""
+        """Response to unit impulses, averaged over each sampling interval; otherwise as :meth:`step`."""
         from ftlm.plot.model_charts import answer
 
         return answer(self, time, "impulse")
 
     def bode(self, w: ArrayLike | None = None) -> Bode:
-        """Gain and phase with 95 % bands: a record that prints and, in a notebook, draws itself.
+        """Gain and phase with 95 % bands, plotted in notebooks.
 
         Parameters
         ----------
         w
-            Angular frequencies [rad/s]; by default around the model's own.
+            Angular frequencies [rad/s]; by default around the corner frequencies of the model.
 
         Returns
         -------
@@ -304,7 +304,7 @@ class Model(Solved):
         DataError
             Frequencies that are not finite numbers from 0.
         ModelError
-            An input that saturates or has a dead zone.
+            An input with saturation or dead zone.
         """
         from ftlm.plot.model_charts import bode
 
@@ -314,28 +314,28 @@ class Model(Solved):
     def from_control(
         cls, system: Any, *, inputs: Sequence[str] | None = None, outputs: Sequence[str] | None = None
     ) -> Model:
-        """A continuous system of python-control as a model of whole orders, one equation an output.
+        """Convert a continuous system of python-control to a model of integer orders, one equation per output.
 
         Parameters
         ----------
         system
-            ``control.StateSpace`` or ``control.TransferFunction``. Equations show transfer behaviour: what no input
-            reaches, or no output shows, cancels in them only if it cancels exactly there.
+            ``control.StateSpace`` or ``control.TransferFunction``. Equations represent the transfer behavior.
+            Uncontrollable or unobservable parts cancel only if they cancel exactly.
         inputs, outputs
             Names of the signals; default the system's own, ``u[0]`` as ``u``, or ``u0`` beside others.
 
         Raises
         ------
         ModelError
-            A sampled system, one of another kind, an output without dynamics or input, more zeros than poles, an order
-            above 10, names that are none or too few.
+            A discrete-time system, another type, an output without dynamics or input, more zeros than poles, an order
+            above 10, invalid or too few names.
         """
         from ftlm.analysis.conversion import structure_of
 
         return cls(structure_of(system, inputs, outputs))
 
     def to_control(self, *, band: tuple[float, float], order: int = 5) -> Any:
-        """A python-control system by Oustaloup's approximation; see :func:`ftlm.analysis.to_control`."""
+        """Convert to python-control by Oustaloup's approximation; see :func:`ftlm.analysis.to_control`."""
         from ftlm.analysis.rational_approximation import to_control
 
         return to_control(self, band=band, order=order)
@@ -374,17 +374,17 @@ def load_model(path: str | os.PathLike[str]) -> Model:
     Parameters
     ----------
     path
-        The file.
+        File to read.
 
     Returns
     -------
     Model
-        The same to the last bit, without what is of use only before identification (lattices, laws, references).
+        Bit-identical model, without data that only identification needs (order grids, laws, references).
 
     Raises
     ------
     DataError
-        No such file, a file that is no model (with the place), one of a later schema, or one above 1 MiB.
+        A file that does not exist, is no model (with the place), has a later schema, or exceeds 1 MiB.
     """
     from ftlm.model.serialization import read_model
 

@@ -1,4 +1,4 @@
-"""The file of a model: what stands in it, and how it is read and written."""
+"""Model file: JSON schema, reading and writing."""
 
 from __future__ import annotations
 
@@ -20,14 +20,13 @@ from ftlm.structure.structure import Offset, Structure, check_initial
 from ftlm.utils.files import Saved, write_atomically
 from ftlm.utils.validation import words_of
 
-#: Schema of a model that every version since the first reads, of one that has an offset, of one that has intervals by
-#: profile likelihood or whose sensor filter names what is no output, of one that has friction, of one whose inputs have
-#: limits, of one whose friction falls with speed, and of one that says what was free in its fit or what spoke against.
+#: Schema versions: base, offset, profile likelihood intervals or sensor filters of signals that are no outputs,
+#: friction, input nonlinearities, Stribeck friction, free parameters and findings of the fit.
 SCHEMA, OFFSET_SCHEMA, PROFILE_SCHEMA, FRICTION_SCHEMA, LIMIT_SCHEMA, STRIBECK_SCHEMA, FIT_SCHEMA = 2, 3, 4, 5, 6, 7, 8
 
 
 class TermFile(msgspec.Struct, forbid_unknown_fields=True):
-    """A term: coefficient is its number without the factor, name what it was called while it was free."""
+    """Term of an equation: coefficient without its factor, name of the free parameter it was."""
 
     signal: str
     order: float
@@ -37,7 +36,7 @@ class TermFile(msgspec.Struct, forbid_unknown_fields=True):
 
 
 class StribeckFile(msgspec.Struct, forbid_unknown_fields=True):
-    """What friction has more near rest: coefficient is its number without the factor, speed that at which it falls."""
+    """Stribeck part of a friction: coefficient without its factor, speed of its decay."""
 
     coefficient: float
     speed: float
@@ -47,7 +46,7 @@ class StribeckFile(msgspec.Struct, forbid_unknown_fields=True):
 
 
 class FrictionFile(msgspec.Struct, forbid_unknown_fields=True):
-    """Friction of an equation's own output: coefficient is Coulomb's number without the factor."""
+    """Friction of an equation's output: Coulomb coefficient without its factor."""
 
     coefficient: float
     factor: float = -1.0
@@ -56,7 +55,7 @@ class FrictionFile(msgspec.Struct, forbid_unknown_fields=True):
 
     @classmethod
     def of(cls, rubs: Friction) -> FrictionFile:
-        """Write friction."""
+        """Convert a friction to its file form."""
         out, near = cls(float(rubs.coefficient), rubs.factor, rubs.name), rubs.stribeck
         if near is not None:
             more = StribeckFile(float(near.coefficient), float(near.speed), near.factor, near.name, near.speed_name)
@@ -64,19 +63,19 @@ class FrictionFile(msgspec.Struct, forbid_unknown_fields=True):
         return out
 
     def friction(self) -> Friction:
-        """Give the friction back."""
+        """Return the friction."""
         s = self.stribeck
         near = UNSET if s is UNSET else Stribeck(s.coefficient, s.speed, s.factor, s.name, s.speed_name)
         return Friction(self.coefficient, self.factor, self.name, near)
 
     @property
     def count(self) -> int:
-        """Numbers of it."""
+        """Number of parameters."""
         return 1 if self.stribeck is UNSET else 3
 
 
 class LimitFile(msgspec.Struct, forbid_unknown_fields=True):
-    """A saturation or a dead zone of an input, in its unit."""
+    """Saturation or dead zone of an input, in its unit."""
 
     signal: str
     law: LimitLaw
@@ -84,7 +83,7 @@ class LimitFile(msgspec.Struct, forbid_unknown_fields=True):
 
 
 class EquationFile(msgspec.Struct, forbid_unknown_fields=True):
-    """An equation whose orders are numbers."""
+    """Equation with numerical orders."""
 
     output: str
     order: float
@@ -93,32 +92,32 @@ class EquationFile(msgspec.Struct, forbid_unknown_fields=True):
 
     @classmethod
     def of(cls, item: Equation) -> EquationFile:
-        """Write an equation."""
+        """Convert an equation to its file form."""
         terms = [TermFile(t.signal, t.order.constant, float(t.coefficient), t.factor, t.name) for t in item.terms]
         friction = UNSET if item.friction is None else FrictionFile.of(item.friction)
         return cls(item.output, item.order.constant, terms, friction)
 
     def equation(self) -> Equation:
-        """Give the equation back."""
+        """Return the equation."""
         terms = tuple(Term(t.signal, Order(t.order), t.coefficient, t.factor, t.name) for t in self.terms)
         rubs = UNSET if self.friction is UNSET else self.friction.friction()
         return Equation(self.output, Order(self.order), terms, rubs)
 
     @property
     def count(self) -> int:
-        """Numbers of it, as a covariance has them."""
+        """Number of parameters, as in a covariance."""
         return 1 + 2 * len(self.terms) + (0 if self.friction is UNSET else self.friction.count)
 
     @property
     def friction_schema(self) -> int:
-        """Schema that its friction needs."""
+        """Schema version that the friction needs."""
         if self.friction is UNSET:
             return SCHEMA
         return FRICTION_SCHEMA if self.friction.stribeck is UNSET else STRIBECK_SCHEMA
 
 
 class FilterFile(msgspec.Struct, forbid_unknown_fields=True):
-    """A sensor filter: of outputs alone, as every version reads it, or of any signals."""
+    """Sensor filter of outputs, which every version reads, or of any signals."""
 
     numerator: tuple[tuple[float, float], ...]
     denominator: tuple[tuple[float, float], ...]
@@ -127,7 +126,7 @@ class FilterFile(msgspec.Struct, forbid_unknown_fields=True):
 
     @classmethod
     def of(cls, structure: Structure) -> FilterFile | None:
-        """Write the sensor filter of a structure, if it has one."""
+        """Convert the sensor filter of a structure; None without one."""
         sensor = structure.sensor_filter
         if sensor is None:
             return None
@@ -136,10 +135,10 @@ class FilterFile(msgspec.Struct, forbid_unknown_fields=True):
         return cls(sensor.numerator, sensor.denominator, signals=sensor.signals)
 
     def sensor(self, *, followed: Collection[str]) -> SensorFilter | None:
-        """Give the filter back; ``followed`` are the outputs of equations that act together, else empty.
+        """Return the sensor filter; ``followed`` are the outputs of coupled equations, else empty.
 
-        A filter of outputs filtered those that follow together, and where none do whatever it named; an input that it
-        named beside the former did not count.
+        A filter of outputs applies to the coupled outputs, or without coupling to every signal it names. An input named
+        beside coupled outputs is ignored.
         """
         if isinstance(self.signals, UnsetType) == isinstance(self.outputs, UnsetType):
             raise ModelError("its sensor filter has neither signals nor outputs, or both; one of them names them")
@@ -151,7 +150,7 @@ class FilterFile(msgspec.Struct, forbid_unknown_fields=True):
 
 
 class ModelFile(msgspec.Struct, forbid_unknown_fields=True):
-    """A model, without what is of use only before identification."""
+    """Model without data that only identification needs."""
 
     format: Literal["ftlm-model"]
     schema: int
@@ -171,9 +170,9 @@ class ModelFile(msgspec.Struct, forbid_unknown_fields=True):
 
     @classmethod
     def of(cls, model: Solved) -> ModelFile:
-        """Write a model."""
+        """Convert a model to its file form."""
         s = model.structure
-        # Written only where there is one, so that what has none is as it was.
+        # Absent fields are omitted, so that files of older structures do not change.
         offset: Offset | UnsetType = UNSET if s.offset == "none" else s.offset
         sensor = FilterFile.of(s)
         known = [(limit, limit.value) for limit in s.limits]
@@ -198,12 +197,12 @@ class ModelFile(msgspec.Struct, forbid_unknown_fields=True):
         )
 
     def solved(self) -> Solved:
-        """Give the record of the model back.
+        """Return the model record.
 
         Raises
         ------
         ModelError
-            Equations that are none, or a covariance of another size than they need.
+            Invalid equations, or a covariance of the wrong size.
         """
         followed = [e.output for e in self.equations] if self.coupling == "simulated" else []
         sensor = None if self.sensor_filter is None else self.sensor_filter.sensor(followed=followed)
@@ -225,7 +224,7 @@ class ModelFile(msgspec.Struct, forbid_unknown_fields=True):
         return Solved(structure, self.orders, self.units, self.m, self.about, self.estimate)
 
 
-#: A model is a few kilobytes.
+#: Model files have a few kilobytes; the default size limit suffices.
 MODEL = Saved("model", "a file written by save()", ModelFile, FIT_SCHEMA)
 
 
@@ -236,7 +235,7 @@ def schema_of(
     sensor: FilterFile | None,
     estimate: Estimate | None,
 ) -> int:
-    """Schema of a model: the least that has all of it, so that what has less is as it was."""
+    """Smallest schema version that contains all parts of a model, so that older files do not change."""
     profiled = estimate is not None and estimate.intervals is not UNSET
     doubted = estimate is not None and estimate.against is not UNSET
     named = sensor is not None and not isinstance(sensor.signals, UnsetType)
@@ -257,7 +256,7 @@ def write_model(model: Solved, path: str | os.PathLike[str], *, force: bool) -> 
 
 
 def read_model(path: str | os.PathLike[str]) -> Solved:
-    """Read the record of a model; the errors are those of :func:`ftlm.load_model`."""
+    """Read a model record; raises as :func:`ftlm.load_model`."""
     read = MODEL.read(path)
     of = schema_of(read.equations, read.limits, read.offset, read.sensor_filter, read.estimate)
     MODEL.check_schema(path, read, of)

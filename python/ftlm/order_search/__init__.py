@@ -1,1 +1,1 @@
-"""Order searches: rounds, stores, executors, tables."""
+"""Order search: exhaustive search over a grid, checkpoints, executors, certificates."""

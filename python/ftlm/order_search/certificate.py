@@ -1,4 +1,4 @@
-"""What is proved of all orders in some intervals, not of those of a lattice alone."""
+"""Certificate of an order search: lower bound of the equation error over all orders of an interval."""
 
 from __future__ import annotations
 
@@ -18,12 +18,12 @@ from ftlm.structure.structure import Structure
 from ftlm.utils.resources import memory_limit
 from ftlm.utils.validation import check_threads, real_number, whole_number
 
-#: How much better than the best found other orders may be, and boxes of orders after which a proof ends.
+#: Default tolerance of the certificate relative to the best equation error found, and maximum number of boxes.
 WITHIN = 0.05
 CELLS = 20_000_000
-#: How large an equation's terms may be beside the output: larger ones cancel but for a hundredth.
+#: Default maximum RMS size of an equation's terms relative to the output. Larger terms cancel to within a hundredth.
 LARGEST = 100.0
-#: What a certificate is of, as settings of an order search.
+#: Settings of an order search for which a certificate exists.
 PROVED: dict[str, Any] = {"criterion": "equation-error", "norm": "l2", "coefficients": "least-squares"}
 _WAY_OUT = (
     "rank by squared equation errors with least-squares coefficients (criterion='equation-error', norm='l2', "
@@ -44,11 +44,12 @@ def certify_orders(
     threads: int | None = None,
     progress: Callable[[int, int], None] | None = None,
 ) -> OrderCertificate:
-    """Prove that no orders in the intervals of a lattice, on it or between, have a much smaller equation error.
+    """Certify that no orders in the intervals of an order grid, on it or between, have a much smaller equation error.
 
-    Boxes of orders are halved until each is proved to leave, with the coefficients that suit each of its orders best,
-    an RMS equation error of at least the best one found times ``1 - within``. What is proved is of the equation error
-    in squares, of equations at rest and of coefficients that are all free; of free runs no such certificate is known.
+    Branch and bound halves boxes of orders until each has a lower bound of the RMS equation error, with the best
+    coefficients of each of its orders, of at least the best one found times ``1 - within``. The certificate covers
+    squared equation errors, equations at rest, and free coefficients only. No such certificate is known for
+    simulations.
 
     Parameters
     ----------
@@ -57,28 +58,28 @@ def certify_orders(
     equation
         One equation with free orders.
     lattice
-        Its intervals count; the values between do not.
+        Order grid. Only the ends of its intervals are used.
     within
-        How much better than the best that is found other orders may be, as a share below 1.
+        Tolerance: how much smaller than the best error found that of other orders may be, as a fraction below 1.
     apart
-        How far orders of the output stay below its highest one, and orders of one signal from one another: where they
-        meet, every equation is fulfilled. By default the step of the lattice.
+        Minimum distance of orders of the output from its highest one, and of orders of one signal from one another.
+        At distance 0 every equation is trivially satisfied. Default: the increment of the order grid.
     largest
-        How many times the RMS size of the output those of an equation's terms may have together. Beyond, terms that
-        cancel are told from nothing by nothing.
+        Maximum RMS size of all terms of an equation together, relative to that of the output. Larger terms that
+        cancel one another are not identifiable.
     cells
-        Boxes of orders after which the proof ends with what it has.
+        Maximum number of boxes of orders; then the bound reached so far is returned.
     m
-        Block pulses a run; default 2 048, or what the runs carry.
+        Block pulses per run; default 2 048, or as many as the runs support.
     threads
-        Threads; default all cores.
+        Number of threads; default all cores.
     progress
-        Called about twenty times a second with (boxes done, boxes known of so far): halves are added as they come.
+        Called about twenty times a second with (boxes done, boxes so far).
 
     Returns
     -------
     OrderCertificate
-        What is proved, which may be less than was asked for, and says so.
+        Lower bound and achieved tolerance, which may be larger than the requested one.
 
     Raises
     ------
@@ -105,7 +106,7 @@ def certify_orders(
 
 
 def check_certifiable(job: Job, within: float) -> None:
-    """Refuse a certificate of what nothing is proved of, or of no share."""
+    """Raise ModelError if no certificate exists for a search, or the tolerance is out of range."""
     _check_within(within)
     for name, value in PROVED.items():
         given = getattr(job.settings, name)
@@ -144,7 +145,7 @@ def certify_job(
     cells: int = CELLS,
     progress: Callable[[int, int], None] | None = None,
 ) -> OrderCertificate:
-    """Prove it of a search that is ready; see :func:`certify_orders`."""
+    """Certify a prepared search; see :func:`certify_orders`."""
     check_certifiable(job, within)
     record, item = job.records[0], job.structure.equations[0]
     intervals = {name: (min(values), max(values)) for name, values in job.values.items()}
@@ -178,7 +179,7 @@ def certify_job(
 def _region(
     item: Equation, intervals: dict[str, tuple[float, float]], signals: Sequence[str]
 ) -> tuple[int, tuple[float, float], list[tuple[int, float, float]]]:
-    """Output, interval of its order, and signal and interval of each term, as the core takes them."""
+    """Output, interval of its order, and signal and interval of each term, as arguments of the core."""
 
     def interval(order: Any) -> tuple[float, float]:
         return intervals[order.names[0]] if order.names else (order.constant, order.constant)

@@ -1,4 +1,4 @@
-"""Frames of a search store: what each holds, and the bytes around it."""
+"""Frames (records) of a search checkpoint file: payloads and encoding."""
 
 from __future__ import annotations
 
@@ -30,38 +30,38 @@ from ftlm.utils.files import write_atomically
 MAGIC = b"ftlm search store 1\n"
 HEAD = struct.Struct("<II")
 DIGEST = 16
-#: Number of the algorithm that rounds follow; rounds of different ones must not be joined.
+#: Version of the search algorithm. Rounds of different versions must not be joined.
 ALGORITHM = 5
-#: Earlier ones whose half-finished stores go on where the rounds of a search have not changed since: 2 screens lattices
-#: of 2²⁵ candidates and more in boxes and in longer rounds, 3 in sharper boxes and by squared equation errors too, 4
-#: proves free runs of 2¹⁸ candidates and more closely, 5 bounds free runs by coefficients that cancel and lays boxes by
-#: the coefficients of all of their candidates; all leave the others as they were.
+#: Earlier versions whose partial searches can be resumed if the rounds of the search are the same in both versions.
+#: Version 2 excludes boxes on grids of 2²⁵ candidates or more, with longer rounds. Version 3 has sharper boxes, also
+#: for squared equation errors. Version 4 has tighter bounds of simulations from 2¹⁸ candidates on. Version 5 bounds
+#: simulations by coefficients that cancel, and constructs boxes by the coefficients of all of their candidates.
 CONTINUED = (1, 2, 3, 4)
-#: Largest payload: a table of 100 000 rows of many coefficients is far below.
+#: Maximum payload [bytes]; a table of 100 000 rows with many coefficients is far smaller.
 MAX_PAYLOAD = 1 << 30
 Natural = Annotated[int, msgspec.Meta(ge=0, le=(1 << 63) - 1)]
 Row = tuple[Natural, float, tuple[float, ...], tuple[tuple[float, ...], ...]]
-#: Candidates, kept, beaten, bounded, stopped early, singular, diverged; of the bounded those in boxes, if any.
+#: Counts: candidates, kept, beaten, bounded, stopped early, singular, diverged; of the bounded those in boxes, if any.
 Counts = Annotated[tuple[Natural, ...], msgspec.Meta(min_length=7, max_length=8)]
 Failures = tuple[tuple[Natural, bool], ...]
 #: Rows (index, raw score, coefficients, initial terms by record), counts, failures (index, whether diverged).
 Part = tuple[tuple[Row, ...], Counts, Failures]
 #: Round, candidates followed, end and length of the batch, its limit.
 Place = tuple[Natural, Natural, Natural, Natural, float]
-#: Where to go on with a stretch half done, with the digest of the visiting order, and whether it was begun anew.
+#: Point of resumption of a partial block with the digest of the visiting order, whether it was restarted, and its part.
 Checkpoint = tuple[tuple[Natural, Natural, Natural, Natural, float, Natural], bool, Part]
-#: Equation, first candidate, the one behind the last, limit.
+#: Equation, first candidate, end (exclusive), limit.
 Span = tuple[int, int, int, float]
-#: What candidates under an order law came to: values and kinds (see :class:`Verdicts`).
+#: Results of candidates under an order law: values and kinds (see :class:`Verdicts`).
 Outcomes = tuple[bytes, bytes]
 
 
-#: Most free motions of a sensor filter that a record may hold.
+#: Maximum number of initial states of a sensor filter in a record.
 MAX_STATES = 10
 
 
 class RecordFile(msgspec.Struct, frozen=True, forbid_unknown_fields=True, omit_defaults=True):
-    """A record: pulse means as little-endian doubles, row by row; an offset is written where there is one."""
+    """Record on file: pulse means as little-endian doubles, row by row; an offset is written only if present."""
 
     signals: tuple[str, ...]
     step: float
@@ -75,7 +75,7 @@ class RecordFile(msgspec.Struct, frozen=True, forbid_unknown_fields=True, omit_d
 
     @classmethod
     def of(cls, record: Record) -> RecordFile:
-        """Write a record."""
+        """Serialize a record."""
         sensor = None if record.sensor is None else np.ascontiguousarray(record.sensor, "<f8").tobytes()
         rows, m = record.means.shape
         means = np.ascontiguousarray(record.means, "<f8").tobytes()
@@ -92,7 +92,7 @@ class RecordFile(msgspec.Struct, frozen=True, forbid_unknown_fields=True, omit_d
         )
 
     def record(self) -> Record:
-        """Give the record back, or refuse sizes that do not fit one another."""
+        """Deserialize the record; raise ModelError if its sizes are inconsistent."""
         rows, m = self.shape
         sizes = (len(self.signals), len(self.inputs), len(self.means))
         if rows < 1 or m < 1 or sizes != (rows, rows, 8 * rows * m) or len(self.sensor or b"") % 8:
@@ -107,7 +107,7 @@ class RecordFile(msgspec.Struct, frozen=True, forbid_unknown_fields=True, omit_d
 
 
 class Request(msgspec.Struct, frozen=True, forbid_unknown_fields=True):
-    """One search: what it is computed from, and what its result is called."""
+    """Definition of one search: its data and settings, and the name of its result."""
 
     name: str
     structure: Structure
@@ -118,7 +118,7 @@ class Request(msgspec.Struct, frozen=True, forbid_unknown_fields=True):
     units: dict[str, str]
 
     def difference(self, other: Request) -> str | None:
-        """Say what sets another request apart, or None."""
+        """Describe the difference to another request, or return None."""
         if [r.offset for r in self.records] != [r.offset for r in other.records]:
             return "another offset"
         if self.records != other.records:
@@ -142,10 +142,10 @@ class Requests(msgspec.Struct, frozen=True, forbid_unknown_fields=True, tag="req
 
 
 class Begun(msgspec.Struct, frozen=True, forbid_unknown_fields=True, tag="progress"):
-    """A stretch of rounds, half done; rows are those found since the frame before, failures None where unchanged.
+    """Partly evaluated block of rounds; rows are those found since the previous frame, failures None if unchanged.
 
-    Where the stretch was begun anew, frames before do not count. Order is the digest of the order in which the round is
-    visited; 0, which older stores mean, is that of none.
+    If the block was restarted, earlier frames are void. ``order`` is the digest of the visiting order; 0, in older
+    files, means none.
     """
 
     search: Natural
@@ -160,7 +160,7 @@ class Begun(msgspec.Struct, frozen=True, forbid_unknown_fields=True, tag="progre
 
 
 class Rounds(msgspec.Struct, frozen=True, forbid_unknown_fields=True, tag="rounds"):
-    """A stretch of rounds, done."""
+    """Block of rounds, complete."""
 
     search: Natural
     first: Natural
@@ -169,10 +169,10 @@ class Rounds(msgspec.Struct, frozen=True, forbid_unknown_fields=True, tag="round
 
 
 class Verdicts(msgspec.Struct, frozen=True, forbid_unknown_fields=True, tag="verdicts"):
-    """A stretch of the candidates that a search under an order law follows, in its order, done.
+    """Block of candidates of a search under an order law, in its order, complete.
 
-    Values are raw sums as little-endian doubles; a byte each of kinds tells of what: 0 the whole record, 1 a bound, 2 a
-    partial sum, 3 singular, 4 diverged.
+    Values are raw sums as little-endian doubles. One byte each of kinds gives their meaning: 0 the whole record, 1 a
+    bound, 2 a partial sum, 3 singular, 4 diverged.
     """
 
     search: Natural
@@ -190,7 +190,7 @@ StageFailure = tuple[Natural, tuple[float, ...], Literal["singular", "diverged"]
 
 
 class Joined(msgspec.Struct, frozen=True, forbid_unknown_fields=True, tag="joined"):
-    """What a search under an order law came to: table, counts by reason, first failures."""
+    """Final table of a search under an order law: rows, counts by reason, first failures."""
 
     search: Natural
     rows: tuple[StageRow, ...]
@@ -212,14 +212,14 @@ def _digest(before: bytes, length: bytes, payload: bytes) -> bytes:
 
 
 def framed(payload: bytes, offset: int, before: bytes) -> tuple[bytes, bytes]:
-    """Bytes of a frame and its digest."""
+    """Return the bytes of a frame and its digest."""
     length = struct.pack("<I", len(payload))
     digest = _digest(before, length, payload)
     return length + struct.pack("<I", _check(length, offset)) + payload + digest, digest
 
 
 def next_frame(data: memoryview, offset: int, before: bytes) -> tuple[bytes, bytes, int] | str:
-    """Payload, digest and end of the frame at an offset, or what is wrong: "torn" or words."""
+    """Return payload, digest and end of the frame at an offset, or the error: "torn" or a message."""
     rest = len(data) - offset
     if rest < HEAD.size:
         return "torn"
@@ -239,24 +239,24 @@ def next_frame(data: memoryview, offset: int, before: bytes) -> tuple[bytes, byt
     return payload, digest, end
 
 
-#: Most bytes of a store: a layout of the largest search under a law takes under a tenth.
+#: Maximum size of a checkpoint file. The largest search under an order law needs less than a tenth.
 LARGEST = 4 << 30
 
 
 @dataclass(frozen=True)
 class Kind:
-    """What a store is called, and the bytes that it opens with."""
+    """Name of a kind of checkpoint file, and its file signature."""
 
     name: str
     magic: bytes
 
 
-#: The stores of an order search and of a selection.
+#: Checkpoint files of an order search and of a structure selection.
 SEARCH, SELECTION = KINDS = (Kind("search", MAGIC), Kind("selection", b"ftlm selection store 1\n"))
 
 
 def check(path: str | os.PathLike[str], handle: int, kind: Kind) -> None:
-    """Refuse what is no file, or none of ours, or too large to be one, before its gigabytes are read."""
+    """Raise DataError for a path that is no regular file, another format, or too large, before it is read."""
     status = os.fstat(handle)
     if not stat.S_ISREG(status.st_mode):
         raise DataError(f"store {path} is no regular file; choose another file")
@@ -277,10 +277,10 @@ def check(path: str | os.PathLike[str], handle: int, kind: Kind) -> None:
 
 
 class Log:
-    """A store's file, locked until it is closed; without `create` it must be there.
+    """Checkpoint file, locked until closed; without `create` it must exist.
 
-    What is appended stands behind `end`, chained to the `digest` of the frame before it; whoever reads the file says
-    where its last whole frame ends.
+    New frames are appended at `end` and chained to the `digest` of the previous frame. The reader of the file sets both
+    to the end of the last intact frame.
     """
 
     def __init__(self, path: str | os.PathLike[str], kind: Kind, *, create: bool) -> None:
@@ -301,7 +301,7 @@ class Log:
             raise
 
     def _lock(self) -> None:
-        """Keep other writers out."""
+        """Lock the file against other writers."""
         try:
             if os.name == "nt":
                 import msvcrt  # noqa: PLC0415
@@ -318,19 +318,19 @@ class Log:
             ) from error
 
     def read(self) -> bytes:
-        """All bytes of the file."""
+        """Return all bytes of the file."""
         os.lseek(self.handle, 0, os.SEEK_SET)
         return b"".join(iter(lambda: os.read(self.handle, 1 << 20), b""))
 
     def unbegun(self, data: bytes) -> bool:
-        """Whether a file is empty or what is left of a store whose first frame was never finished."""
+        """Whether a file is empty, or has an incomplete first frame only."""
         magic = self.kind.magic
         if not data.startswith(magic):
             return magic.startswith(data)
         return next_frame(memoryview(data), len(magic), bytes(DIGEST)) == "torn"
 
     def begin(self, payload: bytes) -> bytes:
-        """Write the first frame; the bytes of the file."""
+        """Write the first frame and return the bytes of the file."""
         frame, digest = framed(payload, len(self.kind.magic), bytes(DIGEST))
         self.end = 0
         self._write(self.kind.magic + frame)
@@ -339,7 +339,7 @@ class Log:
         return self.kind.magic + frame
 
     def append(self, payloads: Sequence[bytes]) -> None:
-        """Write frames behind the last one, and flush to disk."""
+        """Append frames and flush them to disk."""
         data, digest, offset = [], self.digest, self.end
         for payload in payloads:
             piece, digest = framed(payload, offset, digest)
@@ -349,14 +349,14 @@ class Log:
         self.digest = digest
 
     def cut(self) -> None:
-        """Drop what stands behind the end."""
+        """Truncate the file at the end of the last intact frame."""
         with self._writing():
             os.ftruncate(self.handle, self.end)
             os.fsync(self.handle)
 
     @contextlib.contextmanager
     def _writing(self) -> Iterator[None]:
-        """Leave the store as it was where writing fails, and say so."""
+        """Truncate the file to its previous end if writing fails, and raise DataError."""
         try:
             yield
         except OSError as error:
@@ -386,13 +386,13 @@ class Log:
         self.end += len(data)
 
     def close(self) -> None:
-        """Give the lock back."""
+        """Close the file and release the lock."""
         os.close(self.handle)
 
 
 @dataclass
 class Half:
-    """A stretch of rounds, half done, with all rows found since its start."""
+    """Partly evaluated block of rounds, with all rows found since its start."""
 
     last: int
     place: Place
@@ -403,15 +403,15 @@ class Half:
 
     @property
     def checkpoint(self) -> Checkpoint:
-        """Where to go on, as the core takes it."""
+        """Point of resumption, as an argument of the core."""
         return (*self.place, self.order), False, (tuple(self.rows), self.counts, self.failures)
 
 
 @dataclass
 class Section:
-    """What is known of one search: stretches done (of rounds, or of candidates under an order law) and half done.
+    """Progress of one search: blocks (of rounds, or of candidates under an order law), complete or partial.
 
-    Both stand under their first round or candidate.
+    Both are indexed by their first round or candidate.
     """
 
     law: bool = False
@@ -421,7 +421,7 @@ class Section:
     _firsts: list[int] = field(default_factory=list)
 
     def take(self, frame: Frame) -> None:
-        """Take a frame in; refuse one that is there already, that is no stretch, or of another kind of search."""
+        """Add a frame; raise ModelError for a duplicate, an empty block, or another kind of search."""
         if self.joined is not None or (isinstance(frame, Joined) and not self.law):
             raise ModelError("a table stands where none belongs")
         if isinstance(frame, Joined):
@@ -457,36 +457,36 @@ class Section:
 
     @property
     def dealt(self) -> int:
-        """Candidates dealt with."""
+        """Number of candidates evaluated or excluded."""
         done = (len(f.kinds) if isinstance(f, Verdicts) else sum(f.part[1][1:7]) for f in self.done.values())
         return sum(done) + sum(sum(half.counts[1:7]) for half in self.open.values())
 
     @property
     def best(self) -> float | None:
-        """Smallest raw score so far, of one equation's candidates."""
+        """Smallest raw score so far, for the search of one equation."""
         rows = [row for frame in self.done.values() if isinstance(frame, Rounds) for row in frame.part[0]]
         return min((row[1] for row in (*rows, *(r for half in self.open.values() for r in half.rows))), default=None)
 
 
 @dataclass
 class Contents:
-    """What a store holds."""
+    """Contents of a checkpoint file."""
 
     requests: tuple[Request, ...]
     sections: list[Section]
     version: str
     algorithm: int
-    #: Offset behind the last whole frame, and that frame's digest.
+    #: Offset after the last intact frame, and that frame's digest.
     end: int
     digest: bytes
-    #: Bytes behind it that a power cut or a kill left, or that are being written.
+    #: Number of bytes after it, left by a power cut or a kill, or being written.
     torn: int = 0
-    #: What is damaged, with its offset, where frames or bytes follow that cannot be read; None for a whole store.
+    #: Description of corrupt data with its offset; None for an intact file.
     damage: str | None = None
 
 
 def read_store(path: str | os.PathLike[str]) -> Contents:
-    """Read a store as far as it is whole; it may be in use."""
+    """Read the intact part of a checkpoint file, which may be in use."""
     try:
         # A pipe that nobody writes to would keep the open waiting.
         handle = os.open(path, os.O_RDONLY | getattr(os, "O_NONBLOCK", 0) | getattr(os, "O_BINARY", 0))
@@ -502,7 +502,7 @@ def read_store(path: str | os.PathLike[str]) -> Contents:
 
 
 def contents_of(path: str | os.PathLike[str], data: memoryview) -> Contents:
-    """Contents of a store's bytes; refuse what is none, has no first frame, or is of a later version."""
+    """Parse the bytes of a checkpoint file; raise DataError for another file, no first frame, or a later version."""
     start = bytes(data[: len(MAGIC)])
     if not MAGIC.startswith(start):
         raise DataError(f"{path} is no ftlm search store; give a file written with store= (--store)")
@@ -546,25 +546,25 @@ def _opened(frame: Requests | Frame, end: int, digest: bytes) -> Contents:
     return Contents(frame.requests, sections, frame.version, frame.algorithm, end, digest)
 
 
-#: Longest time [s] between two writes, each flushed to disk: with the time between checkpoints, under a second is lost.
+#: Maximum time between two writes, each flushed to disk. Less than a second of work is lost on a crash.
 INTERVAL = 0.3
 
 
 class Store:
-    """A store opened for writing: locked until it is closed; what is appended is on disk within :data:`INTERVAL`.
+    """Checkpoint file opened for writing, locked until closed; results are on disk within :data:`FLUSH_INTERVAL_S`.
 
-    The requests are the searches of a new store, or what an existing one must hold; None takes what it holds. With
-    `salvage` a damaged one goes on with its whole frames, and the damaged file is kept beside it.
+    The requests are the searches of a new file, or those that an existing file must contain; None accepts those of the
+    file. With `salvage` the intact frames of a corrupt file are used, and a copy of the corrupt file is kept beside it.
     """
 
     def __init__(
         self, path: str | os.PathLike[str], requests: Sequence[Request] | None = None, *, salvage: bool = False
     ) -> None:
         self.path = Path(path)
-        #: What was mended, in words.
+        #: Descriptions of repairs.
         self.notes: list[str] = []
         self._last = time.monotonic()
-        #: By search and first round: what is not written yet, and the failures written last.
+        #: By search and first round: frames not written yet, and the failures written last.
         self._waiting: dict[tuple[int, int], Begun] = {}
         self._failures: dict[tuple[int, int], Failures | None] = {}
         self._log = Log(path, SEARCH, create=requests is not None)
@@ -615,7 +615,7 @@ class Store:
         self.contents.damage = None
 
     def outdated(self) -> DataError:
-        """Say why a search that another version began does not go on."""
+        """Return the error of a search that another version began and this one cannot resume."""
         held = self.contents
         return DataError(
             f"store {self.path} is of ftlm {held.version}, whose rounds follow algorithm {held.algorithm}; this "
@@ -634,7 +634,7 @@ class Store:
             self.contents.sections[frame.search].take(frame)
 
     def save(self, search: int, first: int, last: int, checkpoint: Checkpoint | None) -> None:
-        """Note how far a stretch of rounds is; it is written with others, or when it is time."""
+        """Note the progress of a block of rounds; it is written with others, or when the flush interval ends."""
         if checkpoint is not None:
             (*place, order), anew, (rows, counts, failures) = checkpoint
             before = self._waiting.get((search, first))
@@ -646,7 +646,7 @@ class Store:
             self.flush()
 
     def flush(self) -> None:
-        """Write what waits."""
+        """Write all pending"""
         due = []
         for key, frame in self._waiting.items():
             same = not frame.anew and self._failures.get(key) == frame.failures
@@ -657,18 +657,18 @@ class Store:
             self._append(due)
 
     def done(self, frame: Rounds | Verdicts) -> None:
-        """Append a stretch that is done."""
+        """Append a complete block."""
         self._waiting.pop((frame.search, frame.first), None)
         self._failures.pop((frame.search, frame.first), None)
         self._append([frame])
 
     def joined(self, search: int, table: _core._FoundStage) -> None:
-        """Append the table of a search under an order law."""
+        """Append the final table of a search under an order law."""
         frame = {"type": "joined", "search": search, **{k: table[k] for k in ("rows", "counts", "failures")}}
         self._append([msgspec.convert(frame, Joined)])
 
     def close(self) -> None:
-        """Write what waits and give the lock back."""
+        """Write pending frames and release the lock."""
         try:
             self.flush()
         finally:

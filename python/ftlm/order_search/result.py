@@ -1,4 +1,4 @@
-"""What a certificate over all orders says."""
+"""Certificate of an order search."""
 
 from __future__ import annotations
 
@@ -15,31 +15,31 @@ from ftlm.utils.formatting import Cell, Exact, number, symbol, symbol_html
 
 @dataclass(frozen=True)
 class OrderCertificate:
-    """What is proved of the equation errors of all orders in some intervals.
+    """Lower bound of the equation error over all orders in some intervals.
 
     Parameters
     ----------
-    at_least
-        No orders of the intervals leave a smaller RMS equation error, with any coefficients whose terms are not beyond
-        `largest`, in exact arithmetic on the pulse means; 0 where nothing is proved.
+    lower_bound
+        No orders of the intervals have a smaller RMS equation error, with any coefficients whose terms do not exceed
+        `max_term_ratio`, in exact arithmetic on the pulse means; 0 if nothing is proved.
     best
-        The smallest that was found on the way, infinite where none was.
+        Smallest error found; infinite if none was found.
     orders
-        Where that is: free orders by name.
-    asked
-        How much better than that other orders might have been, as a share.
+        Free orders of that error, by name.
+    requested_tolerance
+        Requested tolerance: by what fraction the error of other orders might be smaller.
     intervals
         Lowest and highest value of each free order.
-    apart
-        How far orders of the output stay below its highest one, and orders of one signal from one another.
-    largest
-        How many times the RMS size of the output those of an equation's terms have together at most.
+    min_separation
+        Minimum distance of orders of the output from its highest one, and of orders of one signal from one another.
+    max_term_ratio
+        Maximum RMS size of all terms of an equation together, relative to that of the output.
     cells
-        Boxes of orders that were bounded.
-    open
-        Those of them whose bound is lower than was asked for, too small to be halved or one too many.
+        Number of boxes of orders that were bounded.
+    open_cells
+        Number of boxes whose bound misses the requested tolerance, too small to be halved or beyond the maximum.
     m
-        Block pulses a run.
+        Block pulses per run.
     """
 
     at_least: float
@@ -55,7 +55,7 @@ class OrderCertificate:
 
     @property
     def within(self) -> float:
-        """By what share of the best found other orders may be better: 1 where nothing is proved."""
+        """Tolerance achieved: by what fraction other orders may be better; 1 if nothing is proved."""
         return max(0.0, 1 - self.at_least / self.best)
 
     def to_dict(self) -> dict[str, Any]:
@@ -98,14 +98,14 @@ class OrderCertificate:
 
 @dataclass(frozen=True)
 class SearchRow:
-    """One kept candidate.
+    """Row of the ranked table of an order search.
 
     Parameters
     ----------
     rank
         From 1.
     index
-        Index of the candidate in the lattice, by which ties are broken.
+        Index of the candidate in the order grid; breaks ties.
     score
         Its score: error (45) for norm l1, RMSE for l2; for a stage the sum of the equations' scores, each divided by
         its scale.
@@ -124,7 +124,7 @@ class SearchRow:
 
 @dataclass(frozen=True)
 class SearchResult:
-    """A ranked table, the best model and what became of every candidate.
+    """Table of an order search, best first, with its best model, and counts of the excluded candidates.
 
     Parameters
     ----------
@@ -134,23 +134,22 @@ class SearchResult:
         Model of the first row.
     candidates
         Number of candidates.
-    pruned
-        Candidates not in the table, by reason: "beaten" (run to the end), "bound" (excluded by a lower bound of their
-        score), "stopped early" (left at a partial sum), "singular", "diverged". Kept rows and these are all candidates.
-        One that was excluded or left early might have diverged had it been run.
+    exclusion_counts
+        Number of candidates not in the table, by reason: "beaten" (fully evaluated), "bound" (excluded by a lower bound
+        of their score), "stopped early" (excluded by a partial sum), "singular", "diverged". With the rows of the table
+        they add up to all candidates. An excluded candidate might have diverged in a full evaluation.
     failures
         The first candidates without a score: (orders by name, reason).
     m
-        Block pulses a run.
+        Block pulses per run.
     settings
         Criterion, norm, coefficients, innovation length, prior covariance, rows, initial terms.
-    edges
-        Orders of the first row that stand on the edge of their interval, by name with the edge.
-    boxed
-        Of those under "bound", the candidates whose whole box of orders was excluded by one bound.
+    at_grid_edge
+        Orders of the first row at an end of their interval, by name.
+    excluded_by_box
+        Number of candidates under "bound" that were excluded with a whole box of orders.
     certificate
-        What is proved of the orders between the lattice's, where that was asked for (``ftlm search --certify``,
-        :func:`ftlm.certify_orders`).
+        Certificate over all orders, also between those of the grid, if requested (:func:`ftlm.certify_orders`).
     """
 
     table: list[SearchRow]
@@ -184,14 +183,14 @@ class SearchResult:
 
     @property
     def left_out(self) -> str:
-        """What became of the candidates that are not in the table, in words."""
+        """Text with the counts of the excluded candidates, by reason."""
         told = {reason: f"{count} {reason}" for reason, count in self.pruned.items() if count}
         if self.boxed:
             told["bound"] += f" ({self.boxed} of them in boxes excluded whole)"
         return "".join(f", {words}" for words in told.values())
 
     def to_frame(self) -> Any:
-        """The ranked table as a pandas frame, by rank."""
+        """Return the ranked table as a pandas frame, by rank."""
         rows = [{"rank": r.rank, "score": r.score, **r.orders, **r.coefficients} for r in self.table]
         return to_frame(rows, ["rank"])
 
@@ -226,17 +225,17 @@ class SearchResult:
 
 @dataclass(frozen=True)
 class StoreStatus:
-    """How far a search in a store is.
+    """Progress of a search in a checkpoint file.
 
     Parameters
     ----------
     name
         Output that was searched, or ``"stage"``.
     candidates
-        Candidates in all. Under an order law those of the equations one by one, as far as is known: one that was left
-        early may have to be followed further.
+        Total number of candidates. Under an order law those of the single equations, as far as known: one that was
+        stopped early may have to be evaluated further.
     done
-        Candidates dealt with.
+        Number of candidates evaluated or excluded.
     best
         Best score so far: error (45) for norm l1, RMSE for l2; None before the first.
     settings
@@ -244,11 +243,11 @@ class StoreStatus:
     runs
         Names of the runs.
     version
-        Version of ftlm that began the store.
-    torn
+        Version of ftlm that created the file.
+    truncated
         Bytes of an unfinished write at its end.
-    damage
-        What is damaged, with its offset, or None.
+    corruption
+        Description of corrupt data with its offset, or None.
     """
 
     name: str
@@ -263,7 +262,7 @@ class StoreStatus:
 
     @property
     def complete(self) -> bool:
-        """Whether nothing is left to do."""
+        """Whether the search is complete."""
         return self.done == self.candidates
 
     def to_dict(self) -> dict[str, Any]:
@@ -283,7 +282,7 @@ class StoreStatus:
 
 
 def search_summary(searches: Mapping[str, SearchResult], *, title: str = "What became of the candidates") -> Table:
-    """Return what became of every candidate: kept, or left out for a reason; kept and left out are all candidates."""
+    """Return a table of kept and excluded candidates, by reason; together they are all candidates."""
     reasons = list(dict.fromkeys(reason for s in searches.values() for reason in s.pruned))
     rows: list[list[Cell]] = [
         [
@@ -348,7 +347,7 @@ def _search_name(name: str) -> str:
 
 
 def search_html(found: SearchResult) -> str:
-    """Return the best rows of an order search and what became of the rest."""
+    """Return the best rows of an order search and the counts of the excluded candidates."""
     rows: list[list[Cell]] = [["kept", len(found.table)]]
     for reason, count in found.pruned.items():
         rows.append([reason, count])

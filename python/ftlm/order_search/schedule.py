@@ -1,4 +1,4 @@
-"""What a search is computed from, as the core takes it, here and in a worker."""
+"""Search problems: data of an order search as arguments of the core, in this process and in workers."""
 
 from __future__ import annotations
 
@@ -26,7 +26,7 @@ from ftlm.order_search.options import Settings
 from ftlm.simulation.discretization import InitialTuple
 from ftlm.utils.validation import Floats
 
-#: Searches that a worker keeps ready.
+#: Maximum number of search evaluators that a worker caches.
 READY = 2
 Table = TypeVar("Table")
 Piece = TypeVar("Piece")
@@ -36,7 +36,7 @@ Told = Callable[[int, int, int], None]
 
 @dataclass(frozen=True)
 class Work(ABC, Generic[Table]):
-    """What every round of a search is computed from, and the table it ends in."""
+    """Search problem: data shared by all rounds of a search, and its reduction to a table."""
 
     runs: tuple[CoreRecord, ...]
     inputs: list[bool]
@@ -46,23 +46,23 @@ class Work(ABC, Generic[Table]):
     @property
     @abstractmethod
     def asked(self) -> tuple[Any, ...]:
-        """What the core takes behind the runs."""
+        """Arguments of the core after the runs."""
 
     def core(self, *more: Any) -> tuple[Any, ...]:
-        """All of it, and more, as the core takes it."""
+        """Return all arguments of the core, with further ones appended."""
         return list(self.runs), *self.asked, *more
 
     @abstractmethod
     def search(self, progress: Told | None) -> Table:
-        """Search here and at once."""
+        """Run the whole search in this process."""
 
     @abstractmethod
     def ready(self) -> _core.OrderSearch | _core.StageSearch:
-        """Build what all pieces of the search share."""
+        """Build the evaluator shared by all blocks of the search."""
 
     @property
     def key(self) -> str:
-        """Digest that names the search among workers."""
+        """Digest that identifies the search among workers."""
         digest = hashlib.blake2b(digest_size=16)
         for step, means, sensor in self.runs:
             digest.update(msgspec.msgpack.encode((step, means.shape, sensor is None)))
@@ -74,31 +74,31 @@ class Work(ABC, Generic[Table]):
 
 @dataclass(frozen=True)
 class EquationWork(Work["_core._Found"]):
-    """The search of one equation: output, values of its highest order, and signal, values and freedom of each term."""
+    """Search problem of one equation: output, values of its order, and signal, values and freedom of each term."""
 
     orders: tuple[int, list[float], list[tuple[int, list[float], bool]]]
     fixed: list[float | None]
 
     @property
     def asked(self) -> tuple[Any, ...]:
-        """What the core takes behind the runs."""
+        """Arguments of the core after the runs."""
         return self.orders, self.inputs, self.fixed, self.initial, self.settings.core()
 
     def search(self, progress: Told | None) -> _core._Found:
-        """Search here and at once."""
+        """Run the whole search in this process."""
         return _core.search(*self.core(progress))
 
     def ready(self) -> _core.OrderSearch:
-        """Build what all rounds share."""
+        """Build the evaluator shared by all rounds."""
         return _core.OrderSearch(*self.core())
 
     def plan(self, algorithm: int | None = None) -> tuple[int, list[int], int]:
-        """Candidates, where each wave of rounds ends by this or an earlier algorithm, and the number of this one."""
+        """Return number of candidates, ends of the batches by this or an earlier algorithm, and algorithm version."""
         return _core.search_plan(self.orders, self.inputs, self.initial, self.settings.core(), algorithm)
 
     @property
     def samples(self) -> int:
-        """Pulses of all records."""
+        """Total number of pulses of all records."""
         return sum(int(means.shape[1]) for _, means, _ in self.runs)
 
     def join(self, parts: list[Part]) -> _core._Found:
@@ -109,7 +109,7 @@ class EquationWork(Work["_core._Found"]):
 
 @dataclass(frozen=True)
 class StageWork(Work["_core._FoundStage"]):
-    """The search of a stage: values of the free orders, its equations as sums of them, a scale for each score."""
+    """Search problem of coupled equations: values of the free orders, order law, and a scale of each score."""
 
     axes: list[list[float]]
     laws: list[tuple[int, tuple[float, list[float]], list[tuple[int, tuple[float, list[float]]]]]]
@@ -118,15 +118,15 @@ class StageWork(Work["_core._FoundStage"]):
 
     @property
     def asked(self) -> tuple[Any, ...]:
-        """What the core takes behind the runs."""
+        """Arguments of the core after the runs."""
         return self.axes, self.laws, self.inputs, self.fixed, self.scales, self.initial, self.settings.core()
 
     def search(self, progress: Told | None) -> _core._FoundStage:
-        """Search here and at once."""
+        """Run the whole search in this process."""
         return _core.search_stage(*self.core(progress))
 
     def ready(self, *, keeps_course: bool = False) -> _core.StageSearch:
-        """Build what all candidates share, and where the search itself is kept its course."""
+        """Build the evaluator shared by all candidates, and optionally the state of the search."""
         return _core.StageSearch(*self.core(keeps_course))
 
 
@@ -147,12 +147,12 @@ if hasattr(os, "register_at_fork"):
 def some_rounds(
     key: str, work: EquationWork | None, first: int, last: int, seed: list[tuple[int, float]], start: Any, threads: int
 ) -> tuple[float, Part] | None:
-    """Do some rounds in a worker: seconds and part, or None where the search is not known and not given."""
+    """Evaluate rounds in a worker: return seconds and part, or None if the search is neither cached nor given."""
     return _timed(key, work, lambda search: cast("Part", search.rounds(first, last, seed, start, threads, None, None)))
 
 
 def some_candidates(key: str, work: StageWork | None, spans: list[Span], threads: int) -> tuple[float, Outcomes] | None:
-    """Follow some candidates in a worker: seconds and verdicts, or None where the search is not known and not given."""
+    """Evaluate candidates in a worker: return seconds and verdicts, or None if the search is unavailable."""
     return _timed(key, work, lambda search: cast("Outcomes", search.follow(spans, threads, None)))
 
 
@@ -170,19 +170,19 @@ def _timed(key: str, work: Work[Any] | None, do: Callable[[Any], Piece]) -> tupl
     return time.monotonic() - began, piece
 
 
-#: Time [s] that a task should take: long beside sending it, short beside losing it.
+#: Target duration of a task: long compared with its transfer, short enough to lose little.
 TASK = 2.0
-#: Tasks under way for each worker, so that none waits for the next.
+#: Number of submitted tasks per worker, so that no worker idles.
 AHEAD = 2
-#: Attempts at one task before its search is given up.
+#: Maximum number of attempts at a task before the search fails.
 ATTEMPTS = 3
-#: How often [s] signals and the store are looked after while tasks are under way.
+#: Interval at which signals and the checkpoint file are serviced while tasks run.
 LOOK = 0.05
 
 
 @dataclass
 class Stretch:
-    """Rounds to be done, from a checkpoint or from their start."""
+    """Contiguous block of rounds or candidates to evaluate, from a checkpoint or from its start."""
 
     first: int
     last: int
@@ -192,7 +192,7 @@ class Stretch:
 
 
 def workers(executor: Executor) -> int:
-    """How many tasks an executor works on at a time, as far as it tells."""
+    """Number of tasks that an executor runs concurrently, as far as it is known."""
     count = getattr(executor, "_max_workers", None)
     client = getattr(executor, "_client", None)
     if count is None and client is not None:
@@ -203,17 +203,17 @@ def workers(executor: Executor) -> int:
 
 @dataclass
 class Pace:
-    """Seconds that a round or a candidate takes, once known; the fewest that are sent together."""
+    """Throughput: seconds per round or candidate, once known, and the minimum number in a task."""
 
     each: float = 0.0
     fewest: int = 1
 
     def size(self, seconds: float) -> int:
-        """How many take about so long."""
+        """Number of rounds or candidates that take about the given time."""
         return self.fewest if self.each == 0 else max(self.fewest, int(seconds / self.each))
 
     def took(self, seconds: float, count: int) -> None:
-        """Learn from some."""
+        """Update the throughput by a measured time."""
         each = max(seconds, 1e-9) / count
         self.each = each if self.each == 0 else 0.7 * self.each + 0.3 * each
 
@@ -221,7 +221,7 @@ class Pace:
 def shipped(
     send: Callable[[Stretch], tuple[Any, ...]], left: list[Stretch], executor: Executor, pace: Pace
 ) -> Iterator[tuple[Stretch, Any]]:
-    """Send stretches in pieces of about :data:`TASK` seconds each; give back what they came to."""
+    """Submit blocks in tasks of about :data:`TASK_DURATION_S` seconds each, and yield their results."""
     count = workers(executor)
     ahead = AHEAD * count + 2
     # Of a short wave every worker gets its share.
@@ -256,7 +256,7 @@ def shipped(
 
 
 def _result(future: Future[Any], stretch: Stretch) -> tuple[float, Any] | None:
-    """Seconds and what a task came to; None where it must be sent (again)."""
+    """Return seconds and result of a task, or None if it must be sent again."""
     try:
         timed = cast("tuple[float, Any] | None", future.result())
     except FtlmError:
@@ -284,22 +284,22 @@ def _lost(error: BaseException) -> ConvergenceError:
     )
 
 
-#: Time [s] between two writes of what candidates under an order law came to: what is lost is not much more.
+#: Time between two writes of candidates under an order law. Work lost on a crash is about this long.
 PIECE = 0.25
-#: Fewest candidates under an order law that are followed or sent together: the first wave, so that the first worker to
-#: be asked gets the record before the others are.
+#: Minimum number of candidates under an order law in one task, used for the first batch. The first worker then receives
+#: the record before the others ask for it.
 FEWEST = 256
 Done = TypeVar("Done", Rounds, Verdicts)
-#: Notes a checkpoint of the rounds from the first to the last.
+#: Callback that stores a checkpoint of the rounds from the first to the last.
 Save = Callable[[int, int, Checkpoint | None], None]
 
 
 class Course(ABC, Generic[Done, Table]):
-    """A search on its way: candidates done and in all, and the wave that is being done."""
+    """Search state: number of candidates done and in total, and the current batch."""
 
-    #: Whether what an earlier version began may be gone on with.
+    #: Whether a search begun by an earlier version can be resumed.
     goes_on = True
-    #: Whether the core itself tells of progress in what is done here.
+    #: Whether the core reports progress of local evaluation itself.
     core_tells = False
 
     def __init__(self, work: Work[Table], pace: Pace) -> None:
@@ -309,40 +309,40 @@ class Course(ABC, Generic[Done, Table]):
 
     @cached_property
     def key(self) -> str:
-        """Name of the search among workers."""
+        """Key of the search in the workers' caches."""
         return self.work.key
 
     def payload(self, stretch: Stretch) -> Work[Table] | None:
-        """What goes along with a stretch: nothing, unless a worker said that it does not know the search."""
+        """Search problem to send with a block, or None unless a worker reported that it lacks it."""
         return self.work if stretch.sent else None
 
     @abstractmethod
     def waves(self) -> Iterator[tuple[int, int]]:
-        """First piece of each wave and the one behind its last; the next is laid out once that one is whole."""
+        """Yield first index and end of each batch; the next is constructed once the previous one is complete."""
 
     @abstractmethod
     def here(self, left: list[Stretch], progress: Told | None, save: Save | None) -> Iterator[tuple[Stretch, Any]]:
-        """Do stretches here."""
+        """Evaluate blocks in this process."""
 
     @abstractmethod
     def task(self, stretch: Stretch) -> tuple[Any, ...]:
-        """Name a function and its arguments that do a stretch elsewhere."""
+        """Return a function and its arguments that evaluate a block in a worker."""
 
     @abstractmethod
     def frame(self, number: int, stretch: Stretch, piece: Any) -> Done:
-        """Make what a stretch came to a frame of a store, as of its search of that number."""
+        """Convert the result of a block to a frame of search ``number``."""
 
     @abstractmethod
     def take(self, done: Done) -> int:
-        """Take in a stretch of the wave; tell how many of its candidates were left early, where that is known."""
+        """Add a block to the current batch; return how many of its candidates were stopped early, if known."""
 
     @abstractmethod
     def table(self) -> Table:
-        """Join all waves."""
+        """Reduce all batches to the table."""
 
 
 class EquationCourse(Course[Rounds, "_core._Found"]):
-    """The rounds of one equation; those of a wave know the best rows of the waves before."""
+    """Search state of one equation; the rounds of a batch depend on the best rows of earlier batches."""
 
     core_tells = True
     work: EquationWork
@@ -359,7 +359,7 @@ class EquationCourse(Course[Rounds, "_core._Found"]):
         return self.work.ready()
 
     def waves(self) -> Iterator[tuple[int, int]]:
-        """Rounds that know the same rows, each wave at a pace of its own: later ones exclude more."""
+        """Yield batches of rounds with the same rows, each with its own throughput: later ones exclude more."""
         first, keep = 0, self.work.settings.keep
         for end in self._ends:
             ranked = sorted({(row[1], row[0]) for part in self._parts for row in part[0]})[:keep]
@@ -371,7 +371,7 @@ class EquationCourse(Course[Rounds, "_core._Found"]):
             first = end
 
     def here(self, left: list[Stretch], progress: Told | None, save: Save | None) -> Iterator[tuple[Stretch, Part]]:
-        """Do each stretch in one call, from where it stands."""
+        """Evaluate each block in one call, from its checkpoint."""
         for stretch in left:
             first, last = stretch.first, stretch.last
             told = None if progress is None else partial(self._tell, progress, self.done)
@@ -383,16 +383,16 @@ class EquationCourse(Course[Rounds, "_core._Found"]):
         progress(min(before + done, self.total), self.total, pruned)
 
     def task(self, stretch: Stretch) -> tuple[Any, ...]:
-        """Some rounds."""
+        """Return the function and arguments that evaluate a block of rounds."""
         ranged = stretch.first, stretch.last, self._seed, stretch.start, self.threads
         return some_rounds, self.key, self.payload(stretch), *ranged
 
     def frame(self, number: int, stretch: Stretch, piece: Part) -> Rounds:
-        """Some rounds, done."""
+        """Return the frame of a block of rounds."""
         return Rounds(number, stretch.first, stretch.last, piece)
 
     def take(self, done: Rounds) -> int:
-        """Take in some rounds."""
+        """Add a block of rounds."""
         self._parts.append(done.part)
         self.done += sum(done.part[1][1:])
         return 0
@@ -403,13 +403,13 @@ class EquationCourse(Course[Rounds, "_core._Found"]):
 
 
 def _up_to(worst: tuple[float, int], part: Part) -> Part:
-    """A part without the rows that better ones have pushed out."""
+    """Return a part without rows worse than the last ranked one."""
     rows, counts, failures = part
     return tuple(row for row in rows if (row[1], row[0]) <= worst), counts, failures
 
 
 class StageCourse(Course[Verdicts, "_core._FoundStage"]):
-    """The candidates that a stage wants followed; what those of a wave are depends on the waves before."""
+    """Search state of coupled equations; the candidates of a batch depend on earlier batches."""
 
     work: StageWork
 
@@ -421,7 +421,7 @@ class StageCourse(Course[Verdicts, "_core._FoundStage"]):
         self._wave: list[Verdicts] = []
 
     def waves(self) -> Iterator[tuple[int, int]]:
-        """Candidates that are wanted next, by a number that goes on through all waves."""
+        """Yield batches of the candidates required next, numbered through all batches."""
         while spans := self.search.wanted():
             end = self._first + sum(last - first for _, first, last, _ in spans)
             self._spans, self._wave = spans, []
@@ -432,7 +432,7 @@ class StageCourse(Course[Verdicts, "_core._FoundStage"]):
         self.total = self._first
 
     def here(self, left: list[Stretch], progress: Told | None, save: Save | None) -> Iterator[tuple[Stretch, Outcomes]]:
-        """Follow candidates in pieces of about :data:`PIECE` seconds."""
+        """Evaluate candidates in tasks of about :data:`CHECKPOINT_INTERVAL_S` seconds."""
         for stretch in left:
             at = stretch.first
             while at < stretch.last:
@@ -444,11 +444,11 @@ class StageCourse(Course[Verdicts, "_core._FoundStage"]):
                 at = piece.last
 
     def task(self, stretch: Stretch) -> tuple[Any, ...]:
-        """Some candidates."""
+        """Return the function and arguments that evaluate a block of candidates."""
         return some_candidates, self.key, self.payload(stretch), self._cut(stretch), self.threads
 
     def _cut(self, stretch: Stretch) -> list[Span]:
-        """The candidates of a stretch, counted through all spans of the wave."""
+        """Return the candidates of a block as spans, counted through all spans of the batch."""
         cut, at = [], self._first
         for equation, start, end, limit in self._spans:
             low, high = max(stretch.first - at, 0), min(stretch.last - at, end - start)
@@ -458,22 +458,22 @@ class StageCourse(Course[Verdicts, "_core._FoundStage"]):
         return cut
 
     def frame(self, number: int, stretch: Stretch, piece: Outcomes) -> Verdicts:
-        """Some candidates, done."""
+        """Return the frame of a block of candidates."""
         return Verdicts(number, stretch.first, stretch.last, *piece)
 
     def take(self, done: Verdicts) -> int:
-        """Take in some verdicts."""
+        """Add a block of verdicts."""
         self._wave.append(done)
         self.done += len(done.kinds)
         return done.kinds.count(1) + done.kinds.count(2)
 
     def table(self) -> _core._FoundStage:
-        """Join the equations under their law."""
+        """Join the equations under their order law."""
         return self.search.outcome()
 
 
 def _whole(wave: list[Verdicts], first: int, end: int) -> Outcomes:
-    """Verdicts of a wave in their order; refuse stretches that do not make it up."""
+    """Return the verdicts of a batch in order; raise ModelError if its blocks do not cover it."""
     at, values, kinds = first, [], []
     for verdicts in sorted(wave, key=lambda v: v.first):
         if verdicts.first != at:
@@ -489,7 +489,7 @@ def _whole(wave: list[Verdicts], first: int, end: int) -> Outcomes:
 def search_equation(
     work: EquationWork, *, store: Store | None, number: int, executor: Executor | None, progress: Told | None
 ) -> _core._Found:
-    """Search the orders of one equation: at once here, or in rounds with a store (its search `number`) or executor."""
+    """Search the orders of one equation: in one call here, or in rounds with a checkpoint file or executor."""
     if store is None and executor is None:
         return work.search(progress)
     algorithm = None if store is None else store.contents.algorithm
@@ -499,7 +499,7 @@ def search_equation(
 def search_stage(
     work: StageWork, *, store: Store | None, number: int, executor: Executor | None, progress: Told | None
 ) -> _core._FoundStage:
-    """Search a stage under its order law, as :func:`search_equation`; a finished search is only read."""
+    """Search coupled equations under an order law, like :func:`search_equation`; a finished search is only read."""
     if store is None and executor is None:
         return work.search(progress)
     joined = None if store is None else store.contents.sections[number].joined
@@ -514,7 +514,7 @@ def search_stage(
 def _do(
     course: Course[Done, Table], store: Store | None, number: int, executor: Executor | None, progress: Told | None
 ) -> Table:
-    """Do all that a store does not hold yet, wave by wave, and join."""
+    """Evaluate all blocks that a checkpoint file lacks, batch by batch, and join them."""
     section = None if store is None else store.contents.sections[number]
     save = None if store is None else partial(store.save, number)
     pruned = 0
@@ -543,7 +543,7 @@ def _do(
 
 
 def equation_state(work: EquationWork, section: Section) -> tuple[int, float | None]:
-    """Candidates of one equation, and the best score so far."""
+    """Number of candidates of one equation, and the best score so far."""
     best = section.best
     if best is not None and work.settings.norm == "l2":
         best = math.sqrt(max(best, 0.0) / work.samples)
@@ -551,7 +551,7 @@ def equation_state(work: EquationWork, section: Section) -> tuple[int, float | N
 
 
 def stage_state(work: StageWork, section: Section) -> tuple[int, float | None]:
-    """Candidates that the search of a stage follows, as far as a store tells, and the best score so far."""
+    """Number of candidates of a coupled search, as far as a checkpoint file determines it, and the best score."""
     if section.joined is not None:
         return section.dealt, _table(work, section.joined)["rows"][0][1]
     course = StageCourse(work)
@@ -564,7 +564,7 @@ def stage_state(work: StageWork, section: Section) -> tuple[int, float | None]:
 
 
 def _table(work: StageWork, joined: Joined) -> _core._FoundStage:
-    """The table of a finished search as the core gives it; refuse one of another search."""
+    """Return the table of a finished search in the form of the core; raise ModelError for another search."""
     widths = [len(terms) for _, _, terms in work.laws]
     dealt = sum(v for k, v in joined.counts.items() if k != "candidates")
     sound = (
@@ -582,12 +582,12 @@ def _table(work: StageWork, joined: Joined) -> _core._FoundStage:
 
 
 def _held(section: Section | None, first: int, end: int) -> list[Any]:
-    """What a store holds of a wave."""
+    """Return the stored frames of a batch."""
     return [] if section is None else [frame for at, frame in section.done.items() if first <= at < end]
 
 
 def _left(section: Section | None, first: int, end: int) -> Iterator[Stretch]:
-    """Stretches of a wave that are not done: half done ones as they stand, and the gaps between."""
+    """Yield the blocks of a batch to evaluate: partial ones from their checkpoint, and the gaps between."""
     known: list[Stretch] = []
     if section is not None:
         known = [Stretch(at, frame.last) for at, frame in section.done.items()]

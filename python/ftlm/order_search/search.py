@@ -1,4 +1,4 @@
-"""An order search ready to be done: one equation, or a stage under its order law."""
+"""Job of an order search: one equation, or coupled equations under an order law."""
 
 from __future__ import annotations
 
@@ -47,14 +47,14 @@ from ftlm.structure.structure import Structure
 from ftlm.svg.heat_map import Landscape
 from ftlm.utils.validation import check_threads
 
-#: Settings that tell one search from another; threads make no difference to it.
+#: Settings that define a search. Threads do not change its result.
 KEPT = tuple(f.name for f in fields(Settings) if f.name != "threads")
 Failures = list[tuple[dict[str, float], str]]
 
 
 @dataclass(frozen=True)
 class Job:
-    """What a search works on."""
+    """Order search with checked arguments and records."""
 
     runs: tuple[str, ...]
     units: Mapping[str, str]
@@ -66,11 +66,11 @@ class Job:
 
     @property
     def name(self) -> str:
-        """What its result is called among others."""
+        """Name of the result: the output, or ``"stage"`` under an order law."""
         return "stage" if self.structure.has_order_law else self.structure.outputs[0]
 
     def request(self, name: str) -> Request:
-        """As a store keeps it."""
+        """Return the definition that a checkpoint file stores."""
         settings = {n: getattr(self.settings, n) for n in KEPT}
         records = tuple(RecordFile.of(r) for r in self.records)
         # Hints are not written: they tell a fit where to start and change no search.
@@ -81,7 +81,7 @@ class Job:
 
     @classmethod
     def of(cls, request: Request, threads: int, progress: Told | None) -> Job:
-        """From a store; refuse a request that is none."""
+        """Restore a job from a checkpoint file; raise ModelError for an invalid request."""
         try:
             kept: dict[str, Any] = {n: request.settings[n] for n in KEPT}
         except KeyError as error:
@@ -104,7 +104,7 @@ class Job:
         return runs, list(record.inputs), record.start, self.settings
 
     def equation_work(self) -> EquationWork:
-        """What the rounds of one equation are computed from."""
+        """Return the search problem of one equation."""
         item, signals = self.structure.equations[0], self.records[0].signals
         axes = [
             (signals.index(t.signal), axis_of(t.order, self.values), bool(t.order.names) and t.fixed is None)
@@ -117,7 +117,7 @@ class Job:
         )
 
     def stage_work(self) -> StageWork:
-        """What the search of a stage is computed from."""
+        """Return the search problem of coupled equations under their order law."""
         structure, signals = self.structure, self.records[0].signals
         names = structure.order_names
 
@@ -139,7 +139,7 @@ class Job:
         )
 
     def _spreads(self, points: int) -> list[float]:
-        """Each output's deviation, which makes radians of hub and of deflection weigh alike."""
+        """Standard deviation of each output, by which the scores of the equations are weighted."""
         spreads = []
         for output in self.structure.outputs:
             with np.errstate(over="ignore", invalid="ignore"):
@@ -152,7 +152,7 @@ class Job:
 
 
 def run_job(job: Job, *, store: Store | None = None, number: int = 0, executor: Executor | None = None) -> SearchResult:
-    """Search; with a store, as search `number` of it."""
+    """Run a search; with a checkpoint file, as search ``number`` of it."""
     if executor is not None and not isinstance(executor, Executor):
         raise ModelError(
             f"executor = {executor!r} is no executor of concurrent.futures; pass ProcessPoolExecutor(…) or "
@@ -169,7 +169,7 @@ def run_job(job: Job, *, store: Store | None = None, number: int = 0, executor: 
 
 
 def _equation_rows(structure: Structure, found: _core._Found) -> tuple[list[SearchRow], Failures]:
-    """Rows and failures of one equation by the names of its orders and coefficients."""
+    """Return rows and failures of one equation, by names of orders and coefficients."""
     item = structure.equations[0]
 
     def named(alpha: float, orders: list[float]) -> dict[str, float]:
@@ -184,7 +184,7 @@ def _equation_rows(structure: Structure, found: _core._Found) -> tuple[list[Sear
 
 
 def _stage_rows(structure: Structure, found: _core._FoundStage) -> tuple[list[SearchRow], Failures]:
-    """Rows and failures of a stage by the names of its free orders and of all coefficients."""
+    """Return rows and failures of a coupled search, by names of free orders and of all coefficients."""
     names, table = structure.order_names, []
     for rank, (index, score, free, parts) in enumerate(found["rows"], 1):
         coefficients: dict[str, float] = {}
@@ -236,10 +236,10 @@ def search_orders(
     store: str | os.PathLike[str] | None = None,
     executor: Executor | None = None,
 ) -> SearchResult:
-    """Exhaustive search over the orders of an equation, or of a stage under its order law.
+    """Search the orders of an equation, or of coupled equations under an order law, exhaustively over a grid.
 
-    Each candidate gets its coefficients on the equation error, then its score; the table is that of evaluating every
-    candidate to the end, the same bits for any number of threads on one kind of processor (paper Table 2, steps 5-7).
+    Each candidate gets coefficients from the equation error, then a score. The table equals that of a full evaluation
+    of every candidate, bit for bit for any number of threads on one kind of processor (paper Table 2, steps 5-7).
 
     Parameters
     ----------
@@ -302,9 +302,10 @@ def search_orders(
 
     Notes
     -----
-    One Gram matrix of distinct regressors serves all candidates; each costs a k x k solve and a lower bound of its
-    score from a few inner products. Those that the bound does not exclude are run until their partial sum has lost,
-    likely ones first. Candidates are generated by index, so memory does not grow with their number.
+    One Gram matrix of distinct regressors serves all candidates. Each costs a k x k solve and a lower bound of its
+    score from a few inner products. Candidates that the bound does not exclude are simulated, likely ones first, until
+    their partial sum exceeds the threshold. Candidates are generated by index, so memory does not grow with their
+    number.
     """
     if executor is not None and threads is None:
         threads = 1
@@ -418,7 +419,7 @@ def resume_job(
 
 
 def job_of(store: Store, number: int, threads: int | None) -> Job:
-    """One search of a store as what it works on."""
+    """Return one search of a checkpoint file as a job."""
     request = store.contents.requests[number]
     with _usable(store.path, request):
         return Job.of(request, check_threads(threads), None)
@@ -426,7 +427,7 @@ def job_of(store: Store, number: int, threads: int | None) -> Job:
 
 @contextlib.contextmanager
 def _usable(path: str | os.PathLike[str], request: Request) -> Iterator[None]:
-    """Say of a search that makes no sense which one it is, and in which store."""
+    """Raise DataError that names the search and the checkpoint file of an invalid request."""
     try:
         yield
     except ModelError as error:
@@ -436,9 +437,9 @@ def _usable(path: str | os.PathLike[str], request: Request) -> Iterator[None]:
 
 
 def search_status(path: str | os.PathLike[str]) -> dict[str, StoreStatus]:
-    """How far the searches of a store are; it may be in use.
+    """Return the progress of the searches of a checkpoint file, which may be in use.
 
-    Of an unfinished stage under its order law the tables are laid out again, which takes seconds for a fine lattice.
+    For an unfinished search under an order law its tables are computed again, which takes seconds for a fine grid.
 
     Parameters
     ----------
@@ -479,7 +480,7 @@ def search_status(path: str | os.PathLike[str]) -> dict[str, StoreStatus]:
 
 
 def _told(progress: Callable[[int, int], None] | None) -> Told | None:
-    """What the core calls: the bar shows the share pruned too, others are told what is done."""
+    """Return the callback of the core: a progress bar gets the excluded fraction too, other callables do not."""
     if progress is None or isinstance(progress, Progress):
         return progress
     return lambda done, total, _pruned: progress(done, total)
@@ -494,7 +495,7 @@ def landscape(
     orders: tuple[str, str] | None = None,
     threads: int | None = None,
 ) -> Landscape:
-    """Score every pair of values of two orders by the search's own criterion.
+    """Score every pair of values of two orders by the criterion of the search.
 
     Parameters
     ----------
@@ -541,20 +542,20 @@ def landscape(
     return Landscape((names[0], names[1]), x, y, scores)
 
 
-#: Every so manieth value of each order is tried, the coarsest lattices first.
+#: Factors by which each axis of the order grid is subsampled, coarsest first.
 COARSER = (16, 12, 10, 8, 6, 5, 4, 3, 2)
-#: What is tried has at most this share of the candidates; enough is known once it takes so long [s].
+#: Maximum fraction of the candidates in a probing search, and the probing time [s] that suffices for an estimate.
 SHARE, ENOUGH = 1 / 12, 0.3
-#: Time grows as candidates to a power between these: of finer lattices more is excluded.
+#: Range of the exponent of time over candidates. It is below 1 because finer grids exclude more.
 GROWTH = (0.7, 1.1)
-#: Searches came to between these multiples of what coarse lattices told of them.
+#: Range of measured over estimated computing time.
 CAME_TO = (0.6, 4.0)
-#: Candidates from which on whole boxes of them may be excluded, which no coarse lattice shows, and the growth then.
+#: Number of candidates from which on whole boxes may be excluded, not seen on coarse grids, and the exponent then.
 BOXED, IN_BOXES = 1 << 25, 0.5
 
 
 def announce(progress: object, jobs: Sequence[Job], store: Store | None = None) -> None:
-    """Say how long all of these searches take together, where somebody sees it; with a store, what is left of them."""
+    """Report the expected time of all searches on a progress bar; with a checkpoint file, of the remaining work."""
     if not isinstance(progress, Progress) or progress.quiet:
         return
     least = most = 0.0
@@ -566,7 +567,7 @@ def announce(progress: object, jobs: Sequence[Job], store: Store | None = None) 
 
 
 def expected_seconds(job: Job, clock: Callable[[], float] = time.perf_counter) -> tuple[float, float]:
-    """Least and most time that a search is expected to take here [s]; both 0 where its lattice is too small to tell.
+    """Return lower and upper estimate of the time of a search here [s]; both 0 if its grid is too small.
 
     Takes up to a tenth of the search or half a second, whichever is less.
     """
@@ -600,14 +601,14 @@ def expected_seconds(job: Job, clock: Callable[[], float] = time.perf_counter) -
 
 
 def _candidates(job: Job) -> float:
-    """How many candidates a search has; under an order law, points of the lattice."""
+    """Number of candidates of a search; under an order law, points of the order grid."""
     if job.structure.has_order_law:
         return float(math.prod(len(axis) for axis in job.values.values()))
     return float(job.equation_work().plan()[0])
 
 
 def _left(job: Job, store: Store, number: int) -> float:
-    """The share of a search that a store does not hold."""
+    """Fraction of a search that a checkpoint file does not contain."""
     section = store.contents.sections[number]
     if job.structure.has_order_law:
         return 0.0 if section.joined is not None else 1.0

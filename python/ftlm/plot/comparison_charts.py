@@ -1,4 +1,4 @@
-"""Comparisons and residual tests as charts."""
+"""Charts of measured and simulated outputs, residuals and residual tests."""
 
 from __future__ import annotations
 
@@ -18,7 +18,7 @@ from ftlm.validation.residual_tests import CorrelationTest, Residuals
 
 
 def pulse_times(comparison: Comparison, run: int = 0) -> Floats:
-    """Return when each value of a run of a comparison holds [s]: its instants, or the middle of every block pulse."""
+    """Return the time of each value of a run of a comparison [s]: sample times, or block-pulse centers."""
     if comparison.times:
         return comparison.times[run]
     return np.asarray((np.arange(comparison.m) + 0.5) * comparison.step[run], dtype=np.float64)
@@ -27,7 +27,7 @@ def pulse_times(comparison: Comparison, run: int = 0) -> Floats:
 def comparison_charts(
     comparison: Comparison, *, units: Mapping[str, str] | None = None, label: str = "", points: int = POINTS
 ) -> list[Figure]:
-    """Measured and simulated output, a chart for every output of every run.
+    """Chart measured and simulated output, for every output of every run.
 
     Parameters
     ----------
@@ -36,7 +36,7 @@ def comparison_charts(
     units
         Units of the outputs.
     label
-        What the data were to the model, such as "estimation".
+        Role of the data, such as "estimation".
     points
         Most points of a line.
     """
@@ -87,7 +87,7 @@ def input_charts(runs: Sequence[Run], signals: Sequence[str], *, points: int = P
 def residual_series(
     comparison: Comparison, *, units: Mapping[str, str] | None = None, label: str = "", points: int = POINTS
 ) -> list[Figure]:
-    """Residuals of the free run over time and how often each size occurs, for every output of every run.
+    """Chart residuals of the simulation over time and their histogram, for every output of every run.
 
     Parameters
     ----------
@@ -122,7 +122,7 @@ def residual_series(
 def compared_bars(
     compared: Sequence[tuple[str, Sequence[tuple[str, Comparison]]]], *, title: str = "Fit of the free run"
 ) -> list[Figure]:
-    """Fits of several models side by side, a chart for every output.
+    """Chart the fits of several models side by side, for every output.
 
     Parameters
     ----------
@@ -167,7 +167,7 @@ def error_chart(
     units: Mapping[str, str] | None = None,
     points: int = POINTS,
 ) -> Figure:
-    """Absolute error of the free runs of several models on one run, as in the paper's Figure 4(a).
+    """Chart the absolute simulation errors of several models on one run, as in the paper's Figure 4(a).
 
     Parameters
     ----------
@@ -204,14 +204,14 @@ def with_unit(text: str, units: Mapping[str, str] | None, name: str) -> str:
 
 
 def residual_charts(tests: Residuals, *, label: str = "") -> list[Figure]:
-    """Autocorrelation and cross-correlations of the residuals of every output, with their 99 % bands.
+    """Chart autocorrelation and cross-correlations of the residuals of every output, with 99 % bands.
 
     Parameters
     ----------
     tests
         From :func:`ftlm.resid`.
     label
-        What the data were to the model, such as "validation".
+        Role of the data, such as "validation".
     """
     figures = []
     suffix = f", {label}" if label else ""
@@ -242,7 +242,7 @@ def residual_charts(tests: Residuals, *, label: str = "") -> list[Figure]:
 
 
 def _residual_caption(test: CorrelationTest, drawn: Floats, signal: str) -> str:
-    """What the bars of one test show, and what they were judged by; no signal stands for the residual itself."""
+    """Caption of the chart of one test: result and limit; an empty signal means the residual itself."""
     if not test.decided:
         why = f"{signal} does not move" if np.isnan(test.limit) else f"its limit is {number(test.limit)}, above 1"
         return f"Whether the residual follows {signal} is undecided: {why}."

@@ -1,4 +1,4 @@
-"""Figures and axes of matplotlib, made without pyplot so that nothing is kept or shown."""
+"""Matplotlib figures and axes without pyplot, so that no global state is changed."""
 
 from __future__ import annotations
 
@@ -36,21 +36,21 @@ from ftlm.utils.statistics import NORMAL_95
 from ftlm.validation.comparison import Comparison
 from ftlm.validation.residual_tests import Residuals
 
-#: Width of a figure, and height of one row of axes [inches]: a journal's double column.
+#: Width of a figure and height of one row of axes [inch]; the width is a journal's double column.
 WIDTH, ROW = 7.0, 2.2
 #: Resolution in a notebook.
 NOTEBOOK_DPI = 110
 
 
 def figure_of(rows: int, columns: int = 1, *, row: float = ROW, **options: Any) -> tuple[Any, Any]:
-    """A figure with a grid of axes, made without pyplot so that nothing is kept or shown."""
+    """Return a figure with a grid of axes, created without pyplot."""
     try:
         module = importlib.import_module("matplotlib.figure")
     except ImportError:
         raise ModelError("matplotlib is not installed; pip install 'ftlm[plot]'") from None
 
     class Drawing(module.Figure):  # type: ignore[misc, name-defined]
-        """A figure that a notebook shows although pyplot does not know it."""
+        """Figure that notebooks show although pyplot does not manage it."""
 
         def _repr_png_(self) -> bytes:
             data = io.BytesIO()
@@ -62,7 +62,7 @@ def figure_of(rows: int, columns: int = 1, *, row: float = ROW, **options: Any) 
 
 
 def axes_for(ax: Any, rows: int, columns: int = 1, **options: Any) -> tuple[Any, Any]:
-    """The axes that were given, or those of a new figure: (figure, grid of rows by columns)."""
+    """Return (figure, grid of rows by columns) from the given axes or a new figure."""
     if ax is None:
         return figure_of(rows, columns, **options)
     given = np.atleast_1d(np.asarray(ax, dtype=object)).ravel()
@@ -78,16 +78,16 @@ def axes_for(ax: Any, rows: int, columns: int = 1, **options: Any) -> tuple[Any,
 
 
 def plain(text: str) -> str:
-    """Text that matplotlib does not take for mathematics, whatever a name holds."""
+    """Escape text for matplotlib's math mode."""
     return text.replace("$", r"\$")
 
 
 def label_of(name: str, units: Mapping[str, str]) -> str:
-    """A signal's name with its unit."""
+    """Return a signal's symbol with its unit."""
     return plain(with_unit(symbol(name), units, name))
 
 
-#: A fit has its error beneath it at this share of its height.
+#: Height of a residual plot relative to the fit plot above it.
 BENEATH = 0.4
 
 
@@ -98,7 +98,7 @@ def fit(
     inputs: bool = False,
     ax: Any = None,
 ) -> Any:
-    """Measured and simulated outputs, the residual beneath each.
+    """Plot measured and simulated outputs, with the residual below each.
 
     Parameters
     ----------
@@ -176,7 +176,7 @@ def fit(
 
 
 def _runs_of(result: Identification | Model | Comparison, runs: Run | Sequence[Run] | None) -> list[Run]:
-    """The runs of a comparison, for their inputs."""
+    """Return the runs of a comparison, for their inputs."""
     if runs is not None:
         return [runs] if isinstance(runs, Run) else list(runs)
     task = result.task if isinstance(result, Identification) else None
@@ -186,7 +186,7 @@ def _runs_of(result: Identification | Model | Comparison, runs: Run | Sequence[R
 
 
 def _line_of(axis: Any, run: Run, name: str) -> None:
-    """One signal of a run: outputs as they were read, commands held between rows."""
+    """Plot one signal of a run; zero-order-hold inputs as steps."""
     held = run.intersample.get(name) == "zoh"
     axis.plot(
         run.time,
@@ -200,7 +200,7 @@ def _line_of(axis: Any, run: Run, name: str) -> None:
 
 
 def run(run: Run, *, ax: Any = None) -> Any:
-    """A run as it was recorded: its outputs, and its inputs below them.
+    """Plot the outputs and inputs of a run.
 
     Parameters
     ----------
@@ -230,7 +230,7 @@ def run(run: Run, *, ax: Any = None) -> Any:
 
 
 def residuals(tests: Residuals | Identification, *, ax: Any = None) -> Any:
-    """Correlations of the residuals with themselves and with every input, with their 99 % bands.
+    """Plot correlations of the residuals with themselves and with every input, with 99 % bands.
 
     Parameters
     ----------
@@ -273,7 +273,7 @@ def residuals(tests: Residuals | Identification, *, ax: Any = None) -> Any:
 
 
 def landscape(result: Identification | Landscape, output: str | None = None, *, ax: Any = None) -> Any:
-    """Score of an order search, or cost of a joint fit, over two of its orders.
+    """Plot the score of an order search, or the cost of a joint fit, over two orders.
 
     Parameters
     ----------
@@ -327,7 +327,7 @@ def landscape(result: Identification | Landscape, output: str | None = None, *, 
 
 
 def bode(model: Model | Identification, w: ArrayLike | None = None, *, ax: Any = None) -> Any:
-    """Gain and phase of every output from every input, with 95 % bands where the model has a covariance.
+    """Plot gain and phase of every pair of output and input, with 95 % bands if the model has a covariance.
 
     Parameters
     ----------
@@ -369,7 +369,7 @@ def bode(model: Model | Identification, w: ArrayLike | None = None, *, ax: Any =
 
 
 def _model_of(model: Model | Identification) -> Model:
-    """The model that was meant; refuses what is none."""
+    """Return the model of an argument; raise for another type."""
     found = model.model if isinstance(model, Identification) else model
     if not isinstance(found, Model):
         raise ModelError(f"model is {type(model).__name__}; give a model or an identification")
@@ -377,7 +377,7 @@ def _model_of(model: Model | Identification) -> Model:
 
 
 def poles(model: Model | Identification, *, ax: Any = None) -> Any:
-    """Poles in the plane of s^q with the sector in which they make a model grow; s itself for whole orders.
+    """Plot poles in the plane of s^q (s for integer orders) with the unstable sector.
 
     Parameters
     ----------
@@ -417,7 +417,7 @@ def poles(model: Model | Identification, *, ax: Any = None) -> Any:
 
 
 def step(model: Model | Identification, time: ArrayLike | None = None, *, ax: Any = None) -> Any:
-    """Answer to unit steps from rest, with its 95 % band where the model has a covariance.
+    """Plot the response to unit steps from rest, with its 95 % band if the model has a covariance.
 
     Parameters
     ----------
@@ -444,7 +444,7 @@ def step(model: Model | Identification, time: ArrayLike | None = None, *, ax: An
 
 
 def impulse(model: Model | Identification, time: ArrayLike | None = None, *, ax: Any = None) -> Any:
-    """Answer to unit impulses, as the mean over each interval; else as :func:`step`."""
+    """Plot the response to unit impulses, averaged over each interval; otherwise as :func:`step`."""
     return _answered(_model_of(model).impulse(time), ax)
 
 
@@ -464,7 +464,7 @@ def _answered(found: Answer, ax: Any) -> Any:
 
 
 def correlation(result: Identification, *, ax: Any = None) -> Any:
-    """Correlations of the estimates of a joint fit, with their numbers.
+    """Plot the correlation matrix of the estimates of a joint fit.
 
     Parameters
     ----------
@@ -502,7 +502,7 @@ def correlation(result: Identification, *, ax: Any = None) -> Any:
 
 
 def residual_series(result: Identification | Comparison, *, ax: Any = None) -> Any:
-    """Residuals of the free run over time, and how often each size occurs.
+    """Plot output-error residuals over time and their histogram.
 
     Parameters
     ----------
@@ -540,7 +540,7 @@ def residual_series(result: Identification | Comparison, *, ax: Any = None) -> A
 
 
 def models(compared: Mapping[str, Comparison], *, ax: Any = None) -> Any:
-    """Fits of the free runs of several models on the same runs, as bars.
+    """Plot the fits of several models on the same runs as bars.
 
     Parameters
     ----------
@@ -592,12 +592,12 @@ def models(compared: Mapping[str, Comparison], *, ax: Any = None) -> Any:
 
 
 def design(result: DesignedInput, *, ax: Any = None) -> Any:
-    """A designed input, the answer it is predicted to have beside that to the square, limits and spectrum.
+    """Plot a designed input, its predicted response beside that to a square wave, limits and spectrum.
 
     Parameters
     ----------
     result
-        What :func:`ftlm.design_input` returns.
+        Result of :func:`ftlm.design_input`.
     ax
         Axes to draw into, as many as the figure would have; by default those of a new figure.
 
@@ -609,7 +609,7 @@ def design(result: DesignedInput, *, ax: Any = None) -> Any:
     Raises
     ------
     ModelError
-        Something that is no designed input, axes that are none or too many or few, or no matplotlib.
+        Another type of result, the wrong number of axes, or no matplotlib.
     """
     if not isinstance(result, DesignedInput):
         raise ModelError(f"result is {type(result).__name__}; give what design_input returns")
@@ -634,7 +634,7 @@ def design(result: DesignedInput, *, ax: Any = None) -> Any:
 
 
 def _draw_spectrum(axis: Any, result: DesignedInput) -> None:
-    """Share of the power below each frequency: sums tell spectra with few lines from one another."""
+    """Plot the cumulative power spectrum, which separates line spectra better than the spectrum itself."""
     rows = result.run.length - 1
     frequencies = np.fft.rfftfreq(rows, result.step)
     for shown, color, label in (
@@ -669,14 +669,14 @@ def _draw_spectrum(axis: Any, result: DesignedInput) -> None:
 def response(
     result: FrequencyIdentification | Model, data: FrequencyData | FrequencyValidation | None = None, *, ax: Any = None
 ) -> Any:
-    """Gain and phase of measured responses with the model's curve and its 95 % band.
+    """Plot gain and phase of measured frequency responses with the model's curve and its 95 % band.
 
     Parameters
     ----------
     result
-        What :func:`ftlm.identify_frequency` found, or a model.
+        Result of :func:`ftlm.identify_frequency`, or a model.
     data
-        Responses to draw; by default those of the fit. A model needs some.
+        Responses to draw, by default those of the fit; required for a model.
     ax
         Axes to draw into, as many as the figure would have; by default those of a new figure.
 
@@ -688,7 +688,7 @@ def response(
     Raises
     ------
     ModelError
-        Something that is no result, a model without data, axes that are none or too many or few, or no matplotlib.
+        Another type of result, a model without data, the wrong number of axes, or no matplotlib.
     DataError
         Data of signals that the model does not have.
     """
@@ -724,7 +724,7 @@ def response(
 def nyquist(
     result: FrequencyIdentification | Model, data: FrequencyData | FrequencyValidation | None = None, *, ax: Any = None
 ) -> Any:
-    """Measured responses in the complex plane with the model's curve, one unit in both directions.
+    """Plot measured frequency responses and the model's curve in the complex plane with equal axis units.
 
     Parameters
     ----------
@@ -772,7 +772,7 @@ def nyquist(
 def _given(
     result: FrequencyIdentification | Model, data: FrequencyData | FrequencyValidation | None
 ) -> tuple[Model, list[FrequencyData]]:
-    """The model and the records that were meant."""
+    """Return the model and the frequency data of the arguments."""
     if not isinstance(result, (FrequencyIdentification, Model)):
         raise ModelError(f"result is {type(result).__name__}; give what identify_frequency returns, or a model")
     if isinstance(result, FrequencyIdentification):

@@ -1,4 +1,4 @@
-"""A model in the frequency domain as charts."""
+"""Bode, pole and response charts of a model."""
 
 from __future__ import annotations
 
@@ -21,12 +21,12 @@ from ftlm.utils.formatting import symbol
 from ftlm.utils.statistics import NORMAL_95
 from ftlm.utils.validation import Complex, Floats
 
-#: A natural logarithm of a gain in decibels.
+#: Decibels per unit of the natural logarithm of a gain.
 DECIBEL = 20.0 / math.log(10.0)
 
 
 def response_frequencies(model: Solved, step: float | None = None, duration: float | None = None) -> Floats:
-    """Frequencies at which a model is worth looking at: from one period in a record to half the sampling rate."""
+    """Default frequencies [rad/s] of a response: from one period per record to half the sampling rate."""
     if step is not None and duration is not None:
         return np.geomspace(2 * math.pi / duration, math.pi / step, 240)
     corner = []
@@ -38,21 +38,21 @@ def response_frequencies(model: Solved, step: float | None = None, duration: flo
 
 
 def bode_charts(model: Solved, w: ArrayLike | None = None) -> list[Figure]:
-    """Gain and phase of every output from every input that is not modelled, with 95 % bands where they are known.
+    """Return gain and phase charts for every pair of output and external input, with 95 % bands if known.
 
     Parameters
     ----------
     model
         The model.
     w
-        Frequencies [rad/s]; by default around the model's own.
+        Frequencies [rad/s]; by default around the corner frequencies of the model.
     """
     omega = response_frequencies(model) if w is None else np.asarray(w, dtype=np.float64)
     return drawn_bode(omega, bode_curves(model, omega))
 
 
 def drawn_bode(omega: Floats, curves: Sequence[BodeCurve]) -> list[Figure]:
-    """Gain and phase of these curves."""
+    """Return the gain and phase charts of some curves."""
     figures = []
     for curve in curves:
         title = f"{symbol(curve.output)} from {symbol(curve.input)}"
@@ -80,7 +80,7 @@ def drawn_bode(omega: Floats, curves: Sequence[BodeCurve]) -> list[Figure]:
 
 
 def pole_points(model: Solved) -> tuple[float, Complex]:
-    """Order q of the plane, and the poles in it with their conjugates; none of a model with friction."""
+    """Order q of the plane s^q and the poles in it with their conjugates; empty for a model with friction."""
     q = plane_order(model)
     found = () if model.structure.has_friction else modes(model)
     points = []
@@ -94,14 +94,14 @@ def pole_points(model: Solved) -> tuple[float, Complex]:
 
 
 def pole_charts(model: Solved) -> list[Figure]:
-    """Poles in the plane of s^q, q the highest order over the next whole number, with the sector that is not stable.
+    """Return the pole chart in the plane of s^q, q the highest order over the next integer, with the unstable sector.
 
-    Empty for a model with friction, which has none, and for one without poles.
+    Empty for a model with friction or without poles.
 
     Parameters
     ----------
     model
-        Any.
+        Any model.
     """
     q, points = pole_points(model)
     if not points.size:
@@ -127,7 +127,7 @@ def pole_charts(model: Solved) -> list[Figure]:
 
 
 def plane_order(model: Solved) -> float:
-    """Order q of the plane s^q in which the poles of a model are shown: 1 for whole orders, else between 0.5 and 1."""
+    """Order q of the pole plane s^q: 1 for integer orders, else between 0.5 and 1."""
     orders = [e.order.constant for e in model.equations]
     orders += [t.order.constant for e in model.equations for t in e.terms]
     highest = max(orders)
@@ -137,7 +137,7 @@ def plane_order(model: Solved) -> float:
 
 @dataclass(frozen=True)
 class BodeCurve:
-    """Gain [dB] and phase [degrees] of one output from one input, and half-widths of their 95 % bands or None."""
+    """Gain [dB] and phase [degrees] of one output from one input, with half-widths of 95 % bands or None."""
 
     output: str
     input: str
@@ -148,7 +148,7 @@ class BodeCurve:
 
 
 def bode_curves(model: Solved, omega: Floats) -> list[BodeCurve]:
-    """Curves of all pairs in which the input reaches the output; Coulomb terms are not linear and have none."""
+    """Return the curves of all connected pairs of input and output; Coulomb friction is omitted."""
     response = frequency_response(model, omega)
     spread = None
     if model.estimate is not None and model.estimate.covariance is not None:
@@ -172,14 +172,14 @@ def bode_curves(model: Solved, omega: Floats) -> list[BodeCurve]:
 
 @dataclass(frozen=True)
 class Bode:
-    """A frequency response to look at; what :meth:`ftlm.Model.bode` returns.
+    """Frequency response with charts, the result of :meth:`ftlm.Model.bode`.
 
     Parameters
     ----------
     frequency
         [rad/s], shape (W,).
     curves
-        Gain [dB], phase [degrees] and half-widths of their 95 % bands, of every input that reaches an output.
+        Gain [dB], phase [degrees] and half-widths of their 95 % bands for every connected pair of input and output.
     """
 
     frequency: Floats
@@ -200,21 +200,21 @@ class Bode:
 
 
 def bode(model: Solved, w: ArrayLike | None = None) -> Bode:
-    """Frequency response of a model to look at; see :meth:`ftlm.Model.bode`."""
+    """Return the frequency response of a model with charts; see :meth:`ftlm.Model.bode`."""
     check_solved(model)
     omega = response_frequencies(model) if w is None else np.asarray(w, dtype=np.float64)
     return Bode(omega, tuple(bode_curves(model, omega)))
 
 
 def response_charts(found: Response, *, units: Mapping[str, str] | None = None) -> list[Figure]:
-    """Answers to steps or impulses, a chart for every input that reaches an output, with 95 % bands.
+    """Return step or impulse response charts of every connected pair of input and output, with 95 % bands.
 
     Parameters
     ----------
     found
-        The answers, at which instants, and their deviations.
+        Responses, sample times and standard deviations.
     units
-        Of signals, by name.
+        Units of the signals by name.
     """
     figures = []
     for i, output in enumerate(found.outputs):
@@ -245,15 +245,15 @@ def response_charts(found: Response, *, units: Mapping[str, str] | None = None) 
 
 @dataclass(frozen=True)
 class Answer(Response):
-    """A step or impulse response that draws itself; what :meth:`ftlm.Model.step` returns.
+    """Step or impulse response with charts, the result of :meth:`ftlm.Model.step`.
 
     Parameters
     ----------
     kind, outputs, inputs, time, values, deviation
-        ``"step"`` or ``"impulse"``; names; instants [s], shape (N,); values and their standard deviations (or None),
-        shape (outputs, inputs, N). An impulse has the mean of its answer over each interval, at the interval's middle.
+        ``"step"`` or ``"impulse"``; names; sample times [s], shape (N,); values and their standard deviations (or
+        None), shape (outputs, inputs, N). An impulse response is the mean over each interval, at its middle.
     units
-        Of the signals.
+        Units of the signals.
     """
 
     units: Mapping[str, str] = field(default_factory=dict)
@@ -280,6 +280,6 @@ class Answer(Response):
 
 
 def answer(model: Solved, time: ArrayLike | None, kind: str) -> Answer:
-    """Response of a model to look at; see :meth:`ftlm.Model.step`."""
+    """Return a step or impulse response of a model with charts; see :meth:`ftlm.Model.step`."""
     found = response(model, time, kind=kind)
     return Answer(**vars(found), units=dict(model.units))

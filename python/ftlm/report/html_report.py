@@ -1,4 +1,4 @@
-"""The first things on a page: verdict, warnings in groups, equations, what the model does by itself."""
+"""Top of a report page: verdict, grouped warnings, equations, poles, modes and steady-state gain."""
 
 from __future__ import annotations
 
@@ -40,13 +40,13 @@ from ftlm.validation.findings import SHOWN, concerns
 from ftlm.validation.information_criteria import InformationCriteria, information_table
 from ftlm.validation.residual_tests import LAGS, Residuals, resid, residual_table
 
-#: Figures of what a model does by itself, on a page.
+#: Largest number of pole maps and step responses on a page.
 MOST_FIGURES = 9
 _LOOKS = {"trust": "trust", "with care": "care", "do not use": "not"}
 
 
 def verdict_box(judged: Verdict, of: str = "") -> Markup:
-    """A verdict as the first box of a page, perhaps of one of several; its word says what its colour says."""
+    """Return a verdict as the first box of a page; `of` names the model if there are several."""
     remedy = Markup(' <span class="todo">→ {}</span>').format(judged.remedy) if judged.remedy else ""
     return Markup('<div class="first {}" role="note"><strong>{}</strong>{}{}</div>').format(
         _LOOKS[judged.level],
@@ -57,7 +57,7 @@ def verdict_box(judged: Verdict, of: str = "") -> Markup:
 
 
 def first_warnings(warnings: Sequence[str]) -> tuple[list[str], list[str]]:
-    """At most three groups of warnings with what to do, the most serious first, and all warnings that are left."""
+    """Split warnings into the most serious groups, with remedies, and the remaining warnings."""
     found = concerns(warnings)
     shown: list[str] = []
     left: list[str] = []
@@ -73,7 +73,7 @@ def first_warnings(warnings: Sequence[str]) -> tuple[list[str], list[str]]:
 
 
 def title_of(model: Model) -> str:
-    """What a page about a model is called."""
+    """Return the page title of a model."""
     structure = model.structure
     if structure.name != "equation":
         return structure.name
@@ -83,7 +83,7 @@ def title_of(model: Model) -> str:
 
 
 def behaviour_tables(model: Model) -> list[Table]:
-    """Steady state and modes with standard errors; nothing of what has none."""
+    """Return tables of steady-state gains and modes with standard errors; empty if the model has none."""
     if model.structure.has_friction:
         return []
     tables = []
@@ -135,7 +135,7 @@ def behaviour_tables(model: Model) -> list[Table]:
 
 
 def behaviour_figures(model: Model) -> list[Figure]:
-    """Pole map and step responses; nothing of what has none, or leaves the range of numbers."""
+    """Return pole maps and step responses; outputs without poles or with overflow are omitted."""
     figures: list[Figure] = []
     if model.structure.has_friction or model.structure.limits:
         return figures
@@ -156,14 +156,14 @@ NOTEBOOK_POINTS = 600
 SERIES_POINTS = 600
 #: Points of a convergence curve.
 TRACE_POINTS = 64
-#: Of a model with friction, where others have their stability.
+#: Text for models with friction, in place of their stability.
 STICKS = "The body rests while friction holds it, so that no poles say how it comes to rest."
 
 
 def identification_page(
     result: Judged, path: str | os.PathLike[str], *, validation: Run | Sequence[Run] | None = None, force: bool = False
 ) -> Path:
-    """Write the report of one identification.
+    """Write the HTML report of one identification.
 
     Parameters
     ----------
@@ -230,7 +230,7 @@ def first_sections(
     joint: JointFit | None,
     runs: Sequence[Run] = (),
 ) -> list[Section]:
-    """Warnings, equations, what the model does by itself, errors, charts with the inputs below."""
+    """Return the sections on warnings, equations, modes and errors, with output and input charts."""
     units = model.units
     words = [
         "No check raised a warning. Checked: free run against equation error, orders close to one another or on the "
@@ -270,7 +270,7 @@ def first_sections(
 def _with_inputs(
     model: Model, compared: Sequence[tuple[str, Comparison]], runs: Sequence[Run], points: int
 ) -> list[Figure]:
-    """Outputs of each run measured and simulated, and below them what drove them, where the runs are at hand."""
+    """Return charts of measured and simulated outputs of each run, followed by its inputs if available."""
     inputs = [s for s in model.structure.signals if s not in model.outputs]
     left, drawn = list(runs), []
     for label, comparison in compared:
@@ -284,12 +284,12 @@ def _with_inputs(
 
 
 def tests_on(model: Model, runs: Sequence[Run]) -> list[tuple[str, Residuals]]:
-    """Residual tests of each run that is long enough for them."""
+    """Return the residual tests of each run that is long enough."""
     return [("validation", resid(model, run)) for run in runs if run.length >= 2 * LAGS + 3]
 
 
 def correlation_sections(joint: JointFit | None) -> list[Section]:
-    """How the numbers of a joint fit go together; nothing for one number, or where there is no covariance."""
+    """Return the correlation matrix of a joint fit; empty for one parameter or without covariance."""
     if joint is None or len(joint.names) < 2:
         return []
     words = (
@@ -307,7 +307,7 @@ def residual_section(
     compared: Sequence[tuple[str, Comparison]] = (),
     units: Mapping[str, str] | None = None,
 ) -> Section:
-    """Residual tests, information criteria, residuals over time and how often, correlations as charts."""
+    """Return residual tests, information criteria, residual series, histograms and correlations."""
     tables = [residual_table(t, title=f"{label}: {', '.join(t.runs)}") for label, t in tests]
     if information is not None:
         tables.append(information_table(information))
@@ -319,7 +319,7 @@ def residual_section(
 
 
 def frequency_section(model: Model, steps: Sequence[tuple[float, float]]) -> Section:
-    """Gain and phase as far as runs of these steps and durations show them."""
+    """Return Bode charts over the frequency range of runs with these steps and durations."""
     if model.structure.has_friction:
         words = "A body that may stick has none: its answer is not in proportion to what drives it."
         return Section("Frequency response", words)
@@ -336,7 +336,7 @@ def frequency_section(model: Model, steps: Sequence[tuple[float, float]]) -> Sec
 
 
 def _search_sections(result: Judged) -> list[Section]:
-    """Convergence of the recursion, and the order search with its landscape."""
+    """Return the convergence of the recursion and the order search with its score maps."""
     sections = []
     traces = _traces(result)
     if traces:
@@ -364,7 +364,7 @@ def _search_sections(result: Judged) -> list[Section]:
 
 
 def _maps(task: Task, searches: Mapping[str, SearchResult]) -> list[Figure]:
-    """Landscapes of the searches over more than one order; of one alone its table says all."""
+    """Return score maps of the searches over two or more orders; a table suffices for one."""
     maps = []
     for name, search in searches.items():
         part = task.structure if name == "stage" else task.structure.equation(name)
@@ -375,7 +375,10 @@ def _maps(task: Task, searches: Mapping[str, SearchResult]) -> list[Figure]:
 
 
 def _traces(result: Judged) -> list[Figure]:
-    """The recursion at the orders found, for the paper's p and the one used, where the first run starts at rest."""
+    """Return the recursion at the orders found, for the paper's p and the one used.
+
+    Empty if the first run does not start at rest.
+    """
     if result.task is None or result.method != "multi-innovation" or result.settings["initial"] != "rest":
         return []
     if "offset" in result.settings:
@@ -401,7 +404,7 @@ def _traces(result: Judged) -> list[Figure]:
 
 
 def lead_of(compared: Sequence[tuple[str, Comparison]]) -> str:
-    """Return the fits of the free runs, in a sentence a data set."""
+    """Return the fit percentages of the simulations, one sentence for each data set."""
     sentences = []
     for label, comparison in compared:
         fits = ", ".join(f"{symbol(name)} {number(fit, 4)}\u00a0%" for name, fit in comparison.fit_percent.items())
@@ -411,7 +414,7 @@ def lead_of(compared: Sequence[tuple[str, Comparison]]) -> str:
 
 
 def estimates_table(result: Judged | None, truth: Mapping[str, float] | None = None) -> Table:
-    """Orders and coefficients of a joint fit with intervals, beside their true values where those are known."""
+    """Return orders and coefficients of a joint fit with intervals, and true values if known."""
     rows: list[list[Cell]] = []
     if result is not None and result.joint is not None:
         for name, value in {**result.orders, **result.joint.coefficients}.items():
@@ -426,7 +429,7 @@ def estimates_table(result: Judged | None, truth: Mapping[str, float] | None = N
 
 
 def grouped_warnings(results: Mapping[str, Judged | None]) -> list[str]:
-    """Warnings of several results by label, those that differ in numbers alone together."""
+    """Return warnings of several results by label, merging those that differ only in numbers."""
     groups: dict[str, tuple[str, list[str]]] = {}
     for label, result in results.items():
         for warning in () if result is None else result.warnings:
@@ -440,7 +443,7 @@ def grouped_warnings(results: Mapping[str, Judged | None]) -> list[str]:
 
 
 def starts_table(joint: JointFit, *, rows: int = 10, title: str = "Automatic starts") -> Table:
-    """Return where the first fits began and how far each came on thinned samples, best first."""
+    """Return the initial guesses and their costs on decimated samples, best first."""
     kept = joint.starts[:rows]
     cells: list[list[Cell]] = [[k + 1, origin, level] for k, (level, origin) in enumerate(kept)]
     note = f"{joint.choice}. The best ones went on on all samples." if joint.starts else ""
@@ -448,7 +451,7 @@ def starts_table(joint: JointFit, *, rows: int = 10, title: str = "Automatic sta
 
 
 def settings_table(result: Judged, *, title: str = "What the result depends on") -> Table:
-    """Return what the result depends on besides the data: estimator, criterion, M, p, K₀, initial terms, runs."""
+    """Return a table of the settings of a result: estimator, criterion, M, p, K0, initial terms and runs."""
     structure, comparison = result.model.structure, result.comparison
     rows: list[list[Cell]] = [
         ["structure", structure.name],
@@ -468,12 +471,12 @@ def settings_table(result: Judged, *, title: str = "What the result depends on")
     return Table(title, ("setting", "used"), rows)
 
 
-#: A verdict in a sentence.
+#: Phrases for the result of the independence test.
 _INDEPENDENCE = {"yes": "independent of", "no": "not independent of", "undecided": "perhaps independent of"}
 
 
 def identification_html(result: Judged) -> str:
-    """Return warnings, equations, parameters with intervals, both errors and the residual verdicts."""
+    """Return warnings, equations, parameters with intervals, both errors and residual tests as HTML."""
     model = result.model
     parts = [verdict_html(verdict(result))]
     parts += [Markup("<p>{}</p>").format(e) for e in equations_html(model, result.comparison.offsets)]
@@ -504,7 +507,7 @@ def identification_html(result: Judged) -> str:
 def model_page(
     model: Model, path: str | os.PathLike[str], *, validation: Run | Sequence[Run] | None = None, force: bool = False
 ) -> Path:
-    """Write the report of a saved model: what its file knows of its identification, and validation runs.
+    """Write the HTML report of a saved model: identification results from its file, and validation runs.
 
     Parameters
     ----------

@@ -1,4 +1,4 @@
-"""The first screen of a result: verdict, model, what it does, how well it fits, and what speaks against it."""
+"""Text summary of a result and its settings."""
 
 from __future__ import annotations
 
@@ -28,7 +28,7 @@ MOST_MODES = 6
 
 
 def summary(result: Judged, validation: Comparison | None = None) -> str:
-    """The first screen as text."""
+    """Return the summary of a result as text."""
     judged = verdict(result, validation)
     lines = [*wrapped(str(judged)), ""]
     lines += equations_in_words(result.model, result.comparison)
@@ -39,7 +39,7 @@ def summary(result: Judged, validation: Comparison | None = None) -> str:
 
 
 def equations_in_words(model: Model, comparison: Comparison | None = None) -> list[str]:
-    """Equations with delays, limits, friction, and offsets as they were estimated where there is one run."""
+    """Return the equations with delays, limits and friction, and with offsets if there is one run."""
     structure = model.structure
     lines = []
     for item in model.equations:
@@ -50,7 +50,7 @@ def equations_in_words(model: Model, comparison: Comparison | None = None) -> li
 
 
 def _readable(item: Equation) -> Equation:
-    """The equation with orders of four decimals, and those within that of 0 at 0."""
+    """Return the equation with orders rounded to four decimals."""
     new = copy.copy(item)
     terms = tuple(replace(t, order=Order(round(t.order.constant, ORDER_DECIMALS) + 0.0)) for t in item.terms)
     vars(new).update(order=Order(round(item.order.constant, ORDER_DECIMALS)), terms=terms)
@@ -58,7 +58,7 @@ def _readable(item: Equation) -> Equation:
 
 
 def _offset(output: str, comparison: Comparison | None) -> str | None:
-    """The offset of one run as the last terms of an equation; None where there is none, or where runs differ."""
+    """Return the offset of the only run as terms of an equation; None without one, or with several runs."""
     if comparison is None or len(comparison.offsets) != 1 or not comparison.offsets[0].get(output):
         return None
     parts = comparison.offsets[0][output]
@@ -67,7 +67,7 @@ def _offset(output: str, comparison: Comparison | None) -> str | None:
 
 
 def numbers_in_words(result: Judged) -> list[str]:
-    """Orders and coefficients with standard errors, units, and the values that a maker states."""
+    """Return orders and coefficients with standard errors, units and nominal values, one line each."""
     errors, units, stated = result.standard_errors, units_of(result.model), result.model.structure.reference
     values = {**result.orders, **result.joint_values, **result.coefficients}
     rows = []
@@ -87,7 +87,7 @@ def numbers_in_words(result: Judged) -> list[str]:
 
 
 def behaviour_in_words(model: Model) -> list[str]:
-    """Steady-state gain and modes, as far as the model has them."""
+    """Return lines on steady-state gains and modes, if the model has them."""
     if model.structure.has_friction:
         return ["  no poles, no gain: a body that may stick answers out of proportion"]
     lines: list[str] = []
@@ -105,14 +105,14 @@ def behaviour_in_words(model: Model) -> list[str]:
 
 
 def mode_in_words(mode: Mode) -> str:
-    """A mode with its pole."""
+    """Describe a mode and its pole."""
     s = mode.pole
     where = f"{s.real:.4g} ± {abs(s.imag):.4g}j" if mode.swings else f"{s.real:.4g}"
     return f"{mode}; pole {where}"
 
 
 def gain_in_words(state: SteadyState, model: Model) -> str:
-    """A steady state, or how it runs on."""
+    """Describe a steady-state gain, or the growth of an output without steady state."""
     pair = f"{state.output} from {state.input}"
     above, below = (model.units.get(n, "") for n in (state.output, state.input))
     unit = f" {above}/{below}" if above and below else ""
@@ -126,7 +126,7 @@ def gain_in_words(state: SteadyState, model: Model) -> str:
 
 
 def order_in_words(state: SteadyState) -> str:
-    """How sure the order is with which an output runs on, where that was estimated; and whether it may be another."""
+    """Describe the uncertainty of the order with which an output grows, if it was estimated."""
     error = state.order_error
     if not error:
         return ""
@@ -137,7 +137,7 @@ def order_in_words(state: SteadyState) -> str:
 
 
 def fits_in_words(result: Judged, validation: Comparison | None) -> list[str]:
-    """Fit of the free run on estimation and on validation, and what the equation error says."""
+    """Return lines on the simulation fit on estimation and validation data, and on the equation error."""
     width = max(len(o) for o in result.output_error) + 2
     lines = [f"{'fit of the free run, %':<24}{'estimation':>12}{'validation':>12}{'RMSE':>12}"]
     for output, own in result.output_error.items():
@@ -158,7 +158,7 @@ def _residuals(result: Judged) -> list[str]:
 
 
 def _starts(result: Judged) -> list[str]:
-    """Offsets that are no number of the equations above, and runs that start in motion."""
+    """Return lines on offsets outside the equations, and on runs with nonzero initial conditions."""
     comparison = result.comparison
     shown = {o for o in result.output_error if _offset(o, comparison) is not None}
     hidden = any(o not in shown for run in comparison.offsets for o in run)
@@ -174,7 +174,7 @@ def _starts(result: Judged) -> list[str]:
 
 
 def concerns_in_words(warnings: Sequence[str], how: str = "print(result.details())") -> list[str]:
-    """At most three groups of warnings, the most serious first, with what to do; and where the others are."""
+    """Return up to three groups of warnings with remedies, most serious first."""
     found = concerns(warnings)
     lines = []
     for concern in found[:SHOWN]:
@@ -191,7 +191,7 @@ NORMS = {"l1": "sum of absolute errors (45)", "l2": "RMSE (46)"}
 
 
 def settings_in_words(settings: Mapping[str, Any]) -> str:
-    """On one line."""
+    """Return the settings on one line."""
     words = f"M = {settings['m']}"
     if "refinement" in settings:
         words = f"all samples, {settings['refinement']} pulses each, {settings['starts']} starts"
@@ -212,7 +212,7 @@ def settings_in_words(settings: Mapping[str, Any]) -> str:
 
 
 def robust_in_words(settings: Mapping[str, Any]) -> str:
-    """What a robust loss did."""
+    """Return a summary of the robust loss as text."""
     return (
         f"{settings['lowered']} of {settings['samples']} residuals down-weighted, {settings['outliers']} of them "
         "beyond five deviations"
@@ -220,7 +220,7 @@ def robust_in_words(settings: Mapping[str, Any]) -> str:
 
 
 def settings_rows(settings: Mapping[str, Any], *, searched: bool) -> list[list[Cell]]:
-    """As rows of a table; what ranks orders only where they were searched."""
+    """Return the settings as table rows; the ranking criterion only if orders were searched."""
     rows: list[list[Cell]] = [["block pulses a run, M", int(settings["m"])]]
     if "innovation_length" in settings:
         rows += [

@@ -1,4 +1,4 @@
-"""A model typeset: equations as MathML, parameters as a table."""
+"""Typesetting: equations as MathML, parameters as a table."""
 
 from __future__ import annotations
 
@@ -19,7 +19,7 @@ from ftlm.svg.html_page import Table
 from ftlm.utils.formatting import GREEK, SYMBOL, Cell, Exact, number, symbol, symbol_html, unbounded
 from ftlm.utils.statistics import NORMAL_95
 
-#: Decimals of an order in an equation; the model's file has them all.
+#: Decimals of an order in an equation; the model file stores all digits.
 ORDER_DECIMALS = 4
 THIN = Markup('<mspace width="0.17em"></mspace>')  # our constant
 _LATE = Markup("<mrow><mo>(</mo><mi>t</mi><mo>−</mo>{}{}<mi>s</mi><mo>)</mo></mrow>")
@@ -36,19 +36,18 @@ def equation_html(
     limits: Sequence[Limit] = (),
     offset: Mapping[str, float] | str = "",
 ) -> Markup:
-    """Return an identified equation typeset as MathML, a piece for each term so that it breaks between terms.
+    """Return an identified equation as MathML, one element per term so that lines break between terms.
 
     Parameters
     ----------
     item
-        The equation.
+        Equation.
     delay
         Delays of inputs [s]; a delayed input is written u(t − 0.035 s).
     limits
-        Known saturations and dead zones of inputs; one that saturates is written sat(u, 0.94).
+        Known saturations and dead zones of inputs; a saturated input is written sat(u, 0.94).
     offset
-        The unknown constant of the equation, ``"constant"`` and perhaps ``"ramp"``, as it was estimated on one run, or
-        words for it.
+        Offset of the equation, ``"constant"`` and perhaps ``"ramp"``, as estimated on one run, or a text.
     """
     parts = [_math(_derivative_math(item.order, item.output) + Markup("<mo>=</mo>"))]
     for k, term in enumerate(item.terms):
@@ -85,7 +84,7 @@ def equation_html(
 
 
 def equations_html(model: Solved, offsets: Sequence[Mapping[str, Mapping[str, float]]] | None = None) -> list[Markup]:
-    """Equations of a model; an offset as a number where there is one run, since every run has its own."""
+    """Equations of a model as MathML; offsets as numbers if there is one run, since each run has its own."""
     structure = model.structure
     own = offsets[0] if offsets is not None and len(offsets) == 1 else {}
     return [
@@ -133,7 +132,7 @@ def _number_math(value: float | Exact) -> Markup:
 
 
 def _short(value: float) -> Exact:
-    """A number of an input as equations in words have it: of one that was estimated no more digits than of others."""
+    """Return a number of an input with six digits at most."""
     return Exact(f"{value:.6g}")
 
 
@@ -165,7 +164,7 @@ def _signed(value: float) -> Markup:
 
 
 def derivative_html(order: Order, signal: str) -> Markup:
-    """Return a derivative of a signal as a line of text."""
+    """Return a derivative of a signal as text."""
     if not order.names and round(order.constant, ORDER_DECIMALS) == 0:
         return symbol_html(signal)
     text = str(order) if order.names else number(Exact(round(order.constant, ORDER_DECIMALS) + 0.0))
@@ -173,14 +172,14 @@ def derivative_html(order: Order, signal: str) -> Markup:
 
 
 def parameter_table(model: Solved, joint: JointFit | None = None, *, title: str = "Orders and coefficients") -> Table:
-    """Return orders and coefficients with the place of each, beside standard errors and the values the maker states.
+    """Return a table of orders and coefficients with their terms, standard errors and reference values.
 
     Parameters
     ----------
     model
-        The model. What its ``estimate`` knows is used where there is no fit.
+        Model; its ``estimate`` is used without a fit.
     joint
-        The fit that it came from, where there is one: it knows the standard errors.
+        Output-error fit of the model with its standard errors.
     title
         Caption.
     """
@@ -256,7 +255,7 @@ def parameter_table(model: Solved, joint: JointFit | None = None, *, title: str 
 
 
 def unit_html(unit: str) -> Markup:
-    """A unit with raised powers."""
+    """Return a unit with superscript exponents."""
     parts = re.split(r"\^(-?[\d.]+)", unit)
     raised = (
         Markup("<sup>{}</sup>").format(p.replace("-", "−")) if k % 2 else Markup("{}").format(p)
@@ -266,7 +265,7 @@ def unit_html(unit: str) -> Markup:
 
 
 def model_html(model: Solved) -> str:
-    """Return the equations of a model and its parameters."""
+    """Return the equations and parameters of a model as HTML."""
     lines = Markup("").join(Markup("<p>{}</p>").format(e) for e in equations_html(model))
     known = model.orders or model.coefficients
     return str(lines + parameter_table(model).to_html() if known else lines)

@@ -1,4 +1,4 @@
-"""What a recomputed section 5 consists of: stages, what verdicts are made of, printed models run, both readings."""
+"""Data of the reproduction: stage results, verdict cases, printed models, recomputed tables."""
 
 from __future__ import annotations
 
@@ -25,7 +25,7 @@ from ftlm.validation.comparison import metrics
 
 @dataclass(frozen=True)
 class Recomputed:
-    """Both stages and the runs; its fields are those of :class:`ftlm.Reproduction`."""
+    """Stage results and runs; its fields are those of :class:`ftlm.Reproduction`."""
 
     square: Run
     sine: Run | None
@@ -54,7 +54,7 @@ class Recomputed:
 
     @property
     def rivals(self) -> dict[str, Rival]:
-        """The genetic comparisons of all stages by output."""
+        """Optimizer comparisons of all stages by output."""
         return {output: rival for stage in self.stages.values() for output, rival in stage.rivals.items()}
 
     @property
@@ -64,25 +64,25 @@ class Recomputed:
 
     @property
     def weak_traces(self) -> dict[str, dict[int, Trace]]:
-        """The same with the weak prior."""
+        """Convergence with the weak prior by output and p."""
         return {output: each for stage in self.stages.values() for output, each in stage.weak_traces.items()}
 
 
 Word = Literal["holds", "does not hold", "turns with", "cannot be told from a simulated truth", "cannot be told"]
-#: The factor that is chosen where an arm is simulated: a verdict that it alone decides says what was put in.
+#: Factor chosen by the simulation; a verdict that it alone decides reproduces this choice.
 TRUTH = "the arm"
 
 
 @dataclass(frozen=True)
 class Case:
-    """One case of a claim.
+    """Case of a claim.
 
     Parameters
     ----------
     factors
-        What it was computed with: (name, level), such as ("K0", "1"). The names are the same in all cases of a claim.
+        Conditions: (name, level), such as ("K0", "1"). The names are the same in all cases of a claim.
     holds
-        Whether the claim holds there.
+        Whether the claim holds in this case.
     """
 
     factors: tuple[tuple[str, str], ...]
@@ -91,18 +91,18 @@ class Case:
 
 @dataclass(frozen=True)
 class Ruling:
-    """What a claim comes to.
+    """Verdict of a claim over all its cases.
 
     Parameters
     ----------
     word
         The verdict.
     factors
-        What it turns with, the factor that decides most of it first.
-    cases, held
-        How many there were, and in how many of them the claim holds.
+        Factors on which the outcome depends, the most decisive first.
+    cases, holding_cases
+        Number of cases, and of those in which the claim holds.
     levels
-        (level, cases, held) of the first of these factors.
+        (level, cases, cases in which it holds) of the first factor.
     """
 
     word: Word
@@ -116,23 +116,23 @@ class Ruling:
 
 
 def case(holds: bool, **factors: str) -> Case:
-    """A case from factors by keyword; an underscore stands for a space."""
+    """Build a case from factors by keyword; an underscore stands for a space."""
     return Case(tuple((name.replace("_", " "), level) for name, level in factors.items()), holds)
 
 
 def ruled(cases: Sequence[Case], *, of_the_machine: bool = False) -> Ruling:
     """Return the verdict of all cases together.
 
-    A claim holds where every case does, and does not where none does. Where they differ it turns with those factors
-    that change the outcome while every other one stays.
+    A claim holds if it holds in every case, and does not hold if it holds in none. Otherwise it depends on those
+    factors whose change alone changes the outcome.
 
     Parameters
     ----------
     cases
-        At least one, or nothing can be told.
+        Cases; without any the verdict is open.
     of_the_machine
-        Whether the claim is one of the machine, not of a method, and the machine was simulated: where it turns with the
-        arm, or there is one arm alone, the answer is what was put into it.
+        Whether the claim is about the machine, not about a method, and the machine was simulated. If such a claim
+        depends on the arm, or if there is only one arm, the simulation has determined the answer.
     """
     held = sum(case.holds for case in cases)
     counts = len(cases), held
@@ -153,7 +153,7 @@ def ruled(cases: Sequence[Case], *, of_the_machine: bool = False) -> Ruling:
 
 
 def _levels(cases: Sequence[Case], name: str) -> tuple[tuple[str, int, int], ...]:
-    """Every level of a factor with its cases and in how many of them the claim holds."""
+    """Every level of a factor with its number of cases and of those in which the claim holds."""
     outcomes: dict[str, list[bool]] = {}
     for item in cases:
         outcomes.setdefault(dict(item.factors)[name], []).append(item.holds)
@@ -161,7 +161,7 @@ def _levels(cases: Sequence[Case], name: str) -> tuple[tuple[str, int, int], ...
 
 
 def _flips(cases: Sequence[Case], name: str) -> int:
-    """Pairs of cases that differ in one factor alone, and in the outcome."""
+    """Number of pairs of cases that differ in one factor only, and in the outcome."""
     groups: dict[tuple[tuple[str, str], ...], list[Case]] = {}
     for case in cases:
         rest = tuple(pair for pair in case.factors if pair[0] != name)
@@ -181,38 +181,38 @@ def _listed(names: Sequence[str]) -> str:
     return names[0] if len(names) == 1 else f"{', '.join(names[:-1])} and {names[-1]}"
 
 
-#: Differences of two errors below this share of them are none.
+#: Relative difference below which two errors are equal.
 ALIKE = 0.02
-#: A free run this many times worse than the equation error, or with a larger NR than this, describes nothing.
+#: Largest ratio of output error to equation error, and largest NR, of a model that describes the data.
 FLATTERY, EXPLAINS = 5.0, 0.5
-#: Digits of RMSE and NR in Table 7 allow this much between two standard deviations of one record.
+#: Relative difference of two standard deviations of one record that the digits of Table 7 allow.
 MIXED = 0.15
-#: Standard errors that an estimate may be away from the truth by chance.
+#: Largest error of an estimate, in standard errors, that is due to chance.
 BY_CHANCE = 4.0
-#: One curve converges faster than another where it needs fewer steps by this share.
+#: Smallest relative saving of steps that counts as faster convergence.
 SOONER = 0.1
-#: The arm of whole orders whose friction no fitted model has.
+#: Arm of integer orders with friction that no fitted model includes.
 FEIGNED = "whole orders, friction"
 #: Steps between two points of a convergence curve.
 STEPS = TRACE_EVERY
-#: A model moves as a machine does where their standard deviations are within this factor.
+#: Largest ratio of the standard deviations of a model and of the machine.
 MOVES = 2.0
 
 
 @dataclass(frozen=True)
 class Claim:
-    """One claim of the paper, or slip in it, with a verdict from computed numbers.
+    """Claim of the paper, or an error in it, with a verdict from computed numbers.
 
     Parameters
     ----------
     claim
-        In words.
+        Text of the claim.
     ruling
-        The verdict, and the cases that it was computed from.
+        Verdict with the cases that it follows from.
     brief
-        The number that shows it, in one line.
+        Main number, in one line.
     evidence
-        All numbers, in words.
+        All numbers, as text.
     """
 
     claim: str
@@ -222,16 +222,16 @@ class Claim:
 
     @property
     def verdict(self) -> str:
-        """Holds, does not hold, turns with …, cannot be told from a simulated truth."""
+        """Verdict as text: holds, does not hold, depends on …, not decidable by simulation."""
         return str(self.ruling)
 
     @property
     def holds(self) -> bool | None:
-        """Whether it holds in every case; None where it turns with something or cannot be told."""
+        """Whether the claim holds in every case; None if it depends on a factor or is not decidable."""
         return {"holds": True, "does not hold": False}.get(self.ruling.word)
 
     def to_dict(self) -> dict[str, Any]:
-        """For JSON."""
+        """Return the claim for JSON."""
         return {
             "claim": self.claim,
             "verdict": self.verdict,
@@ -244,9 +244,9 @@ class Claim:
 
 
 def claims(found: Recomputed) -> list[Claim]:
-    """Hold the paper's claims, and its slips, against computed numbers.
+    """Compare the claims of the paper, and its errors, with computed numbers.
 
-    Every verdict follows from numbers by a rule; none is written down.
+    Every verdict follows from numbers by a rule.
     """
     each = (
         *_claims_of_printed_models(found),
@@ -268,22 +268,22 @@ def claims(found: Recomputed) -> list[Claim]:
 
 
 def numbers_listed(values: Iterable[float], digits: int = 4) -> str:
-    """Numbers in a row."""
+    """Format numbers as a list."""
     return ", ".join("∞" if math.isinf(v) else f"{v:.{digits}g}" for v in values)
 
 
 def listed(numbers: Mapping[str, Iterable[float]], digits: int = 4) -> str:
-    """The numbers of every angle."""
+    """Format the numbers of every angle."""
     return "; ".join(f"{symbol(name)} {numbers_listed(values, digits)}" for name, values in numbers.items())
 
 
 def printed_saturation(output: str) -> tuple[float, float, float]:
-    """Return x and c of x·p / (p + c) through the printed a of p = 1 and 7, and how far p = 3 and 5 are from it.
+    """Fit x·p / (p + c) to the printed a of p = 1 and 7; return x, c and the largest error at p = 3 and 5.
 
     Parameters
     ----------
     output
-        An angle of the paper's, such as ``"theta11"``.
+        An angle of the paper, such as ``"theta11"``.
     """
     rows = printed.FRACTIONAL[output]
     first, last = printed.INNOVATION_LENGTHS[0], printed.INNOVATION_LENGTHS[-1]
@@ -296,19 +296,19 @@ def printed_saturation(output: str) -> tuple[float, float, float]:
 
 
 def weak_spread(stage: Stage, output: str) -> float:
-    """Largest relative difference of a coefficient between p = 1 and any other p, with a weak prior."""
+    """Largest relative change of a coefficient between p = 1 and any other p, with a weak prior."""
     each = stage.weak[output]
     first = each[printed.INNOVATION_LENGTHS[0]]
     return max(abs(c[n] / first[n] - 1) for c in each.values() for n in first if first[n])
 
 
 def prior_in_words(prior: float) -> str:
-    """1 or 10¹⁰."""
+    """Format K0 as 1 or 10¹⁰."""
     return "1" if prior == PRIORS[0] else "10¹⁰"
 
 
 def spread_in_words(found: Recomputed) -> str:
-    """How many times less printed models move, and what that says of the NR printed beside them."""
+    """Describe the ratio of implied to simulated standard deviations, and the NR that it implies."""
     factors = sorted(r.too_small for r in found.ran)
     # What moves r times less than the angle leaves at least 1 - 1/r of its deviation.
     floors = [max(1 - 1 / r.too_small, 0.0) for r in found.ran]
@@ -336,7 +336,7 @@ def _of_trials(trials: Sequence[Trial], holding: Sequence[bool]) -> list[Case]:
 
 
 def _held(ruling: Ruling) -> str:
-    """How many cases, and how they fall on the levels of what decides."""
+    """Describe the number of cases in which a claim holds, by level of the deciding factor."""
     name = "K0 = " if ruling.factors[:1] == ("K0",) else ""
     parts = "; ".join(f"{name}{level}: {held} of {count}" for level, count, held in ruling.levels)
     return f"{ruling.held} of {ruling.cases} cases" + (f"; {parts}" if parts else "")
@@ -442,7 +442,7 @@ def _claims_of_tables(found: Recomputed) -> list[Claim]:
 
 
 def _of_main(found: Recomputed, prior: float) -> dict[str, Trial]:
-    """The first record's trials, by angle."""
+    """Return the first record's trials on the main arm, by angle."""
     own: dict[str, Trial] = {}
     for t in found.panel.trials:
         if t.prior == prior:
@@ -451,7 +451,7 @@ def _of_main(found: Recomputed, prior: float) -> dict[str, Trial]:
 
 
 def _falls(t: Trial) -> bool:
-    """Whether no step of p has a larger error (45), and the largest p a smaller one than the first."""
+    """Whether the error (45) never rises with p, and is smaller at the largest p than at the first."""
     e = [t.errors[p] for p in printed.INNOVATION_LENGTHS]
     return all(b <= a for a, b in pairwise(e)) and e[-1] < (1 - ALIKE) * e[0]
 
@@ -474,7 +474,7 @@ def _claim_of_smaller_errors(found: Recomputed) -> Claim:
 
 
 def _claim_of_p_itself(found: Recomputed) -> Claim:
-    """Whether errors fall with p where the prior, whose weight p is, has none."""
+    """Claim that errors fall with p, tested with a weak prior, where p has no weight."""
     trials = [t for t in found.panel.trials if t.prior == WEAK_PRIOR]
     ruling = ruled(_of_trials(trials, [_falls(t) for t in trials]))
     first, last = printed.INNOVATION_LENGTHS[0], printed.INNOVATION_LENGTHS[-1]
@@ -503,7 +503,7 @@ def _claim_of_p_itself(found: Recomputed) -> Claim:
 
 
 def sooner(arrived: Mapping[int, float]) -> bool | None:
-    """Whether a larger p takes fewer steps; None where all arrive with the first step that is looked at."""
+    """Whether larger p need fewer steps; None if all converge at the first evaluated step."""
     steps = [arrived[p] for p in printed.INNOVATION_LENGTHS]
     if max(steps) <= STEPS:
         return None
@@ -628,7 +628,7 @@ def _claim_of_one_record() -> Claim:
 
 
 def beats(error: float, seeds: Iterable[float]) -> bool:
-    """Whether an error is finite and below the median seed's: the best of many would be better the more there are."""
+    """Whether an error is finite and below the median over seeds; the best seed would depend on their number."""
     return math.isfinite(error) and error < statistics.median(seeds)
 
 
@@ -693,7 +693,7 @@ def _claim_of_the_derivative(found: Recomputed) -> Claim:
 
 
 def _claim_of_the_form(found: Recomputed) -> Claim | None:
-    """Whether the published form finds the orders of an arm that hangs on its hub; of simulated runs, where known."""
+    """Claim about the orders that the published form finds for an arm with links that move with their hubs."""
     away: list[str] = []
     fits: dict[str, list[float]] = {}
     count = 0

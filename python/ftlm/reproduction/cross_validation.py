@@ -1,4 +1,4 @@
-"""Whether fractional orders earn their place on runs that were not fitted to: the links of a measured arm."""
+"""Cross-validation of fractional against integer orders on the links of a measured arm."""
 
 from __future__ import annotations
 
@@ -21,7 +21,7 @@ from ftlm.utils.resources import between, by_output_error, expected
 from ftlm.utils.validation import check_threads, listed
 from ftlm.validation.comparison import Comparison, finite
 
-#: What may be fractional, by the orders that are free then; whole is what they are otherwise.
+#: Free orders of each structure; the other orders are integer.
 WHOLE = "whole orders"
 KINDS: dict[str, tuple[str, ...]] = {
     WHOLE: (),
@@ -30,40 +30,40 @@ KINDS: dict[str, tuple[str, ...]] = {
     "both fractional": ("beta", "mu"),
 }
 WHOLE_ORDERS = {"beta": 0.0, "mu": 1.0}
-#: Rows that a fit takes at most of a run; the arm's modes are a decade below the rate that is left of 20 s.
+#: Most samples of a run in a fit; the arm's modes are a decade below the reduced rate of a 20 s run.
 MOST_ROWS = 1250
-#: What the structures of ``Deflection.before`` are called.
+#: Label of the structures of ``Deflection.before``.
 WITHOUT = "without the rate of the other deflection"
-#: Points of fit below which a difference on an unseen run is none.
+#: Smallest significant difference in fit on a validation run [percentage points].
 MARGIN = 0.5
 
 
 @dataclass(frozen=True)
 class Fitted:
-    """One structure fitted to one run.
+    """Structure fitted to one run, with its simulations on all runs.
 
     Parameters
     ----------
     result
         The identification.
-    compared
-        Free runs by the name of the run, that which it was fitted to among them.
+    comparisons
+        Comparisons by the name of the run, the estimation run included.
     """
 
     result: Identification
     compared: dict[str, Comparison]
 
     def fit(self, run: str) -> float:
-        """Fit of the free run in percent; minus infinity where it leaves the range of numbers."""
+        """Fit of the simulation in percent; minus infinity on overflow."""
         value = next(iter(self.compared[run].fit_percent.values()))
         return value if math.isfinite(value) else -math.inf
 
     @property
     def estimates(self) -> dict[str, tuple[float, float, float]]:
-        """Every free number with the ends of its 95 % interval; orders first.
+        """Free parameters with their 95 % intervals; orders first.
 
-        Two terms of the deflection differ by their orders alone. The lower one is the elasticity's, whatever name it
-        went by in the fit.
+        Two terms of the deflection differ only in their orders. The lower order belongs to the elasticity, regardless
+        of its name in the fit.
         """
         joint = self.result.joint
         values = {**self.result.orders, **({} if joint is None else joint.coefficients)}
@@ -76,22 +76,22 @@ class Fitted:
 
     @property
     def numbers(self) -> int:
-        """How many orders and coefficients were free."""
+        """Number of free orders and coefficients."""
         return len(self.estimates)
 
 
 @dataclass(frozen=True)
 class Verdict:
-    """Whether a kind of order earns its place.
+    """Decision whether a kind of fractional order improves the prediction significantly.
 
     Parameters
     ----------
     kind
-        A key of ``KINDS``.
+        A key of ``FREE_ORDERS_BY_KIND``.
     earns
-        None where it cannot be told.
+        The decision; None if it is inconclusive.
     words
-        The numbers that it follows from.
+        Numbers that it follows from, as text.
     """
 
     kind: str
@@ -101,20 +101,20 @@ class Verdict:
 
 @dataclass(frozen=True)
 class Deflection:
-    """One deflection of the arm.
+    """Cross-validation of one deflection of the arm.
 
     Parameters
     ----------
     output
-        Its name.
+        Name of the deflection.
     structure
-        With both orders free.
+        Structure with both orders free.
     fits
-        By kind, then by the run that was fitted.
+        Fits by kind, then by estimation run.
     failed
-        Why there is no fit, by kind and run.
+        Reasons for missing fits, by kind and run.
     before
-        The same without the rate of the other deflection; None where the other stage was not measured.
+        Cross-validation without the rate of the other deflection; None if the other stage was not measured.
     """
 
     output: str
@@ -124,7 +124,7 @@ class Deflection:
     before: Deflection | None = None
 
     def gains(self, kind: str) -> dict[tuple[str, str], float]:
-        """Points of fit over whole orders by (fitted, judged), on runs that were not fitted to."""
+        """Gain in fit over integer orders by (estimation run, validation run) [percentage points]."""
         found = {}
         for run, whole in self.fits[WHOLE].items():
             other = self.fits[kind].get(run)
@@ -135,12 +135,12 @@ class Deflection:
         return found
 
     def worse(self, kind: str) -> list[str]:
-        """Runs on which a fit is worse than that of whole orders, which its structure contains."""
+        """Runs on which a fit is worse than that of integer orders, which its structure contains."""
         both = ((run, each, self.fits[WHOLE][run]) for run, each in self.fits[kind].items())
         return [run for run, free, whole in both if not free.fit(run) > whole.fit(run) - MARGIN]
 
     def intervals(self, kind: str) -> dict[str, dict[str, tuple[float, float]]]:
-        """95 % intervals of the free orders, by order, then by the run that was fitted."""
+        """Return 95 % intervals of the free orders, by order, then by estimation run."""
         return {
             name: {run: each.estimates[name][1:] for run, each in self.fits[kind].items()}
             for name in self.structure.order_names
@@ -149,11 +149,11 @@ class Deflection:
 
     @property
     def verdicts(self) -> list[Verdict]:
-        """Of every kind that has a fractional order."""
+        """Verdicts of all kinds with a fractional order."""
         return [self.verdict(kind) for kind in KINDS if kind != WHOLE]
 
     def verdict(self, kind: str) -> Verdict:
-        """Of one kind, from its gains and intervals."""
+        """Verdict of one kind, from its gains and intervals."""
         told = self.intervals(kind)
         whole = {name: WHOLE_ORDERS[name.rstrip("0123456789")] for name in told}
         worse = self.worse(kind)
@@ -180,7 +180,7 @@ class Deflection:
 
 
 def overlapping(intervals: Any) -> bool:
-    """Whether all of some intervals have a value in common."""
+    """Whether all intervals have a value in common."""
     each = list(intervals)
     return not each or max(low for low, _ in each) <= min(high for _, high in each)
 
@@ -188,11 +188,11 @@ def overlapping(intervals: Any) -> bool:
 def judged(
     gains: Sequence[float], intervals: Mapping[str, Mapping[str, tuple[float, float]]], whole: Mapping[str, float]
 ) -> bool | None:
-    """Whether orders earn their place, from the points of fit that they gain on unseen runs and their intervals.
+    """Whether fractional orders improve the prediction, from their gains on validation runs and their intervals.
 
-    They do where every run that was fitted excludes a whole order, the runs do not contradict each other, no unseen run
-    loses and the middle gain counts. They do not where no gain counts, or no run excludes a whole order and the middle
-    gain does not count. The rest cannot be told.
+    True if every estimation run excludes an integer order, the runs are consistent, no validation run loses, and the
+    median gain is significant. False if no gain is significant, or if no run excludes an integer order and the median
+    gain is not significant. Otherwise None.
     """
     runs = list(next(iter(intervals.values()), {}))
     told = [any(not e[r][0] <= whole[n] <= e[r][1] for n, e in intervals.items()) for r in runs]
@@ -205,7 +205,7 @@ def judged(
 
 
 def _range(low: float, high: float) -> str:
-    """An interval in short; an end that the run does not bound is left out."""
+    """Format an interval; unbounded ends are left out."""
     ends = [f"{v:.2f}".replace("-", "−") if math.isfinite(v) else "" for v in (low, high)]
     if all(ends):
         return " to ".join(ends)
@@ -213,24 +213,24 @@ def _range(low: float, high: float) -> str:
 
 
 def percent(value: float) -> str:
-    """A fit in percent."""
+    """Format a fit in percent."""
     return f"{value:.1f}".replace("-", "−") if math.isfinite(value) else "−∞"
 
 
 @dataclass(frozen=True)
 class UnseenOrders:
-    """Integer against fractional orders on runs that were not fitted to.
+    """Cross-validation of integer against fractional orders over several runs.
 
     Parameters
     ----------
     runs
-        As they were fitted and judged.
+        Runs as used for estimation and validation.
     deflections
-        By output.
+        Results by output.
     filtered
-        Whether the deflections stand behind the stock filter.
+        Whether the deflections passed the stock filter.
     notes
-        What was done to the runs.
+        Preprocessing of the runs.
     """
 
     runs: tuple[Run, ...]
@@ -239,7 +239,7 @@ class UnseenOrders:
     notes: tuple[str, ...] = ()
 
     def to_dict(self) -> dict[str, Any]:
-        """For JSON."""
+        """Return fits and verdicts for JSON."""
         return {
             "runs": [run.name for run in self.runs],
             "filtered": self.filtered,
@@ -253,7 +253,7 @@ class UnseenOrders:
 
 
 def _told(deflection: Deflection) -> dict[str, Any]:
-    """One structure's fits and verdicts, for JSON."""
+    """Return fits and verdicts of one structure for JSON."""
     return {
         "equation": str(deflection.structure),
         "verdicts": {v.kind: {"earns": v.earns, "words": v.words} for v in deflection.verdicts},
@@ -275,11 +275,11 @@ def _told(deflection: Deflection) -> dict[str, Any]:
 
 
 def link_structure(stage: StageNumber, *, both: bool, filtered: bool, rate: bool = True) -> Structure:
-    """A deflection as (15) has it, driven by the measured hub: elasticity and damping of any order, gauge and cable.
+    """Deflection by (15) with the measured hub as input: elasticity and damping of any order, gauge and cable.
 
-    With the other stage's angles its accelerations besides, by the energies of the planar arm, and the rate of its
-    deflection, an observer's gain (``rate``). Initial terms are Caputo's: a history would give fractional orders more
-    numbers of the judged run than whole ones.
+    With the angles of the other stage it includes their accelerations, by the energies of the planar arm, and the rate
+    of the other deflection, an observer's gain (``rate``). Initial terms are Caputo's. A history would give fractional
+    orders more parameters on the validation run than integer ones.
     """
     made = flexible_link(
         stage=stage,
@@ -302,25 +302,25 @@ def orders_on_unseen_runs(
     say: Callable[[str], None] = lambda _: None,
     progress: Callable[[int, int], None] | None = None,
 ) -> UnseenOrders:
-    """Fit every deflection of the arm to each run, with whole and with fractional orders, and judge it on all others.
+    """Fit every deflection of the arm to each run with integer and fractional orders, and validate it on all others.
 
-    A link is (15) with the terms that a real arm needs: the hub's measured motion, the other stage's accelerations
-    and the rate of its deflection where both stages were measured, hub angles in the gauge, and the gauge's zero, one
-    a run. The same terms stand in every structure; what differs is whether the link's elasticity (order 0) and its
-    damping (order 1) may have other orders. Where both stages were measured all of that is done without the rate of
-    the other deflection besides (``Deflection.before``): an order that earns its place there alone stands in for it.
+    A link is (15) with the terms that a real arm needs: the measured hub motion, the accelerations of the other stage
+    and the rate of its deflection if both stages were measured, hub angles in the gauge, and an offset of the gauge per
+    run. All structures have the same terms and differ in the orders of the link's elasticity (integer 0) and damping
+    (integer 1). If both stages were measured, everything is repeated without the rate of the other deflection
+    (``Deflection.before``): an order that improves the prediction only there compensates for the missing term.
 
     Parameters
     ----------
     runs
-        Two or more, with theta11 and theta12 and (or) theta21 and theta22 [rad]. Of runs with more than 1250 rows one
-        row of so many is taken. Initial terms, the filter's state and the gauge's zero are each run's own.
+        Two or more, with theta11 and theta12 and (or) theta21 and theta22 [rad]. Runs with more than 1250 samples are
+        decimated. Initial terms, initial filter state and gauge offset are separate for each run.
     filtered
         Whether both deflections passed the 2 Hz low-pass of the arm's stock model.
     threads, progress
         See :func:`ftlm.search_orders`.
     say
-        Called with a line about what happens next.
+        Called with a line about the next step.
 
     Returns
     -------
@@ -332,7 +332,7 @@ def orders_on_unseen_runs(
     DataError
         Fewer than two runs, two of one name, or runs without both angles of a stage.
     ModelError
-        No fit with whole orders.
+        No fit with integer orders.
     """
     runs = [run if run.name else replace(run, name=f"run {k}") for k, run in enumerate(runs, 1)]
     if len(runs) < 2:
@@ -368,7 +368,7 @@ def orders_on_unseen_runs(
 
 
 def stages_in(runs: Sequence[Run]) -> list[StageNumber]:
-    """Stages both of whose angles all runs have.
+    """Return the stages of which all runs contain both angles.
 
     Raises
     ------
@@ -393,7 +393,7 @@ def _deflection(
     say: Callable[[str], None],
     progress: Callable[[int, int], None] | None,
 ) -> Deflection:
-    """Every kind fitted to every run."""
+    """Fit every kind of structure to every run."""
     output = structure.outputs[0]
     runs = [run.select(list(structure.signals)) for run in runs]
     fits: dict[str, dict[str, Fitted]] = {kind: {} for kind in KINDS}

@@ -1,4 +1,4 @@
-"""The main job from end to end on simulated runs of both stages: a short reproduction, on a coarse lattice."""
+"""Demonstration: identification of a simulated arm from end to end, a short reproduction on a coarse order grid."""
 
 from __future__ import annotations
 
@@ -22,30 +22,30 @@ from ftlm.structure.order_grid import Lattice
 from ftlm.utils.files import check_folder
 from ftlm.validation.comparison import Metrics, finite
 
-#: Rows of an order search that a result keeps.
+#: Candidates that the result of an order search keeps.
 KEEP = 20
-#: Steps between two points of a convergence curve: 128 points are more than a page shows.
+#: Steps between two points of a convergence curve; 128 points are more than a page shows.
 TRACE_EVERY = 16
-#: Parts of a stage that tell their names: an order search for each p and for least squares, and the joint fit.
+#: Steps of a stage that are announced: an order search for each p and for least squares, and the joint fit.
 PARTS_OF_A_STAGE = len(INNOVATION_LENGTHS) + 2
-#: Models that are saved, by the end of their file's name.
+#: Models that are saved, by the suffix of their file name.
 SAVED = {"paper": f"p = {INNOVATION_LENGTHS[-1]}", "output-error": "output error"}
 
 
 @dataclass(frozen=True)
 class StageRow:
-    """One row of a table in the shape of the paper's Tables 4 and 5, for one output.
+    """Row of the demonstration's tables, in the form of the paper's Tables 4 and 5, for one output.
 
     Parameters
     ----------
     label
-        Which model.
+        Name of the model.
     output
-        Which equation.
+        Output of the equation.
     orders, coefficients
-        By name; an integer-order model without the term has none.
+        Values by name; an integer-order model lacks those of absent terms.
     equation_error, output_error
-        On the run that the model was identified from.
+        Errors on the estimation run.
     validation
         Output error on the other run.
     """
@@ -61,7 +61,7 @@ class StageRow:
 
 @dataclass(frozen=True)
 class Demo:
-    """Everything the demonstration made.
+    """Results of the demonstration.
 
     Parameters
     ----------
@@ -74,9 +74,9 @@ class Demo:
     traces
         Convergence by output and p.
     derived
-        By stage, what the published equations make of the numbers that were found.
+        Effect of the dropped derivative of the current, by stage.
     files
-        What was written.
+        Written files.
     """
 
     square: Run
@@ -89,7 +89,7 @@ class Demo:
 
     @cached_property
     def checked(self) -> dict[int, Validation]:
-        """The models of output error on the sine run, by stage."""
+        """Validation of the output-error models on the sine run, by stage."""
         return {stage: results["output error"].validate(self.sine) for stage, results in self.results.items()}
 
     @property
@@ -98,7 +98,7 @@ class Demo:
         return {stage: truth_of(stage) for stage in STAGES}
 
     def to_dict(self) -> dict[str, Any]:
-        """For JSON."""
+        """Return rows and estimates for JSON."""
         return {
             "rows": {
                 str(stage): [
@@ -128,7 +128,7 @@ class Demo:
 
 
 def rows_of(candidate: Candidate) -> list[StageRow]:
-    """A row for every equation of a model that was compared with both runs."""
+    """Return a table row for every equation of a model that was compared with both runs."""
     own, other = candidate.estimation, candidate.validation
     rows: list[StageRow] = []
     if other is None:
@@ -152,16 +152,17 @@ def run_demo(
     say: Callable[[str], None] = lambda _: None,
     progress: Callable[[int, int], None] | None = None,
 ) -> Demo:
-    """Simulate, identify every equation with p = 1, 3, 5, 7, by least squares and by output error, compare, save.
+    """Simulate two runs, and identify every equation by p = 1, 3, 5, 7, least squares and output error.
 
-    Output error has the arm as it is, (14)-(15); the others have the paper's (22)-(25), whose links bend the wrong way.
+    Output error uses the equations of the simulated arm, (14)-(15). The other methods use the paper's (22)-(25), whose
+    deflections have the wrong sign.
 
     Parameters
     ----------
     folder
-        Where runs and models go; made if it is not there.
+        Folder of runs and models; created if absent.
     step
-        Step of the order lattice; the paper's is 0.05, which takes minutes.
+        Increment of the order grid; the paper's is 0.05, which takes minutes.
     noise, seed
         See :func:`demo_run`.
     threads, progress
@@ -169,7 +170,7 @@ def run_demo(
     force
         Whether to overwrite.
     say
-        Called with a line about what happens next.
+        Called with a line about the next step.
 
     Returns
     -------
@@ -179,7 +180,7 @@ def run_demo(
     Raises
     ------
     DataError
-        A file is there already and ``force`` is not set, or the folder cannot be written.
+        A file exists and ``force`` is not set, or the folder cannot be written.
     """
     names = [f"stage{n}-{stem}.json" for n in STAGES for stem in SAVED]
     check_folder(folder, ["square.csv", "sine.csv", *names, "demo.html"], force=force)

@@ -1,4 +1,4 @@
-"""The paper's figures, drawn from computed runs."""
+"""Figures of the paper, drawn from computed runs."""
 
 from __future__ import annotations
 
@@ -20,20 +20,20 @@ from ftlm.utils.formatting import symbol
 from ftlm.utils.validation import Floats
 from ftlm.validation.comparison import Comparison, metrics
 
-#: Points of a line of these charts: there are some fifty on the page, which stays below 2 MB.
+#: Points per line: some fifty charts keep the page below 2 MB.
 LINE_POINTS = 500
-#: A response is drawn as far as it stays within so many times the largest excursion of what it is compared with, an
-#: error of the recursion as far as it stays within so many times the last one: what flies away hides all others.
+#: Largest drawn excursion relative to the reference line, and largest drawn error of the recursion relative to its last
+#: value. Diverging lines would hide all others.
 FARTHEST, FARTHEST_ERROR = 4.0, 1000.0
 
 
 def compared_with(*, simulated: bool) -> str:
-    """What the line is called that models are compared with."""
+    """Label of the line that models are compared with."""
     return "simulated arm" if simulated else "measured"
 
 
 def within(values: Floats, measured: Floats) -> Floats:
-    """A response as far as it stays near what it is compared with; the rest is a gap, which the drawing tells."""
+    """Replace values far from the measured ones by NaN; the chart marks the gap."""
     middle = float(np.mean(measured))
     limit = FARTHEST * float(np.max(np.abs(measured - middle)))
     with np.errstate(invalid="ignore"):
@@ -43,7 +43,7 @@ def within(values: Floats, measured: Floats) -> Floats:
 def fit_chart(
     models: Sequence[tuple[str, Comparison]], output: str, title: str, caption: str = "", *, simulated: bool
 ) -> Figure:
-    """An angle and the free runs of some models."""
+    """Chart of an angle and its simulations by some models."""
     first = models[0][1]
     measured = first.measured[output][0]
     lines = [(compared_with(simulated=simulated), measured)]
@@ -67,7 +67,7 @@ def fit_chart(
 
 
 def ran_charts(found: Recomputed) -> list[Figure]:
-    """The printed models of the hubs under the paper's current, beside an angle that moves as much as the paper's."""
+    """Charts of the printed hub models under the paper's current, beside an angle of the implied standard deviation."""
     charts = []
     for output in dict.fromkeys(r.output for r in found.ran if r.output.endswith("1")):
         rows = [r for r in found.ran if r.output == output]
@@ -94,7 +94,7 @@ def ran_charts(found: Recomputed) -> list[Figure]:
 
 
 def share_picture(ruling: Ruling) -> Markup:
-    """In how many cases a claim holds: a bar for every level of what decides, filled as far as it holds."""
+    """Bar of the share of cases in which a claim holds, for every level of the deciding factor."""
     levels = ruling.levels or (("", ruling.cases, ruling.held),)
     height = 10 * len(levels) - 2
     words = "; ".join(f"{level + ': ' if level else ''}{held} of {count}" for level, count, held in levels)
@@ -107,7 +107,7 @@ def share_picture(ruling: Ruling) -> Markup:
 
 
 def convergence_chart(traces: Mapping[int, Trace], title: str, *, log_x: bool = True) -> Figure:
-    """Error (45) after every step of the recursion, a line for each p."""
+    """Chart of the error (45) over the steps of the recursion, one line per p."""
     ends = max(float(t.error[-1]) for t in traces.values())
     drawn = {}
     for p, trace in traces.items():
@@ -121,7 +121,7 @@ def convergence_chart(traces: Mapping[int, Trace], title: str, *, log_x: bool = 
 
 
 def derivative_chart(derived: Derived, *, simulated: bool = True) -> Figure:
-    """The deflection as it is, by (14)-(15), and with the same numbers as published."""
+    """Chart of the measured deflection, of (14)-(15), and of the published form with the same parameters."""
     nr, bent = metrics(derived.derived, derived.published).nr, derived.correlations
     own = compared_with(simulated=simulated)
     lines = [(own, derived.measured), ("(14)–(15)", derived.derived), ("(22)–(25)", derived.published)]
@@ -144,7 +144,7 @@ def derivative_chart(derived: Derived, *, simulated: bool = True) -> Figure:
 def _fits_chart(
     models: Mapping[str, Candidate], output: str, place: str, *, sine: bool, simulated: bool
 ) -> list[Figure]:
-    """Models on one input with their fits, or nothing without that run."""
+    """Charts of the models' fits on one input; empty without that run."""
     compared = {label: c.validation if sine else c.estimation for label, c in models.items()}
     present = [(label, c) for label, c in compared.items() if c is not None]
     if not present:
@@ -158,7 +158,7 @@ def _fits_chart(
 
 
 def _beside_integer(stage: Stage) -> dict[str, Candidate]:
-    """The models of Figures 6, 9 and 10."""
+    """Models of Figures 6, 9 and 10."""
     last = f"p = {printed.INNOVATION_LENGTHS[-1]}"
     labels = {"integer, manual": stage.manual, last: last, "output error": "output error"}
     return {shown: stage.candidates[label] for shown, label in labels.items()}
@@ -197,12 +197,12 @@ def sine_figures(found: Recomputed) -> list[Figure]:
     ]
 
 
-#: What lines are called.
+#: Labels of the lines.
 RIVAL_NAMES = {PAIR[0]: "p = 7, K₀ = 1", PAIR[1]: "p = 7, weak prior"}
 
 
 def rival_figures(found: Recomputed) -> list[Figure]:
-    """Figure 11: on the input that neither has seen, or on the one they were identified from."""
+    """Figure 11, on the validation run, or on the estimation run without one."""
     figures = []
     for output, rival in found.rivals.items():
         models = {RIVAL_NAMES.get(n, n): c for n, c in rival.models.items() if n != "differential evolution"}
@@ -211,7 +211,7 @@ def rival_figures(found: Recomputed) -> list[Figure]:
     return figures
 
 
-#: Boxes of Figure 2: (heading, what it holds), from left to right or from above.
+#: Boxes of Figure 2: (heading, equations), from left to right or from top to bottom.
 BOXES = (
     ("Energies", "(7)–(11)"),
     ("Equations", "(14)–(21), (26)"),
@@ -232,7 +232,7 @@ def flow_chart() -> Figure:
 
 
 def _flow(described: str, *, narrow: bool) -> Markup:
-    """Boxes with arrows between them; the loop over the orders goes back from the free run."""
+    """Flow chart with boxes and arrows; a loop leads from the simulation back to the orders."""
     count = len(BOXES)
     width, step, w, h = (NARROW, 62, 200, 42) if narrow else (980, 140, 122, 54)
     height = 12 + count * step if narrow else 128

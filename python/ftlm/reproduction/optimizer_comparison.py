@@ -1,4 +1,4 @@
-"""Multi-innovation and its two rivals like for like: one record, criterion and budget, bounds that know nothing."""
+"""Comparison of multi-innovation with two global optimizers: one record, criterion and budget, uninformed bounds."""
 
 from __future__ import annotations
 
@@ -28,16 +28,16 @@ from ftlm.structure.order_grid import Lattice
 from ftlm.structure.structure import Structure
 from ftlm.validation.comparison import Comparison, compare_means, finite, metrics
 
-#: Most seeds, fewest, and how many evaluations of one rival on one angle all seeds together may come to.
+#: Largest and smallest number of seeds, and most evaluations of one optimizer on one angle over all seeds.
 MOST_SEEDS, FEWEST_SEEDS, EVALUATIONS = 10, 3, 40_000
-#: Smallest step of the rivals' lattice, on every arm, unless another is asked for: the paper's has 60 000 candidates an
-#: angle, as many evaluations a seed, and takes minutes.
+#: Default smallest increment of the order grid, on every arm: the paper's grid has 60 000 candidates per angle, as many
+#: evaluations per seed, and takes minutes.
 CONTEST_STEP = 0.1
 
 
 @dataclass(frozen=True)
 class LikeForLike:
-    """What the three came to on one equation: p = 7 by K0, and both rivals."""
+    """Results on one equation: multi-innovation with p = 7 by K0, genetic algorithm, differential evolution."""
 
     settings: Genetic
     candidates: int
@@ -47,12 +47,12 @@ class LikeForLike:
 
 
 def rivals_lattice(step: float, smallest: float = CONTEST_STEP) -> Lattice:
-    """The lattice of the genetic comparison, where the orders' own has this step."""
+    """Return the order grid of the comparison, given the increment of the main grid."""
     return Lattice(step=max(step, smallest), alpha=RIVAL_ALPHA)
 
 
 def seeds_for(candidates: int) -> tuple[int, ...]:
-    """Ten seeds, or as many as the evaluations allow."""
+    """Return ten seeds, or as many as the budget of evaluations allows."""
     return tuple(range(min(MOST_SEEDS, max(FEWEST_SEEDS, EVALUATIONS // max(candidates, 1)))))
 
 
@@ -66,20 +66,20 @@ def like_for_like(
     threads: int | None = None,
     progress: Callable[[int, int], None] | None = None,
 ) -> LikeForLike:
-    """Give the genetic algorithm and differential evolution as many evaluations a seed as the lattice has candidates.
+    """Compare multi-innovation with a genetic algorithm and differential evolution at equal budgets per seed.
 
     Parameters
     ----------
     run
-        One record that starts at rest.
+        Record that starts at rest.
     single
-        One equation.
+        Structure with one equation.
     lattice
-        Of multi-innovation; its ends bound the rivals' orders.
+        Order grid of multi-innovation; its ends bound the orders of the optimizers.
     asked
-        Seeds and evaluations that are asked for.
+        Settings of the genetic algorithm given by the user.
     seeds
-        Where none are asked for; default as many as the evaluations allow.
+        Default seeds; by default as many as the budget of evaluations allows.
     threads, progress
         See :func:`ftlm.search_orders`.
 
@@ -88,7 +88,7 @@ def like_for_like(
     ModelError
         PyGAD or SciPy is not installed, or the record does not start at rest.
     """
-    # Where a structure states the maker's values, bounds would follow them.
+    # Reference values of a structure would inform the bounds.
     blind = replace(single, reference={})
     searches = {
         prior: search_orders(
@@ -115,11 +115,11 @@ def like_for_like(
     return LikeForLike(settings, count, searches, *rivals)
 
 
-#: An error has arrived where it stays below the end of p = 1 and this share of it.
+#: An error has converged if it stays below the final error of p = 1 plus this share.
 ARRIVED = 0.02
-#: Joint fits of the panel take one of so many rows: 8 ms on the virtual rig, a fifteenth of the fastest link's period.
+#: Joint fits use every fourth sample: 8 ms on the virtual rig, a fifteenth of the fastest link mode's period.
 EVERY = 4
-#: Step of the panel's order lattices.
+#: Increment of the order grids.
 PANEL_STEP = 0.25
 
 
@@ -130,11 +130,12 @@ class Trial:
     Parameters
     ----------
     arm, seed, output, prior
-        Which record, which angle, which K0.
+        Arm and seed of the record, angle, K0.
     errors
-        Error (45) of the free run by p, each at its own best orders.
-    arrived
-        Steps by p until the error stays within 2 % of the end of p = 1, all at the orders of p = 7; infinite for never.
+        Output error (45) by p, each at its own best orders.
+    convergence_steps
+        Steps by p until the error stays within 2 % of the final one of p = 1, all at the orders of p = 7; infinite if
+        never.
     nr, manual
         NR of p = 7 and of the manual's integer-order model.
     """
@@ -149,7 +150,7 @@ class Trial:
     manual: float
 
     def to_dict(self) -> dict[str, Any]:
-        """For JSON."""
+        """Return the trial for JSON."""
         return {
             "arm": self.arm,
             "seed": self.seed,
@@ -164,16 +165,16 @@ class Trial:
 
 @dataclass(frozen=True)
 class Contest:
-    """Multi-innovation, the genetic algorithm and differential evolution on one angle of one record, like for like.
+    """Multi-innovation, genetic algorithm and differential evolution on one angle of one record, with equal budgets.
 
     Parameters
     ----------
     arm, output
-        Which record, which angle.
+        Arm of the record, angle.
     candidates
-        Of the lattice, and evaluations of every seed.
+        Candidates of the order grid, and evaluations per seed.
     step
-        Of the lattice.
+        Increment of the order grid.
     lattice
         Error (45) of p = 7 by K0.
     genetic, evolution
@@ -189,7 +190,7 @@ class Contest:
     evolution: dict[int, float]
 
     def to_dict(self) -> dict[str, Any]:
-        """For JSON."""
+        """Return the contest for JSON."""
         return {
             "arm": self.arm,
             "output": self.output,
@@ -203,14 +204,14 @@ class Contest:
 
 @dataclass(frozen=True)
 class Freed:
-    """Whole and free orders of (14)-(15), both by joint output error from the currents alone, on one record.
+    """Integer and free orders of (14)-(15) on one record, both by joint output error from the currents alone.
 
     Parameters
     ----------
     arm, stage
-        Which record.
+        Arm and stage of the record.
     whole, free
-        NR of the free run by angle.
+        NR of the output error by angle, with integer and with free orders.
     orders
         Estimate and 95 % interval of every free order.
     """
@@ -223,11 +224,11 @@ class Freed:
 
     @property
     def away(self) -> list[str]:
-        """Orders whose interval excludes the whole one."""
+        """Orders whose interval excludes the integer one."""
         return [n for n, (_, low, high) in self.orders.items() if not low <= whole_order(n) <= high]
 
     def to_dict(self) -> dict[str, Any]:
-        """For JSON."""
+        """Return the comparison for JSON."""
         return {
             "arm": self.arm,
             "stage": self.stage,
@@ -240,18 +241,18 @@ class Freed:
 
 @dataclass(frozen=True)
 class Panel:
-    """Everything that verdicts are made of."""
+    """All cases behind the verdicts."""
 
     trials: tuple[Trial, ...] = ()
     contests: tuple[Contest, ...] = ()
     freed: tuple[Freed, ...] = ()
 
     def beside(self, other: Panel) -> Panel:
-        """Both together."""
+        """Return the union of two panels."""
         return Panel(self.trials + other.trials, self.contests + other.contests, self.freed + other.freed)
 
     def to_dict(self) -> dict[str, Any]:
-        """For JSON."""
+        """Return all cases for JSON."""
         parts: tuple[tuple[str, Iterable[Any]], ...] = (
             ("trials", self.trials),
             ("contests", self.contests),
@@ -261,7 +262,7 @@ class Panel:
 
 
 def arrived_at(trace: Trace, end: float) -> float:
-    """First step from which an error stays within a share of another one's end; infinite for never."""
+    """First step from which an error stays within a share of a final error; infinite if never."""
     with np.errstate(invalid="ignore"):
         away = np.flatnonzero(~(trace.error <= (1.0 + ARRIVED) * end))
     if not away.size:
@@ -270,7 +271,7 @@ def arrived_at(trace: Trace, end: float) -> float:
 
 
 def manual_nr(stage: StageNumber, run: Run) -> dict[str, float]:
-    """NR of the manual's integer-order model by explicit Euler, as the paper ran it."""
+    """NR of the manual's integer-order model by explicit Euler, as in the paper."""
     m = default_m([run], power_of_two=True)
     found = {}
     for name, samples in explicit_euler(link_model(stage=stage, form="published"), run).items():
@@ -282,7 +283,7 @@ def manual_nr(stage: StageNumber, run: Run) -> dict[str, float]:
 
 
 def trials_of(stage: StageNumber, square: Run, arm: str, seed: int, threads: int | None) -> list[Trial]:
-    """Multi-innovation on both angles of a stage, with all p and both ends of K0."""
+    """Run multi-innovation on both angles of a stage, with all p and both values of K0."""
     structure = flexible_link(stage=stage, form="published", coupling="measured", laws=())
     run = square.select(list(structure.signals))
     manual, found = manual_nr(stage, run), []
@@ -326,7 +327,7 @@ def trials_of(stage: StageNumber, square: Run, arm: str, seed: int, threads: int
 
 
 def contest(made: LikeForLike, output: str, arm: str, step: float) -> Contest:
-    """The errors of all three."""
+    """Return the errors of all three optimizers."""
     lattice = {k: search.score for k, search in made.lattice.items()}
     return Contest(arm, output, made.candidates, step, lattice, made.genetic.errors, made.evolution.errors)
 
@@ -338,12 +339,12 @@ def freed_of(
     threads: int | None,
     progress: Callable[[int, int], None] | None = None,
 ) -> Freed:
-    """Whole and free orders of one stage of a simulated arm, which starts at rest, on one of so many rows.
+    """Fit integer and free orders of one stage of a simulated arm, which starts at rest, on a decimated run.
 
     Raises
     ------
     ConvergenceError
-        No start of one of the fits converged.
+        No initial guess of one of the fits converged.
     """
     structure = replace(flexible_link(stage=stage, coupling="simulated"), initial="rest")
     own = square.select(list(structure.signals))
@@ -363,7 +364,7 @@ def _freed(arm: str, stage: int, whole: Comparison, free: Comparison, fit: Ident
 
 
 def panel_of(stages: Sequence[Stage], square: Run, arm: str, seed: int, threads: int | None) -> Panel:
-    """What one run, and the stages that were made of it, add: no trials of a run that does not start at rest."""
+    """Return the cases of one run and its stage results; trials only for runs that start at rest."""
     trials: list[Trial] = []
     contests = []
     freed = []
@@ -402,7 +403,7 @@ def simulated_panel(
     begin: Callable[[str], None] = lambda _: None,
     progress: Callable[[int, int], None] | None = None,
 ) -> Panel:
-    """One stage on one simulated arm; with the rivals' lattice contests and joint fits as well, on the first record.
+    """Return the cases of one stage on one simulated arm; contests and joint fits on the first record only.
 
     Before each step `begin` is called with what it is, a key of `ftlm.reproduction.stage_models.STEPS`.
     """

@@ -1,4 +1,4 @@
-"""The paper's printed models run: whether they are stable, how far its current moves them, what they give back."""
+"""Simulation of the paper's printed models: stability, standard deviations, re-identified parameters."""
 
 from __future__ import annotations
 
@@ -26,32 +26,32 @@ from ftlm.structure.structure import Structure
 from ftlm.utils.validation import Floats
 from ftlm.validation.comparison import compare_means, finite
 
-#: Orders around the printed ones that a printed model's own response is searched on, in the paper's steps.
+#: Increment and radius [increments] of the order grid around the printed orders.
 STEP, AROUND = 0.05, 2
 
 
 @dataclass(frozen=True)
 class Ran:
-    """One printed model of one angle, run under the paper's current from rest.
+    """Simulation of one printed model of one angle under the paper's current from rest.
 
     Parameters
     ----------
     output, p
-        Which row of Tables 4 and 5.
+        Row of Tables 4 and 5.
     stability
-        Of the stage's two printed equations together.
-    moved, alone
-        Standard deviation of the angle [rad], by both equations together and by (26) with one angle alone.
-    implied
-        Standard deviation that the paper's own RMSE / NR gives the measured angle [rad].
+        Stability of the stage's two coupled printed equations.
+    angle_deviation, single_equation_deviation
+        Standard deviation of the angle [rad], by both coupled equations and by (26) with one angle alone.
+    implied_deviation
+        Standard deviation of the measured angle that the paper's RMSE / NR implies [rad].
     time, response
-        Middle of every pulse [s], and the angle by both equations [rad].
+        Middle of every block pulse [s], and the angle by both equations [rad].
     arm
-        The simulated arm's angle, scaled to the implied deviation [rad].
-    returned
-        Coefficients that multi-innovation returns from that response at the printed orders, by K0.
+        Angle of the simulated arm, scaled to the implied standard deviation [rad].
+    returned_coefficients
+        Coefficients that multi-innovation identifies from that response at the printed orders, by K0.
     orders
-        Orders that it returns by K0, searched around the printed ones; empty unless p is the largest.
+        Orders identified by K0 on a grid around the printed ones; empty unless p is the largest.
     """
 
     output: str
@@ -68,11 +68,11 @@ class Ran:
 
     @property
     def too_small(self) -> float:
-        """How many times more the paper's own angle moves."""
+        """Ratio of the implied to the simulated standard deviation."""
         return self.implied / self.moved if self.moved else np.inf
 
     def to_dict(self) -> dict[str, Any]:
-        """For JSON."""
+        """Return the simulation for JSON."""
         return {
             "output": self.output,
             "p": self.p,
@@ -99,7 +99,7 @@ def printed_numbers(stage: StageNumber, p: int) -> tuple[dict[str, float], dict[
 
 
 def printed_model(stage: StageNumber, p: int) -> Model:
-    """Both printed equations of a stage, driven by the current alone."""
+    """Model of both printed equations of a stage with the current as input."""
     orders, coefficients = printed_numbers(stage, p)
     structure = flexible_link(stage=stage, form="published", coupling="simulated", laws=())
     known = structure.with_orders(orders).with_coefficients(coefficients)
@@ -107,7 +107,7 @@ def printed_model(stage: StageNumber, p: int) -> Model:
 
 
 def one_angle(output: str, p: int) -> Model:
-    """The printed row as (26) reads: every term but the current's has the angle itself."""
+    """Model of the printed row by (26): every term but the current's contains the angle itself."""
     row = printed.FRACTIONAL[output][p]
     terms = [
         Term(output, Order(float(row.orders[order])), float(row.coefficients[letter]))
@@ -118,12 +118,12 @@ def one_angle(output: str, p: int) -> Model:
 
 
 def papers_current(stage: StageNumber) -> Run:
-    """The paper's square current over one stage; nothing here uses the demonstration's angles beside it."""
+    """Run with the paper's square current of one stage; the simulated angles are not used."""
     return demo_run("square", noise=0.0).select([f"I{stage}", f"theta{stage}1", f"theta{stage}2"])
 
 
 def ran(stage: StageNumber, threads: int | None = None) -> list[Ran]:
-    """Run every printed fractional model of a stage, and identify each from its own response."""
+    """Simulate every printed fractional model of a stage, and identify each from its own response."""
     drive, found = papers_current(stage), []
     spreads = implied_spreads()
     scaled, _ = papers_record()
@@ -156,7 +156,7 @@ def ran(stage: StageNumber, threads: int | None = None) -> list[Ran]:
 def _returned(
     run: Run, single: Structure, orders: dict[str, float], p: int, threads: int | None
 ) -> tuple[dict[float, dict[str, float]], dict[float, dict[str, float]]]:
-    """Coefficients at the model's own orders, and for the largest p the orders around them, by K0."""
+    """Coefficients at the model's own orders, and for the largest p the best orders around them, by K0."""
     own = {n: orders[n] for n in single.order_names}
     wide = {
         n: [round(v + k * STEP, 9) for k in range(-AROUND, AROUND + 1) if v + k * STEP < 2.0 or n.startswith("alpha")]

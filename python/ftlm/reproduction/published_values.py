@@ -1,4 +1,4 @@
-"""What the paper prints in its Tables 3 to 7: numbers to set beside computed ones, never to compute with.
+"""Values printed in the paper's Tables 3 to 7, for comparison only, and the tables recomputed at the printed orders.
 
 Wang, Li, Li, Liang, Gao, Symmetry 2025, 17, 1072, doi:10.3390/sym17071072. Digits are the paper's.
 """
@@ -25,7 +25,7 @@ from ftlm.utils.formatting import Exact
 from ftlm.utils.validation import Floats
 from ftlm.validation.comparison import Metrics, finite, metrics
 
-#: The paper's p, its number of pulses, and its four angles in the order n = 1 … 4.
+#: The paper's p, its number of block pulses, and its four angles in the order n = 1 … 4.
 INNOVATION_LENGTHS = COMPARED_LENGTHS
 POINTS = 2048
 OUTPUTS = ("theta11", "theta12", "theta21", "theta22")
@@ -35,7 +35,7 @@ ORDERS, COEFFICIENTS = ("gamma", "alpha", "beta", "mu"), ("a", "b", "d", "g")
 
 @dataclass(frozen=True)
 class Printed:
-    """One printed row: its numbers by letter, and criteria (45), (46), (47); None where the table has none."""
+    """Row of a printed table: parameters by letter, and criteria (45), (46), (47), None if absent."""
 
     orders: Mapping[str, float]
     coefficients: Mapping[str, float]
@@ -126,33 +126,34 @@ def last_orders(output: str) -> dict[str, float]:
     return {f"{n}{index}": v for n, v in FRACTIONAL[output][INNOVATION_LENGTHS[-1]].orders.items()}
 
 
-#: What may stand in the terms a, b and d of an angle: the angle itself (own) or the other one of its stage.
+#: Angles in the terms a, b and d of an equation: its own angle, or the other one of its stage.
 READINGS = {
     "(22)–(25)": "as printed there",
     "(26), one angle": "every term has the angle itself",
     "own angle in a": "the angle itself in a, the other one in b and d",
     "a and b exchanged": "the orders of (22)–(25), the columns a and b of the table exchanged",
 }
-#: K0 that are tried: eight a decade.
+#: Values of K0: eight per decade.
 SCAN = tuple(float(v) for v in np.logspace(-3, 5, 65))
-#: Orders around the printed ones, in the paper's steps, among which the printed ones have their place.
+#: Grid of orders around the printed ones, in the paper's increments, for the rank of the printed orders.
 LOW, HIGH, STEP = 1.6, 1.95, 0.05
-#: A column agrees with the printed one where its signs do and no entry is further than this factor.
+#: Largest ratio to a printed coefficient that counts as agreement, with equal signs.
 NEAR = 1.25
 
 
 @dataclass(frozen=True)
 class Reading:
-    """One way to read what the paper did.
+    """Interpretation of the unstated settings of the paper.
 
     Parameters
     ----------
     terms
-        A key of `READINGS`.
+        A key of `TERM_INTERPRETATIONS`.
     filtered
         Whether the deflections passed the stock 2 Hz filter.
     reversed
-        Whether terms of the angle itself stand on the left-hand side, as in a transfer function: their sign turns.
+        Whether terms of the angle itself are on the left-hand side, as in a transfer function, which reverses their
+        sign.
     prior
         K0.
     """
@@ -169,7 +170,7 @@ class Reading:
 
 @dataclass(frozen=True)
 class Row:
-    """What one reading gives with one p, at the printed orders."""
+    """Coefficients and errors of one interpretation with one p, at the printed orders."""
 
     coefficients: dict[str, float]
     equation: Metrics
@@ -177,26 +178,26 @@ class Row:
 
 @dataclass(frozen=True)
 class AsPrinted:
-    """One angle's part of Tables 4 and 5 by the reading that comes nearest.
+    """Columns of one angle in Tables 4 and 5, by the interpretation closest to the printed values.
 
     Parameters
     ----------
     output
         The angle.
     reading
-        The nearest of all.
+        Closest interpretation.
     rows
-        By p, with the signs of that reading.
+        Rows by p, with the signs of that interpretation.
     away
-        Factor by which a and NR of the four rows are away from the printed ones, in the geometric mean.
+        Geometric mean of the ratios of a and NR to the printed values, over four rows.
     away_at_one
-        The same with K0 = 1 and the nearest of the other choices.
+        The same ratio with K0 = 1 and the best of the other settings.
     rank, among
-        Place of the printed orders by the error (45) of the equation among neighbouring ones, at p = 7.
+        Rank of the printed orders by the equation error (45) among neighboring orders, at p = 7.
     best
-        Orders of the first place.
+        Orders of the first rank.
     scale
-        What the simulated angle was multiplied by.
+        Scale factor of the simulated angle.
     """
 
     output: str
@@ -221,7 +222,7 @@ class AsPrinted:
 
     @property
     def ratios(self) -> dict[str, list[float]]:
-        """Ours over printed by p, of every column and of NR."""
+        """Ratio to the printed value by p, for every coefficient and NR."""
         table = FRACTIONAL[self.output]
         columns = {
             c: [r.coefficients[c] / table[p].coefficients[c] for p, r in self.rows.items()] for c in COEFFICIENTS
@@ -230,11 +231,11 @@ class AsPrinted:
 
     @property
     def near(self) -> bool:
-        """Whether every coefficient has the printed sign and is, as NR is, within a quarter of the printed value."""
+        """Whether all coefficients have the printed sign and are, as NR is, within 25 % of the printed values."""
         return all(1.0 / NEAR <= q <= NEAR for column in self.ratios.values() for q in column)
 
     def to_dict(self) -> dict[str, Any]:
-        """For JSON."""
+        """Return the comparison for JSON."""
         return {
             "reading": str(self.reading),
             "K0": self.reading.prior,
@@ -257,7 +258,7 @@ class AsPrinted:
 
 
 class _Angle:
-    """Regressors of one angle at any order, in Haar coordinates, and the closed form of the recursion (44)."""
+    """Regressors of one angle at any orders in Haar coordinates, and the closed form of the recursion (44)."""
 
     def __init__(self, angles: Mapping[str, Floats], current: Floats, output: str, step: float) -> None:
         other = output[:-1] + ("2" if output.endswith("1") else "1")
@@ -272,7 +273,7 @@ class _Angle:
         self._kept: dict[tuple[str, float], tuple[Floats, Floats]] = {}
 
     def integral(self, signal: str, order: float) -> tuple[Floats, Floats]:
-        """I^order of a signal, in time and in Haar coordinates."""
+        """Fractional integral I^order of a signal, in time and in Haar coordinates."""
         key = signal, round(order, 6)
         if key not in self._kept:
             kernel = _core.block_pulse_kernel(order, self.m, self.step)
@@ -281,7 +282,7 @@ class _Angle:
         return self._kept[key]
 
     def places(self, terms: str) -> tuple[str, str, str, str]:
-        """Which signal the terms a, b, d, g have."""
+        """Signal in each of the terms a, b, d, g."""
         hub = self.output.endswith("1")
         return {
             "(22)–(25)": ("other", "own", "other", "u") if hub else ("own", "other", "own", "u"),
@@ -299,7 +300,7 @@ class _Angle:
         return np.stack(time, axis=1), np.stack(haar, axis=1)
 
     def solved(self, haar: Floats, priors: Sequence[float], p: int) -> list[Floats]:
-        """Closed form of (44): row i counts min(p, M - i + 1) times, against the prior."""
+        """Return the closed form of (44): least squares with weight min(p, M - i + 1) of row i, and a prior."""
         weights = np.minimum(p, self.m - np.arange(self.m)).astype(np.float64)
         weighted = haar * weights[:, None]
         gram, right = weighted.T @ haar, weighted.T @ self.haar_y
@@ -309,12 +310,12 @@ class _Angle:
 
 
 def implied_spreads() -> dict[str, tuple[float, float]]:
-    """Standard deviations that Table 7 implies by RMSE / NR, of the genetic algorithm's record and of the other."""
+    """Standard deviations that Table 7 implies by RMSE / NR, for the genetic algorithm and for multi-innovation."""
     return {o: (g[1] / g[2], m[1] / m[2]) for o, (g, m) in RIVALS.items()}
 
 
 def papers_record() -> tuple[Run, dict[str, float]]:
-    """The arm under the paper's square current, every angle scaled to the deviation that the paper implies."""
+    """Run of the arm under the paper's square current, every angle scaled to the implied standard deviation."""
     run = demo_run("square", parameters=PAPERS_ARM)
     scales = {o: implied[1] / float(np.std(run[o])) for o, implied in implied_spreads().items()}
     outputs = {o: run[o] * scales[o] for o in scales}
@@ -323,7 +324,7 @@ def papers_record() -> tuple[Run, dict[str, float]]:
 
 
 def as_printed(outputs: Sequence[str] = OUTPUTS) -> dict[str, AsPrinted]:
-    """Tables 4 and 5 by the reading that comes nearest to them, angle by angle.
+    """Recompute Tables 4 and 5 by the closest interpretation, angle by angle.
 
     Parameters
     ----------
@@ -383,7 +384,7 @@ def _nearest(output: str, angles: Mapping[bool, _Angle], scale: float) -> AsPrin
 
 
 def _away(rows: Mapping[int, Row], table: Mapping[int, Printed]) -> float:
-    """Mean absolute logarithm of ours over the printed, of a and NR; an a of the other sign counts as a decade."""
+    """Mean absolute logarithm of the ratios to the printed a and NR; a reversed sign of a counts as a decade."""
     logs = []
     for p, row in rows.items():
         ratio = row.coefficients["a"] / table[p].coefficients["a"]
@@ -393,7 +394,7 @@ def _away(rows: Mapping[int, Row], table: Mapping[int, Printed]) -> float:
 
 
 def _ranked(angle: _Angle, reading: Reading, orders: Mapping[str, float]) -> tuple[int, int, dict[str, float]]:
-    """Place of the printed orders among all neighbouring ones, at the largest p."""
+    """Rank of the printed orders among all neighboring ones at the largest p, their number, and the best orders."""
     values = [round(LOW + k * STEP, 9) for k in range(round((HIGH - LOW) / STEP) + 1)]
     errors: dict[tuple[float, ...], float] = {}
     for beta, gamma, mu in product(values, values, values):

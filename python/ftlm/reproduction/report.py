@@ -1,4 +1,4 @@
-"""The paper's section 5 as a page: verdicts first, then every table and figure beside what is printed."""
+"""HTML pages of the reproduction, of the cross-validation and of the demonstration."""
 
 from __future__ import annotations
 
@@ -51,7 +51,7 @@ def stage_section(
     charts: Sequence[Figure],
     *notes: str,
 ) -> Section:
-    """The joint model's equations, then tables with that of all searches, and figures."""
+    """Section with the joint model's equations, tables including all searches, and figures."""
     searches = {f"{n}, {o}": s for n, r in results.items() if r is not None for o, s in r.searches.items()}
     words = "(14)–(15) by joint output error, order law and coefficient law imposed:"
     equations = [equation_html(e, joint.structure.delay, joint.structure.limits) for e in joint.equations]
@@ -65,13 +65,13 @@ def stage_section(
 
 
 def typeset(words: str) -> str:
-    """Words with numbers as a page sets them: powers of ten, a minus, K₀."""
+    """Typeset numbers in a text: powers of ten, minus signs, K₀."""
     powers = re.sub(r"(?<=\d)e([+-]\d+)\b", lambda e: f"·10{str(int(e[1])).translate(SUPERSCRIPTS)}", words)
     return re.sub(r"(?<![\w.])-(?=\d)", "−", powers).replace("K0", "K₀")
 
 
 def _verdict_section(found: Recomputed) -> Section:
-    """A line for each verdict, and the numbers behind a fold."""
+    """Section with one line per verdict, and the evidence in a collapsed part."""
     told = claims(found)
     rows: list[list[Cell]] = [
         [
@@ -272,7 +272,7 @@ def _runs_section(found: Recomputed) -> Section:
 
 
 def reproduction_page(found: Recomputed, path: str | os.PathLike[str], *, force: bool = False) -> Path:
-    """Write the reproduction as one page; see :meth:`ftlm.Reproduction.page`."""
+    """Write the reproduction as one HTML page; see :meth:`ftlm.Reproduction.page`."""
     check_free(path, force=force)
     sections = [
         _verdict_section(found),
@@ -315,7 +315,7 @@ def reproduction_page(found: Recomputed, path: str | os.PathLike[str], *, force:
 
 
 def fits_text(fits: Mapping[str, Sequence[float]], label: int, widths: Sequence[int]) -> list[str]:
-    """Fits in percent, a line for each model, in columns of these widths."""
+    """Fits in percent as text, one line per model, in columns of these widths."""
     lines = []
     for name, values in fits.items():
         shown = ("–" if math.isnan(fit) else f"{fit:.2f}" for fit in values)
@@ -324,7 +324,7 @@ def fits_text(fits: Mapping[str, Sequence[float]], label: int, widths: Sequence[
 
 
 def reproduction_text(found: Recomputed) -> str:
-    """Verdicts, each with its shortest reason, and fits for a terminal; the page has the numbers."""
+    """Summary for a terminal: verdicts with their main number, and fits."""
     lines = []
     for claim in claims(found):
         lines += [f"{claim.verdict.upper()}: {claim.claim}", f"    {claim.brief}"]
@@ -346,22 +346,22 @@ def reproduction_text(found: Recomputed) -> str:
     return "\n".join(lines)
 
 
-#: The structure of the pictures: everything that the paper says of a link may be fractional.
+#: Structure in the charts: elasticity and damping fractional, as in the paper.
 SHOWN = "both fractional"
-#: What each kind is called in a verdict, and how it goes on.
+#: Subject and both endings of a verdict for each kind.
 WHAT = {
     "fractional elasticity": ("a fractional order of the elasticity", "earns its place", "does not earn its place"),
     "fractional damping": ("a fractional order of the damping", "earns its place", "does not earn its place"),
     SHOWN: ("fractional orders", "earn their place", "do not earn their place"),
 }
-#: A verdict in a cell.
+#: Verdict in a table cell.
 SHORT = {True: "yes", False: "no", None: "cannot be told"}
-#: Points of a line of the pictures.
+#: Points of a line.
 LINE_POINTS = 700
 
 
 def sentence(output: str, verdict: Verdict) -> str:
-    """A verdict in words."""
+    """Return a verdict as a sentence."""
     what, yes, no = WHAT[verdict.kind]
     if verdict.earns is None:
         return f"{symbol(output)}: whether {what} {yes} cannot be told."
@@ -374,7 +374,7 @@ def _verdict(output: str, verdict: Verdict) -> Markup:
 
 
 def unseen_charts(found: UnseenOrders, deflection: Deflection) -> list[Figure]:
-    """Measured deflection and both free runs on the run after the one that was fitted."""
+    """Charts of a deflection and its simulations by both structures on the run after the estimation run."""
     charts = []
     names = [run.name or "" for run in found.runs]
     for run, judged in zip(names, names[1:] + names[:1], strict=True):
@@ -407,7 +407,7 @@ def unseen_charts(found: UnseenOrders, deflection: Deflection) -> list[Figure]:
 
 
 def _each(found: UnseenOrders) -> list[tuple[str, Deflection]]:
-    """Every structure that was judged, with its heading; those without the rate after those with it."""
+    """Return every structure with its heading; those without the rate follow those with it."""
     out = []
     for output, deflection in found.deflections.items():
         out.append((symbol(output), deflection))
@@ -417,7 +417,7 @@ def _each(found: UnseenOrders) -> list[tuple[str, Deflection]]:
 
 
 def places_table(found: UnseenOrders) -> Table | None:
-    """Which orders earn their place before the rate of the other deflection stood in the equation, and with it."""
+    """Table of the verdicts without and with the rate of the other deflection."""
     rows: list[list[Cell]] = []
     headings = {}
     for output, deflection in found.deflections.items():
@@ -438,7 +438,7 @@ def places_table(found: UnseenOrders) -> Table | None:
 
 
 def fits_table(found: UnseenOrders) -> Table:
-    """Every structure on every run, seen and unseen, with its orders."""
+    """Table of the fits of every structure on all runs, with its orders."""
     names = [run.name or "" for run in found.runs]
     pairs = [(run, other) for run in names for other in names]
     rows: list[list[Cell]] = []
@@ -465,7 +465,7 @@ def fits_table(found: UnseenOrders) -> Table:
 
 
 def estimates_table_unseen_page(deflection: Deflection, told: str = "") -> Table:
-    """What every fit found, with intervals, a line a number."""
+    """Table of the estimates with 95 % intervals of every fit, one line per parameter."""
     rows: list[list[Cell]] = []
     headings = {}
     for kind, each in deflection.fits.items():
@@ -520,7 +520,7 @@ def _method_section(found: UnseenOrders) -> Section:
 
 
 def unseen_page(found: UnseenOrders, path: str | os.PathLike[str], *, force: bool = False) -> Path:
-    """Write pictures, verdicts and numbers as one page.
+    """Write charts, verdicts and numbers as one HTML page.
 
     Parameters
     ----------
@@ -559,7 +559,7 @@ def unseen_page(found: UnseenOrders, path: str | os.PathLike[str], *, force: boo
 
 
 def unseen_text(found: UnseenOrders) -> str:
-    """Verdicts and fits for a terminal."""
+    """Summary of verdicts and fits for a terminal."""
     lines: list[str] = []
     for output, deflection in found.deflections.items():
         for verdict in deflection.verdicts:
@@ -594,7 +594,7 @@ NOTE = (
 
 
 def paper_rows(demo: Demo, stage: int) -> list[PaperRow]:
-    """Rows of a stage, those of one output together."""
+    """Table rows of a stage, grouped by output."""
     rows = []
     for r in sorted(demo.rows[stage], key=lambda r: r.output):
         orders, coefficients = ({letter_of(n): v for n, v in part.items()} for part in (r.orders, r.coefficients))
@@ -603,7 +603,7 @@ def paper_rows(demo: Demo, stage: int) -> list[PaperRow]:
 
 
 def validation_table(demo: Demo) -> Table:
-    """Fit of every model on the square run, from which it was identified, and on the sine run."""
+    """Table of the fits of every model on the square run (estimation) and on the sine run (validation)."""
     rows: list[list[Cell]] = [
         [r.output, r.label, r.output_error.fit, r.validation.fit, r.validation.error, r.validation.nr]
         for stage in demo.rows
@@ -620,12 +620,12 @@ def validation_table(demo: Demo) -> Table:
     return Table("Validation on the other input", columns, rows, note="Free runs; error in rad.")
 
 
-#: Models whose fits the first screen shows, and what the paper calls the method.
+#: Models in the first table, with the paper's names of the methods.
 SHOWN_MODELS = ("integer order", "p = 1", "p = 7", "least squares", "output error")
 
 
 def demo_text(demo: Demo) -> str:
-    """What came out on one screen: both verdicts, both models, who predicts the run that nobody saw, three warnings."""
+    """Summary for a terminal: verdicts, models, fits on the validation run, three warnings."""
     square = demo.square
     lines = [
         f"A simulated flexible arm: {square.length} rows of a square current, checked on a sine.",
@@ -667,7 +667,7 @@ def demo_text(demo: Demo) -> str:
 
 
 def demo_details(demo: Demo) -> str:
-    """All tables for a terminal of 120 columns, warnings last."""
+    """All tables for a terminal of 120 columns, followed by the warnings."""
     lines = []
     for stage in demo.rows:
         lines += [f"Stage {stage}, square current (the shape of the paper's Table {3 + stage})"]
@@ -702,7 +702,7 @@ def demo_details(demo: Demo) -> str:
 
 
 def demo_page(demo: Demo, path: str | os.PathLike[str], *, force: bool = False) -> Path:
-    """Write everything on one page: both verdicts, who predicts the other run, then each stage with its tables.
+    """Write the demonstration as one HTML page: verdicts, fits on the validation run, then the tables of each stage.
 
     Raises
     ------
@@ -746,7 +746,7 @@ def demo_page(demo: Demo, path: str | os.PathLike[str], *, force: bool = False) 
 
 
 def _first_section_demo_page(demo: Demo) -> Section:
-    """Which model predicts the run that none has seen, as bars, an output each."""
+    """Fits of all models on the validation run as bars, one chart per output."""
     figures = []
     for stage in demo.rows:
         for output in dict.fromkeys(r.output for r in demo.rows[stage]):

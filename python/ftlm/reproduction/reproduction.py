@@ -1,4 +1,4 @@
-"""Section 5 of the paper from end to end: its tables and figures recomputed, beside the printed ones, and judged."""
+"""Reproduction of the paper's section 5: tables and figures beside the printed ones, verdicts."""
 
 from __future__ import annotations
 
@@ -30,47 +30,47 @@ from ftlm.utils.files import check_folder, write_atomically
 from ftlm.utils.resources import expected
 from ftlm.utils.validation import check_threads, listed, nearest, real_number, whole_number
 
-#: Rows that an order search keeps; the tables need the best alone.
+#: Candidates that an order search keeps; the tables need only the best.
 KEEP = 1
-#: What is saved whatever the stages hold.
+#: File of the tables, which is always saved.
 TABLES = "tables.json"
-#: What verdicts call the runs that were given.
+#: Name of the given runs in verdicts.
 MEASURED = "as measured"
 ALWAYS_SAVED = ("square.csv", "sine.csv", TABLES)
-#: Seconds between two looks for Ctrl-C.
+#: Polling interval for Ctrl-C [s].
 LOOK = 0.1
 
 
 class Reproduction(Recomputed):
-    """Section 5 of the paper, recomputed.
+    """Reproduction of section 5 of the paper.
 
     Parameters
     ----------
     square, sine
-        The run that everything is identified from, and the other one (None where it is not given).
+        Estimation run and validation run (None if not given).
     simulated
-        Whether they come from the virtual rig, whose truth is known.
+        Whether the runs come from the virtual rig, whose parameters are known.
     stages
-        By number.
+        Stage results by number.
     lattice
-        Of the order searches.
+        Order grid of the searches.
     notes
-        What was left out and why.
+        Omitted parts with reasons.
     panel
-        What verdicts are made of: all arms, records and both ends of K0.
+        Cases behind the verdicts: all arms, records and both values of K0.
     ran
-        The paper's printed models run under its own current.
+        Simulations of the paper's printed models under its own current.
     as_printed
         Tables 4 and 5 as the paper computed them, by angle.
     """
 
     @property
     def claims(self) -> list[Claim]:
-        """What holds and what does not."""
+        """Claims of the paper with verdicts."""
         return claims(self)
 
     def page(self, path: str | os.PathLike[str], *, force: bool = False) -> Path:
-        """Write everything as one HTML file that opens offline.
+        """Write the reproduction as one offline HTML file.
 
         Parameters
         ----------
@@ -87,12 +87,12 @@ class Reproduction(Recomputed):
         return reproduction_page(self, path, force=force)
 
     def save(self, folder: str | os.PathLike[str], *, force: bool = False) -> list[Path]:
-        """Write runs, models and all tables' numbers, from which each table can be computed again.
+        """Write runs, models and the numbers of all tables, from which each table can be recomputed.
 
         Parameters
         ----------
         folder
-            Made if it is not there: ``square.csv``, ``sine.csv``, a model file for every row, ``tables.json``.
+            Created if absent: ``square.csv``, ``sine.csv``, a model file for every row, ``tables.json``.
         force
             Overwrite.
 
@@ -104,7 +104,7 @@ class Reproduction(Recomputed):
         Raises
         ------
         DataError
-            A file is there already, or the folder cannot be written.
+            A file exists, or the folder cannot be written.
         """
         where = Path(folder)
         models: dict[str, Model] = {}
@@ -123,7 +123,7 @@ class Reproduction(Recomputed):
         return [where / name for name in (*runs, *models, TABLES)]
 
     def to_dict(self) -> dict[str, Any]:
-        """For JSON: every number of every table, and the verdicts."""
+        """Return all numbers of the tables and the verdicts for JSON."""
         return {
             "runs": [run.name for run in self.runs],
             "simulated": self.simulated,
@@ -138,7 +138,7 @@ class Reproduction(Recomputed):
 
 
 def slug(label: str) -> str:
-    """A label as part of a file's name."""
+    """Return a label as part of a file name."""
     return "-".join("".join(c if c.isalnum() else " " for c in label).split())
 
 
@@ -157,36 +157,35 @@ def reproduce(
     say: Callable[[str], None] = lambda _: None,
     progress: Callable[[int, int], None] | None = None,
 ) -> Reproduction:
-    """Recompute section 5 of the paper, on the virtual rig or on runs of one's own.
+    """Reproduce section 5 of the paper, on the virtual rig or on measured runs.
 
     Parameters
     ----------
     square
-        Run that everything is identified from: I1, theta11, theta12 and (or) I2, theta21, theta22, in A and rad. By
-        default both stages of the virtual rig under a square current of 0.3 A, period 2 s, for 10 s.
+        Estimation run: I1, theta11, theta12 and (or) I2, theta21, theta22, in A and rad. By default both stages of the
+        virtual rig under a square current of 0.3 A, period 2 s, for 10 s.
     sine
-        Run that nothing is identified from. By default, with the default ``square`` only, 0.6 A at 6.3 rad/s.
+        Validation run. By default, with the default ``square`` only, 0.6 A at 6.3 rad/s.
     step
-        Step of the order lattice; the paper's is 0.05.
+        Increment of the order grid; the paper's is 0.05.
     noise, seed
-        Of the virtual rig's angles, see :func:`ftlm.reproduction.demo_run`.
+        Noise of the virtual rig's angles, see :func:`ftlm.reproduction.demo_run`.
     genetic
         Seeds and evaluations of the genetic algorithm and of differential evolution; by default ten seeds, or as many
-        as 20 000 evaluations an angle allow, each with as many evaluations as the lattice that they are compared with
-        has candidates.
+        as 20 000 evaluations an angle allow, each with as many evaluations as the compared order grid has candidates.
     rivals_step
-        Smallest step of that lattice, on every arm; the paper's 0.05 takes sixteen times as long.
+        Smallest increment of that grid, on every arm; the paper's 0.05 takes sixteen times as long.
     arms
-        Simulated arms that verdicts are computed on besides the first: keys of `ARMS`, by default all. Of a measured
-        run nothing is simulated.
+        Simulated arms for verdicts besides the first: keys of `ARM_VARIANTS`, by default all. For a measured run there
+        are none.
     records
-        Records of each of them, whose noise differs.
+        Records of each arm with different noise.
     threads
-        Threads of each stage; two stages or arms are computed at the same time unless this is 1.
+        Threads of each stage; two stages or arms are computed in parallel unless this is 1.
     say
-        Called with a line about what happens next, from the thread of a stage.
+        Called with a line about the next step, from the thread of a stage.
     progress
-        Called with (parts done, parts in all) of the whole, from the thread of a stage; the parts are of equal time.
+        Called with (parts done, all parts) of the whole, from the thread of a stage; the parts have equal duration.
 
     Returns
     -------
@@ -196,9 +195,9 @@ def reproduce(
     Raises
     ------
     DataError
-        Runs without the signals of any stage, or a sine run that lacks some.
+        Runs without the signals of any stage, or a sine run without some of them.
     ModelError
-        A sine run without a square run, arms that are not known, a step or records that are none.
+        A sine run without a square run, unknown arms, an invalid step or number of records.
     """
     simulated = square is None
     others, lattice = _others(arms, records), Lattice(step=step)
@@ -275,7 +274,7 @@ def reproduce(
 
 @dataclass(frozen=True)
 class Made:
-    """What was made of one stage of the run that everything is identified from."""
+    """Results of one stage of the estimation run."""
 
     stage: Stage
     rows: list[Ran]
@@ -284,12 +283,12 @@ class Made:
     notes: list[str]
 
 
-#: What a worker does, told where to say how far it is.
+#: Job of a worker, called with its progress.
 Job = Callable[[Steps], Made | Panel]
 
 
 def _others(arms: Sequence[str] | None, records: int) -> list[str]:
-    """Arms besides the first."""
+    """Return the arms besides the first."""
     if isinstance(arms, str):
         raise ModelError(f"arms = {arms!r} is a text; give a list of names, such as [{arms!r}]")
     for name in arms or ():
@@ -303,7 +302,7 @@ def _others(arms: Sequence[str] | None, records: int) -> list[str]:
 def side_by_side(
     jobs: Sequence[Job], workers: int, seconds: float, progress: Callable[[int, int], None] | None
 ) -> list[Made | Panel]:
-    """What all jobs come to, so many of them at the same time: while one fits on one core, another uses the rest."""
+    """Run all jobs in parallel and return their results; single-core fits overlap with parallel searches."""
     stop, whole = threading.Event(), Whole(seconds, progress)
 
     def done_by(job: Job) -> Made | Panel:
@@ -334,12 +333,12 @@ def side_by_side(
 
 
 def stages_of(square: Run, sine: Run | None) -> list[StageNumber]:
-    """Stages whose signals a run has.
+    """Return the stages whose signals a run contains.
 
     Raises
     ------
     DataError
-        No stage is whole, or the sine run lacks a signal of one.
+        No complete stage, or a sine run without a signal of one.
     """
     wanted = {n: (f"I{n}", f"theta{n}1", f"theta{n}2") for n in STAGES}
     found = [n for n, names in wanted.items() if all(s in square.signals for s in names)]

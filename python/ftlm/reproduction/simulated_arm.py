@@ -1,4 +1,4 @@
-"""The arm that the paper's runs are simulated on, and these runs."""
+"""Arm simulated for the reproduction, and its runs."""
 
 from __future__ import annotations
 
@@ -16,22 +16,22 @@ from ftlm.rig.recording import record
 
 StageNumber = Literal[1, 2]
 STAGES: tuple[StageNumber, StageNumber] = (1, 2)
-#: The paper's inputs and their amplitudes [A].
+#: Input shapes of the paper with their current amplitudes [A].
 AMPLITUDES = {"square": 0.3, "sine": 0.6}
-#: The demonstration's arm: effective coefficients, fractional damping in the links, nothing that is not linear.
+#: Arm of the demonstration: effective coefficients, fractional damping of the links, linear.
 PARAMETERS = ArmParameters.of("linear")
-#: Its seed unless another is asked for.
+#: Default seed of the noise.
 SEED = 1
 
 
 def _whole(stage: StageParameters, *, friction: bool) -> StageParameters:
-    """The maker's integer orders; Coulomb friction as it is, or none."""
+    """Return a stage with the maker's integer orders, with or without Coulomb friction."""
     return replace(stage, gamma=1.0, beta=0.0, mu=1.0, coulomb=stage.coulomb if friction else 0.0)
 
 
 def _whole_arm(*, friction: bool, coupling: float) -> ArmParameters:
     rubbing = SETS["effective"]
-    # Links of the maker's file have no damping in stage 1.
+    # Stage 1 of the maker's file has no link damping.
     first = replace(_whole(rubbing.stage1, friction=friction), d=0.0)
     return replace(
         PARAMETERS,
@@ -42,8 +42,8 @@ def _whole_arm(*, friction: bool, coupling: float) -> ArmParameters:
     )
 
 
-#: Arms on which a verdict is computed: the demonstration's, with Coulomb friction in the hubs and stages that push each
-#: other as well, and both with the maker's whole orders. Gauges are exact in all: noise is put on every angle alike.
+#: Arms for verdicts: that of the demonstration, one with Coulomb friction and stage coupling, and both with the maker's
+#: integer orders. Gauges are exact in all; every angle has the same noise.
 ARMS: dict[str, ArmParameters] = {
     "fractional": PARAMETERS,
     "fractional, friction": replace(
@@ -52,22 +52,22 @@ ARMS: dict[str, ArmParameters] = {
     "whole orders": _whole_arm(friction=False, coupling=0.0),
     "whole orders, friction": _whole_arm(friction=True, coupling=1.0),
 }
-#: The demonstration's arm among them.
+#: Key of the demonstration's arm.
 MAIN = "fractional"
-#: The paper's arm as one can guess it: whole orders, friction, each stage by itself as in its equations.
+#: Guess of the paper's arm: integer orders, friction, uncoupled stages as in its equations.
 PAPERS_ARM = _whole_arm(friction=True, coupling=0.0)
 
 
 def demo_plant(stage: int, *, form: Form = "lagrange") -> Model:
-    """One stage of the demonstration's arm: effective coefficients, fractional orders, their law.
+    """Model of one stage of the demonstration's arm: effective coefficients, fractional orders, order law.
 
     Parameters
     ----------
     stage
         1 or 2.
     form
-        ``"lagrange"``: the arm as it is, what :func:`demo_run` records. ``"published"``: the same numbers in the
-        paper's own equations (22)-(25) as printed, whose links bend the wrong way, see :func:`ftlm.flexible_link`.
+        ``"lagrange"``: the arm as simulated by :func:`demo_run`. ``"published"``: the same parameters in the paper's
+        printed equations (22)-(25), whose deflections have the wrong sign, see :func:`ftlm.flexible_link`.
 
     Returns
     -------
@@ -82,12 +82,12 @@ def demo_plant(stage: int, *, form: Form = "lagrange") -> Model:
 
 
 def parameters_of(stage: int) -> StageParameters:
-    """Of one stage of the demonstration's arm."""
+    """Parameters of one stage of the demonstration's arm."""
     return PARAMETERS.stage1 if stage == 1 else PARAMETERS.stage2
 
 
 def truth_of(stage: int) -> dict[str, float]:
-    """Orders and free coefficients of the simulated arm; the deflection's highest order is fixed, at 2."""
+    """Orders and free coefficients of the simulated arm; the deflection's highest order is fixed at 2."""
     arm = parameters_of(stage)
     orders = {n: v for n, v in arm.orders(stage).items() if n != f"alpha{2 * stage}"}
     hub = {f"{c}{2 * stage - 1}": float(getattr(arm, c)) for c in "abdg"}
@@ -103,23 +103,23 @@ def demo_run(
     seed: int = SEED,
     parameters: ArmParameters = PARAMETERS,
 ) -> Run:
-    """A run of the virtual rig under the paper's inputs: the linear arm, encoders and all, and noise on every angle.
+    """Run of the virtual rig under the paper's inputs: linear arm with encoders, and noise on every angle.
 
-    Its links hang on their hubs, (14)-(15), as those of a real arm do; the paper's own (22)-(25) are not this arm.
+    The links move with their hubs, (14)-(15), as in a real arm, unlike the paper's equations (22)-(25).
 
     Parameters
     ----------
     shape
-        ``"square"``: 0.3 A, period 2 s, duty 50 %. ``"sine"``: 0.6 A at 6.3 rad/s. Both currents alike, held over
-        a sample.
+        ``"square"``: 0.3 A, period 2 s, duty 50 %. ``"sine"``: 0.6 A at 6.3 rad/s. Both currents are equal and have a
+        zero-order hold.
     duration, step
         Length and sampling step [s].
     noise
         Standard deviation of the noise on every angle [rad].
     seed
-        Of the noise.
+        Seed of the noise.
     parameters
-        Of another arm.
+        Parameters of another arm.
 
     Returns
     -------
@@ -129,7 +129,7 @@ def demo_run(
     Raises
     ------
     ModelError
-        Another shape, or a noise that is negative.
+        Another shape, or negative noise.
     """
     if not (np.isfinite(noise) and noise >= 0):
         raise ModelError(f"noise = {noise} rad is not a non-negative number")
@@ -156,7 +156,7 @@ def demo_run(
 
 
 def thinned(run: Run, every: int) -> Run:
-    """Every so manieth row of a run, held inputs by their means until the next one, which act alike."""
+    """Decimate a run; zero-order-hold inputs are averaged over each interval, which preserves their effect."""
     rows = run.length // every
     data = {}
     for name in run.signals:

@@ -1,4 +1,4 @@
-"""How far the reproduction is: what each of its steps takes, said beforehand, and the share that is behind."""
+"""Progress of the reproduction: processor time of its steps and completed share."""
 
 from __future__ import annotations
 
@@ -38,9 +38,9 @@ from ftlm.svg.heat_map import Landscape
 from ftlm.utils.validation import check_threads
 from ftlm.validation.comparison import Comparison, compare_means, metrics
 
-#: What each step of a stage takes one core of the machine that base/pace.py knows [s]: searches at the step of the
-#: paper's lattice, rivals at that of theirs, fits on the virtual rig's 5000 rows. Three quarters of what they took
-#: beside other work.
+#: Processor time of each step of a stage on one core of the reference machine of base/pace.py [s]: searches with the
+#: paper's increment, optimizers with theirs, fits on the virtual rig's 5000 samples. These are three quarters of the
+#: measured times, which included other load.
 STEPS: Mapping[str, float] = {
     "whole orders": 1.5,
     "search": 1.4,
@@ -57,9 +57,9 @@ STEPS: Mapping[str, float] = {
 }
 
 
-#: Of the rivals' lattice at its usual step.
+#: Candidates of the optimizer comparison at its default increment.
 CANDIDATES = 3800
-#: What a stage of the run that is identified from takes, once each unless said, and one of another arm.
+#: Number of executions of each step, for a stage of the estimation run and for a stage of another arm.
 OF_STAGE = {
     "whole orders": 1,
     "search": 5,
@@ -77,7 +77,7 @@ OF_ARM = {"trials": 0, "rivals": 2, "freed": 1}
 
 
 def seconds_of(step: str, lattice_step: float, rivals_step: float = CONTEST_STEP) -> float:
-    """Processor time of a step [s]; what searches lattices grows with the fourth power of their fineness."""
+    """Processor time of a step [s]; searches grow with the inverse fourth power of the increment."""
     if step == "rivals":
         candidates = round(CANDIDATES * (CONTEST_STEP / max(lattice_step, rivals_step)) ** 4)
         evaluations = candidates * len(seeds_for(candidates))
@@ -88,7 +88,7 @@ def seconds_of(step: str, lattice_step: float, rivals_step: float = CONTEST_STEP
 def seconds_of_all(
     lattice_step: float, stages: int, arms: int = 0, records: int = 1, *, rivals_step: float = CONTEST_STEP
 ) -> float:
-    """Processor time of all of it [s]: stages of one run, so many arms besides, records of each and of the first."""
+    """Processor time of the whole reproduction [s]."""
     counts = dict(OF_STAGE)
     for step, count in OF_ARM.items():
         counts[step] = counts.get(step, 0) + arms * count
@@ -97,12 +97,12 @@ def seconds_of_all(
 
 
 class Whole:
-    """The share of all work that is done, told to one listener by workers at the same time.
+    """Share of all completed work, reported by several workers to one receiver.
 
     Parameters
     ----------
     seconds
-        Of all work together.
+        Processor time of all work.
     told
         See :class:`ftlm.progress.Course`.
     """
@@ -113,32 +113,32 @@ class Whole:
         self._under_way: dict[object, float] = {}
 
     def at(self, worker: object, seconds: float) -> None:
-        """A worker is so far with its step."""
+        """Report the progress of a worker within its step."""
         with self._lock:
             self._under_way[worker] = seconds
             self._course.at((self._done + sum(self._under_way.values())) / self._seconds)
 
     def ended(self, worker: object, seconds: float) -> None:
-        """A worker has ended a step."""
+        """Report that a worker has finished a step."""
         with self._lock:
             self._under_way.pop(worker, None)
             self._done += seconds
             self._course.at((self._done + sum(self._under_way.values())) / self._seconds)
 
     def end(self) -> None:
-        """All is done, whatever was left out on the way."""
+        """Report that all work is finished, including skipped steps."""
         self._course.at(1.0)
 
 
 class Steps(Stoppable):
-    """One worker's steps, one after the other: what searches and fits are to call with (done, total).
+    """Progress of one worker through its steps; searches and fits call it with (done, total).
 
     Parameters
     ----------
     whole
-        All work.
+        Progress of all work.
     stop
-        Set to end the work with KeyboardInterrupt at its next report.
+        Event that ends the work with KeyboardInterrupt at its next report.
     """
 
     def __init__(self, whole: Whole, stop: threading.Event) -> None:
@@ -146,13 +146,13 @@ class Steps(Stoppable):
         self._whole, self._step, self._within = whole, 0.0, 0.0
 
     def begin(self, seconds: float) -> None:
-        """The step before has ended; the next one takes so long."""
+        """Finish the previous step, and start one with this processor time."""
         super().__call__(0, 0)
         self._whole.ended(self, self._step)
         self._step, self._within = seconds, 0.0
 
     def __call__(self, done: int, total: int, pruned: int | None = None) -> None:
-        """A part of the step is so far; where it counts anew, it has gone half of the way that was left."""
+        """Report progress within the step; a restarted count continues at half of the remainder."""
         super().__call__(done, total, pruned)
         share = done / max(total, 1)
         if share < self._within:
@@ -162,22 +162,22 @@ class Steps(Stoppable):
         self._whole.at(self, self._step * share)
 
 
-#: Instrumental variables are searched so many steps of the lattice around the orders of least squares: every candidate
-#: costs several free runs.
+#: Radius [increments] of the search by instrumental variables around the orders of least squares; every candidate needs
+#: several simulations.
 AROUND = 2
-#: Runs with more rows than the first are thinned to at most the second for joint fits, whose cost and whose grid's
-#: refinement grow with the rows; the arm's modes are two decades below the rate that is left.
+#: Runs with more samples than the first number are decimated to at most the second for joint fits, whose cost grows
+#: with the samples. The arm's modes are two decades below the reduced rate.
 MOST_ROWS, JOINT_ROWS = 6000, 2500
-#: On finer lattices than this those orders of multi-innovation that no bound excludes are searched in steps of this
-#: first, then in the lattice's own steps around so many of the best.
+#: Increment of a first search on finer grids, among orders of multi-innovation that no bound excludes, and number of
+#: the best candidates around which the grid's own increment follows.
 COARSE, BEST = 0.1, 10
-#: Whole orders that are none leave residuals that no row more makes smaller.
+#: Samples of fits with integer orders, whose systematic residuals do not shrink with more samples.
 WHOLE_ROWS = 1250
 
 
 @dataclass(frozen=True)
 class Preset:
-    """What the reproduction and the demonstration do differently."""
+    """Settings that differ between the reproduction and the demonstration."""
 
     lattice: Lattice
     keep: int  # rows of an order search
@@ -190,7 +190,7 @@ class Preset:
 
 @dataclass
 class StageWork:
-    """One stage under way: runs, settings, whom to tell, and notes of what was left out and why."""
+    """Computation of one stage: runs, settings, progress receivers, and notes about omitted parts."""
 
     number: StageNumber
     square: Run
@@ -200,11 +200,11 @@ class StageWork:
     say: Callable[[str], None]
     progress: Callable[[int, int], None] | None
     notes: list[str] = field(default_factory=list)
-    # Whether the runs are simulated, from rest: nobody need find out what was before.
+    # Whether the runs are simulated from rest, so that initial conditions are known.
     simulated: bool = False
 
     def __post_init__(self) -> None:
-        # The paper's own structure, for what its tables are set beside, and the arm as it is.
+        # Structures of the paper and of the simulated arm.
         self.measured = flexible_link(stage=self.number, form="published", coupling="measured", laws=())
         self.published = flexible_link(stage=self.number, form="published")
         self.coupled = flexible_link(stage=self.number, coupling="simulated")
@@ -220,13 +220,13 @@ class StageWork:
             )
 
     def begin(self, words: str, step: str) -> None:
-        """Say what comes next, and how much of the whole it is."""
+        """Announce the next step and its share of the whole."""
         self.say(words)
         if isinstance(self.progress, Steps):
             self.progress.begin(seconds_of(step, self.preset.lattice.step, self.preset.rivals_step))
 
     def reproduced(self, genetic: Genetic | None) -> Stage:
-        """Everything that section 5 says of a stage."""
+        """Compute all results of section 5 for a stage."""
         exact = self.manual("integer, exact")
         candidates = {"integer, Euler": self.stepped("integer, Euler", exact), "integer, exact": exact}
         candidates["integer, identified"] = self.best(
@@ -273,12 +273,12 @@ class StageWork:
         )
 
     def landscape(self, result: Identification | None) -> Landscape | None:
-        """Around the joint fit, along the two orders that the run tells apart least."""
+        """Cost surface around the joint fit over its two most correlated orders."""
         self.begin(f"stage {self.number}: the landscape of its orders", "landscape")
         return None if result is None or result.joint is None else output_error_landscape(result)
 
     def candidate(self, label: str, model: Model, result: Identification | None = None) -> Candidate:
-        """Both errors of a model on both runs, and its free run from the currents alone."""
+        """Return a model with both errors on both runs, and its simulation from the currents alone."""
         alike = self.preset.alike
         m = default_m([self.on], power_of_two=True) if alike else model.m
         model = model if model.m == m else replace(model, m=m)
@@ -292,16 +292,16 @@ class StageWork:
         return Candidate(label, model, estimation, validation, alone, result)
 
     def identified(self, label: str, run: Run, structure: Structure, **options: Any) -> Candidate:
-        """A candidate by one of the methods."""
+        """Identify a candidate by one of the methods."""
         result = identify(run, structure, threads=self.threads, progress=self.progress, **options)
         return self.candidate(label, result.model, result)
 
     def manual(self, label: str) -> Candidate:
-        """The maker's integer-order model."""
+        """Return the maker's integer-order model."""
         return self.candidate(label, link_model(stage=self.number, form="published"))
 
     def stepped(self, label: str, exact: Candidate) -> Candidate:
-        """The same model stepped by explicit Euler, as the paper ran it."""
+        """Return the same model simulated by explicit Euler, as in the paper."""
         on = self._by_euler(exact.model, self.on, exact.estimation)
         alone = {self.on.name: on.output_error}
         off = None
@@ -311,7 +311,7 @@ class StageWork:
         return replace(exact, label=label, estimation=on, validation=off, alone=alone)
 
     def _by_euler(self, model: Model, run: Run, exact: Comparison) -> Comparison:
-        """The comparison with Euler's response in place of the exact one."""
+        """Return the comparison with Euler's response in place of the exact one."""
         responses = explicit_euler(model, run)
         means = {}
         for name, samples in responses.items():
@@ -331,7 +331,7 @@ class StageWork:
         )
 
     def searches(self) -> dict[str, Candidate]:
-        """Multi-innovation with the paper's p, and least squares, on the whole lattice."""
+        """Search the whole order grid by multi-innovation with the paper's p, and by least squares."""
         kinds: dict[str, dict[str, Any]] = {
             f"p = {p}": {"coefficients": "multi-innovation", "innovation_length": p} for p in printed.INNOVATION_LENGTHS
         }
@@ -349,7 +349,7 @@ class StageWork:
         return found
 
     def searched(self, label: str, lattice: Lattice, **options: Any) -> Candidate:
-        """The best orders of both equations, each by itself, without all that a whole identification says of them."""
+        """Return the best orders of each equation by itself, without the statistics of an identification."""
         orders: dict[str, float] = {}
         coefficients: dict[str, float] = {}
         for output in self.measured.outputs:
@@ -364,10 +364,10 @@ class StageWork:
         return self.candidate(label, Model(known, orders=orders, units=units, about=about))
 
     def _best_orders(self, single: Structure, own: Lattice, options: Mapping[str, Any]) -> SearchResult:
-        """The best candidate of a lattice.
+        """Return the best candidate of an order grid.
 
-        With K0 = 1 a deflection hardly moves: all candidates' errors are close to that of no motion, no bound excludes
-        one, and each would have to be run to its end.
+        With K0 = 1 a deflection hardly moves. The errors of all candidates are close to those of a zero output, so no
+        bound excludes any, and each would have to be simulated completely.
         """
 
         def searched(lattice: Lattice, keep: int) -> SearchResult:
@@ -386,7 +386,7 @@ class StageWork:
         return min(ends, key=lambda end: end.score)
 
     def instrumental(self, start: Candidate) -> Candidate:
-        """Instrumental variables on the part of the lattice around the orders of another model."""
+        """Search by instrumental variables on the part of the grid around the orders of another model."""
         self.begin(f"stage {self.number}: orders by instrumental variables", "instrumental")
         step, top = self.preset.lattice.step, self.preset.lattice.alpha[1]
         axes = {}
@@ -406,7 +406,7 @@ class StageWork:
     def joint(
         self, label: str, structure: Structure, words: str, rows: int | None = None, near: Model | None = None
     ) -> Candidate:
-        """Joint output error on the run as it is, or on every so many rows of it."""
+        """Fit by joint output error, on the whole run or a decimated one."""
         step = "published" if structure is self.published else "output error" if rows is None else "whole orders"
         self.begin(f"stage {self.number}: {words}", step)
         run = self.on
@@ -451,7 +451,7 @@ class StageWork:
         rows: int | None = None,
         near: Model | None = None,
     ) -> Candidate:
-        """Joint output error from the current alone, or driven by the measured other angle where that has no start."""
+        """Fit by joint output error from the current alone, or with the measured other angle if that fails."""
         words = f"{what}{', (22)–(25)' * (structure is self.published)}, "
         try:
             return self.joint(label, structure, f"{words}by output error", rows, near)
@@ -477,7 +477,7 @@ class StageWork:
         )
 
     def rivals(self, genetic: Genetic | None) -> dict[str, Rival]:
-        """Genetic algorithm, differential evolution and lattice on one equation each, like for like."""
+        """Compare the optimizers on each equation at equal budgets."""
         lattice = rivals_lattice(self.preset.lattice.step, self.preset.rivals_step)
         found = {}
         for output in self.measured.outputs:
@@ -506,7 +506,7 @@ class StageWork:
         return found
 
     def near(self) -> Candidate:
-        """The orders that the paper prints, with the best coefficients that this run gives them."""
+        """Return the model with the printed orders and least-squares coefficients on this run."""
         orders: dict[str, float] = {}
         for output in self.measured.outputs:
             orders |= printed.last_orders(output)
@@ -514,7 +514,7 @@ class StageWork:
         return self.searched("printed orders", axes, coefficients="least-squares")
 
     def by_equation(self) -> Candidate:
-        """Least squares at the orders whose equation error is smallest."""
+        """Return the least-squares model with the orders of the smallest equation error."""
         self.begin(f"stage {self.number}: orders by the equation error", "equation")
         return self.searched(
             "smallest equation error",
@@ -525,7 +525,7 @@ class StageWork:
         )
 
     def in_published_form(self, model: Model) -> Model:
-        """The numbers of (14)-(15) in the equations (22)-(25), which drop a derivative of the current."""
+        """Insert the parameters of (14)-(15) into (22)-(25), which drop a derivative of the current."""
         h, d = self.number * 2 - 1, self.number * 2
         output = self.measured.outputs[1]
         known = {n: model.coefficients[n] for n in (f"{c}{k}" for c in "ad" for k in (h, d))}
@@ -543,7 +543,7 @@ class StageWork:
         return replace(other, m=model.m, structure=replace(other.structure, initial=model.structure.initial))
 
     def published_values(self, model: Model) -> dict[str, float]:
-        """The numbers of (14)-(15) as those that are free in (22)-(25) under their laws."""
+        """Values of the free parameters of (22)-(25) under their laws for a model of (14)-(15)."""
         other = self.in_published_form(model)
         known = {**other.orders, **other.coefficients}
         h, d = f"a{self.number * 2 - 1}", f"a{self.number * 2}"
@@ -551,7 +551,7 @@ class StageWork:
         return {n: v for n, v in known.items() if n in free} | {f"r{self.number}": -known[d] / known[h]}
 
     def derived(self, model: Model) -> Derived:
-        """The deflection by (14)-(15), and with the same numbers by (22)-(25) as published."""
+        """Compare the deflection by (14)-(15) with that by (22)-(25) at equal parameters."""
         output, other = self.measured.outputs[1], self.in_published_form(model)
         whole, published = (compare_means(m, self.on) for m in (model, other))
         drive = f"I{self.number}"
@@ -568,11 +568,11 @@ class StageWork:
 
 
 def around(orders: Mapping[str, float], lattice: Lattice, single: Structure) -> dict[str, list[float]]:
-    """Values of a lattice less than two of its coarse steps away from these orders."""
+    """Grid values less than two coarse increments away from these orders."""
     values = lattice.values(single)
     return {n: [v for v in values[n] if abs(v - at) < 2 * COARSE - 1e-9] for n, at in orders.items()}
 
 
 def _known(item: Structure, orders: Mapping[str, float], coefficients: Mapping[str, float]) -> Model:
-    """A model of one equation whose numbers are known."""
+    """Return a model of one equation with given parameters."""
     return Model(item.with_orders(orders).with_coefficients(coefficients), orders=dict(orders))

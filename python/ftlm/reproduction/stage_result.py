@@ -1,4 +1,4 @@
-"""What a recomputed section 5 says of one stage: models on both runs, rivals, traces."""
+"""Results of one stage: models on both runs, optimizer comparisons, convergence."""
 
 from __future__ import annotations
 
@@ -16,34 +16,35 @@ from ftlm.svg.heat_map import Landscape
 from ftlm.utils.validation import Floats
 from ftlm.validation.comparison import Comparison, Metrics, finite
 
-#: Steps between two points of a convergence curve: what p does, it does in the first steps.
+#: Steps between two points of a convergence curve; the effect of p is limited to the first steps.
 TRACE_EVERY = 2
-#: A prior so weak that the data alone decide.
+#: Prior covariance so large that the data alone decide.
 WEAK_PRIOR = 1e10
-#: Both ends of K0: the paper's recursion with the identity, and the data alone.
+#: Both values of K0: the paper's identity, and a weak prior.
 PRIORS = (1.0, WEAK_PRIOR)
-#: Labels of multi-innovation beside its rivals, by K0.
+#: Labels of multi-innovation in the optimizer comparison, by K0.
 PAIR = ("p = 7", "p = 7, weak prior")
-#: Lattice of the genetic comparison: both algorithms' printed highest orders lie in it, and all of it can be evaluated.
+#: Highest orders of the optimizer comparison: they contain those printed for both methods, and all candidates can be
+#: evaluated.
 RIVAL_ALPHA = (1.95, 2.0)
 
 
 @dataclass(frozen=True)
 class Candidate:
-    """One model of a stage on both runs.
+    """Model of a stage with its errors on both runs.
 
     Parameters
     ----------
     label
-        Such as "p = 7".
+        Label, such as "p = 7".
     model
         The model.
     estimation
-        Both errors on the run that it was identified from, driven as the method drives it.
+        Both errors on the estimation run, with the inputs that the method uses.
     validation
-        The same on the other run; None without one.
+        Both errors on the other run; None without one.
     alone
-        Output error from the currents alone, on both runs, by run and output.
+        Output error from the currents alone, by run and output.
     result
         The identification; None for a model that was not identified.
     """
@@ -56,7 +57,7 @@ class Candidate:
     result: Identification | None = None
 
     def to_dict(self) -> dict[str, Any]:
-        """For JSON."""
+        """Return the model and its errors for JSON."""
         result = self.result
         return {
             "orders": {n: float(v) for n, v in self.model.orders.items()},
@@ -72,20 +73,20 @@ class Candidate:
 
 @dataclass(frozen=True)
 class Rival:
-    """Multi-innovation and its two rivals on one equation, like for like.
+    """Multi-innovation, genetic algorithm and differential evolution on one equation, with equal budgets.
 
     Parameters
     ----------
     candidates
-        Of the lattice, and evaluations of every seed unless others were asked for.
+        Candidates of the order grid, and default evaluations per seed.
     step
-        Of the lattice.
+        Increment of the order grid.
     population
-        Of the genetic algorithm.
+        Population size of the genetic algorithm.
     genetic_run, evolution_run
-        What the genetic algorithm and differential evolution came to, seed by seed, and within which bounds.
+        Results of the genetic algorithm and of differential evolution by seed, with their bounds.
     models
-        The best of each by label: genetic, differential evolution, p = 7 with K0 = 1 and with a weak prior.
+        Best model of each by label: genetic, differential evolution, p = 7 with K0 = 1 and with a weak prior.
     """
 
     candidates: int
@@ -97,7 +98,7 @@ class Rival:
 
     @property
     def genetic(self) -> Candidate:
-        """The genetic algorithm's best seed."""
+        """Best seed of the genetic algorithm."""
         return self.models["genetic"]
 
     @property
@@ -106,7 +107,7 @@ class Rival:
         return self.models["p = 7"]
 
     def to_dict(self) -> dict[str, Any]:
-        """For JSON."""
+        """Return the comparison for JSON."""
         runs = {"genetic": self.genetic_run, "differential evolution": self.evolution_run}
         return {
             "candidates": self.candidates,
@@ -121,7 +122,7 @@ class Rival:
 
 @dataclass(frozen=True)
 class Derived:
-    """What the derivative of the current that (19) drops does to the deflection's free run, all numbers alike."""
+    """Effect of the derivative of the current that (19) drops on the simulated deflection, at equal parameters."""
 
     output: str
     order: float  # that the current would have; 0 as published
@@ -133,7 +134,7 @@ class Derived:
 
     @property
     def correlations(self) -> dict[str, float]:
-        """Of the deflection with the current: as measured, with nothing dropped, as published; nan for one at rest."""
+        """Correlation of the deflection with the current: measured, (14)-(15), published; NaN at rest."""
         found = {}
         for words, series in (("measured", self.measured), ("derived", self.derived), ("published", self.published)):
             parts = [v - np.mean(v) for v in (series, self.current)]
@@ -144,7 +145,7 @@ class Derived:
 
 @dataclass(frozen=True)
 class Stage:
-    """Everything about one stage.
+    """Results of one stage.
 
     Parameters
     ----------
@@ -157,15 +158,15 @@ class Stage:
     weak
         Coefficients by output and p with a weak prior, at the orders of p = 7.
     rivals
-        By output; empty without PyGAD or where a run does not start at rest.
+        Optimizer comparisons by output; empty without PyGAD or for a run that does not start at rest.
     near
-        The model with the orders that the paper prints, least-squares coefficients on this run.
+        Model with the printed orders and least-squares coefficients on this run.
     by_equation
-        The model whose orders have the smallest equation error on the lattice.
+        Model with the orders of the smallest equation error on the grid.
     derived
-        What the dropped derivative of the current changes.
+        Effect of the dropped derivative of the current.
     landscape
-        Cost around the joint fit along the two orders that the run tells apart least; None where there are none.
+        Cost around the joint fit over its two most correlated orders; None without them.
     """
 
     number: StageNumber
@@ -186,11 +187,11 @@ class Stage:
 
     @property
     def manual(self) -> str:
-        """Label of the manual's model as the paper ran it; Euler's steps start at rest, so not on any other run."""
+        """Label of the manual's model as simulated in the paper; Euler's method needs a start at rest."""
         return "integer, Euler" if self.traces else "integer, exact"
 
     def to_dict(self) -> dict[str, Any]:
-        """For JSON."""
+        """Return the stage results for JSON."""
         return {
             "models": {label: c.to_dict() for label, c in self.candidates.items()},
             "printed orders": self.near.to_dict(),

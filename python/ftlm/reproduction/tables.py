@@ -1,4 +1,4 @@
-"""Tables in the shape of the paper's Tables 4 and 5."""
+"""Tables in the form of the paper's Tables 4 and 5."""
 
 from __future__ import annotations
 
@@ -22,9 +22,9 @@ from ftlm.svg.html_page import NOT_IN_MODEL, Table
 from ftlm.utils.formatting import DIGITS, DIVERGED, SUPERSCRIPTS, Cell, Exact, number, shortened, symbol, symbol_html
 from ftlm.validation.comparison import Comparison, Metrics
 
-#: The order that each coefficient's term has in the paper's equations (22)-(25).
+#: Order of each coefficient's term in the paper's equations (22)-(25).
 ORDER_OF = {"a": "beta", "b": "gamma", "d": "mu"}
-#: Heads of the columns of an equation's numbers and of its criteria, and the groups that the former stand in.
+#: Heads of the columns of parameters and criteria, and groups of the parameter columns.
 ORDER_HEADS = tuple(map(symbol_html, ORDERS))
 HEADS = (*ORDER_HEADS, *map(symbol_html, COEFFICIENTS))
 CRITERIA = ("error (45)", "RMSE", "NR")
@@ -33,20 +33,20 @@ GROUPS = (("", 1), ("orders", 4), ("coefficients", 4))
 
 @dataclass(frozen=True)
 class PaperRow:
-    """One row of a table in the shape of the paper's Tables 4 and 5.
+    """Row of a table in the form of the paper's Tables 4 and 5.
 
     Parameters
     ----------
     label
-        Such as "integer order" or "p = 7".
+        Label, such as "integer order" or "p = 7".
     output
-        Name of the output whose equation this is.
+        Output of the equation.
     orders
-        ``alpha``, ``beta``, ``gamma``, ``mu``; what is missing is not in the model.
+        ``alpha``, ``beta``, ``gamma``, ``mu``; orders of absent terms are missing.
     coefficients
         ``a``, ``b``, ``d``, ``g``, likewise.
     equation_error, output_error
-        Figures; None where they were not computed.
+        Metrics; None if they were not computed.
     """
 
     label: str
@@ -58,7 +58,7 @@ class PaperRow:
 
 
 def letter_of(name: str) -> str:
-    """A name of the paper without its index: alpha1 is alpha."""
+    """Strip the index of a name: alpha1 becomes alpha."""
     return name.rstrip("0123456789")
 
 
@@ -75,22 +75,22 @@ def letters_of(item: Equation) -> tuple[dict[str, float], dict[str, float]]:
 
 
 def four_digits(orders: Mapping[str, float]) -> dict[str, float]:
-    """Orders with the digits of the paper's Table 6."""
+    """Round orders to the four decimals of the paper's Table 6."""
     return {name: round(order, 4) + 0.0 for name, order in orders.items()}
 
 
 def number_cells(orders: Mapping[str, float], coefficients: Mapping[str, float]) -> list[Cell]:
-    """The cells under `HEADS`: orders as they are, coefficients as estimates."""
+    """Cells under `NUMBER_HEADS`: orders in full, coefficients as estimates."""
     return [*(Exact(orders[n]) if n in orders else None for n in ORDERS), *map(coefficients.get, COEFFICIENTS)]
 
 
 def criteria_cells(figures: Metrics | None) -> list[Cell]:
-    """The cells under `CRITERIA`."""
+    """Cells under `CRITERION_HEADS`."""
     return [None] * 3 if figures is None else [figures.error, figures.rmse, figures.nr]
 
 
 def paper_row(label: str, model: Model, comparison: Comparison, output: str) -> PaperRow:
-    """Return the row of one equation of an arm's model, whose coefficients are called a, b, d, g with an index.
+    """Return the row of one equation of an arm's model with coefficients a, b, d, g and an index.
 
     Raises
     ------
@@ -105,17 +105,17 @@ def paper_row(label: str, model: Model, comparison: Comparison, output: str) -> 
 
 
 def _beginnings(rows: Sequence[PaperRow]) -> dict[int, str]:
-    """The output that begins at each row index."""
+    """Output of each group of rows, by the index of its first row."""
     return {i: r.output for i, r in enumerate(rows) if i == 0 or rows[i - 1].output != r.output}
 
 
 def paper_table(rows: Sequence[PaperRow], *, title: str = "Identified models") -> Table:
-    """Return a table in the shape of the paper's Tables 4 and 5, with both errors.
+    """Return a table in the form of the paper's Tables 4 and 5, with both errors.
 
     Parameters
     ----------
     rows
-        For each output the integer-order model, then one row for each p; rows of one output stand together.
+        For each output the integer-order model, then one row for each p; rows of one output are adjacent.
     title
         Caption.
     """
@@ -137,12 +137,12 @@ def paper_table(rows: Sequence[PaperRow], *, title: str = "Identified models") -
     )
 
 
-#: Widths of the columns in text: label, four orders, four coefficients, twice error, RMSE, NR. Together 119 of 120.
+#: Column widths of the text: label, four orders, four coefficients, twice error, RMSE, NR. Together 119 of 120.
 _LABEL, _TEXT_WIDTHS = 17, (5,) * 4 + (9,) * 4 + (8, 8, 7) * 2
 
 
 def paper_table_text(rows: Sequence[PaperRow]) -> str:
-    """Return the same table for a terminal of 120 columns; a number loses digits where its column is too narrow."""
+    """Return the same table as text of 120 columns; numbers lose digits in narrow columns."""
     heads = [*map(symbol, (*ORDERS, *COEFFICIENTS)), *("error", "RMSE", "NR") * 2]
     left, right = sum(_TEXT_WIDTHS[:8]) + _LABEL, sum(_TEXT_WIDTHS[8:11])
     groups = (f" {words} ".center(right - 1, "-").rjust(right) for words in ("equation error", "free run"))
@@ -163,7 +163,7 @@ def paper_table_text(rows: Sequence[PaperRow]) -> str:
 
 
 def _fitted(value: Cell, width: int) -> str:
-    """A number with as many of its five digits as fit."""
+    """Format a number with as many of its five digits as fit."""
     if value is None or isinstance(value, str):
         return NOT_IN_MODEL
     if not math.isfinite(value):
@@ -174,7 +174,7 @@ def _fitted(value: Cell, width: int) -> str:
 
 WEAK = f"10{str(round(math.log10(WEAK_PRIOR))).translate(SUPERSCRIPTS)}"
 PRINTED_NOTE = "Rows in which “printed” stands are the paper's numbers, from the authors' arm; all others are computed."
-#: Table 1: the symbols, what they are, and what they are called here.
+#: Table 1: symbols, descriptions, and names in ftlm.
 SYMBOLS = (
     ("θ₁₁, θ₂₁", "hub angles: how far each motor has turned", "theta11, theta21 [rad]"),
     ("θ₁₂, θ₂₂", "deflection angles: how far each link bends at its root", "theta12, theta22 [rad]"),
@@ -192,7 +192,7 @@ SYMBOLS = (
     ("D^β θ₁₂, D^β θ₂₂", "derivative of the deflection in the link's elasticity", "beta2, beta4 (beta1, beta3 follow)"),
     ("D^μ θ₁₂, D^μ θ₂₂", "derivative of the deflection in the link's friction", "mu2, mu4 (mu1, mu3 follow)"),
 )
-#: Table 2: the seven steps, and what does each.
+#: Table 2: the seven steps with their functions.
 STEPS = (
     ("Record currents and angles", "rig.record, load", "Run: point samples with units"),
     (
@@ -213,7 +213,7 @@ STEPS = (
 
 
 def by_angle(title: str, columns: Sequence[str], rows: Mapping[str, Sequence[Sequence[Cell]]], **rest: Any) -> Table:
-    """A table in which the rows of every angle stand under its symbol."""
+    """Return a table whose rows are grouped under the symbol of their angle."""
     flat: list[Sequence[Cell]] = []
     headings = {}
     for output, each in rows.items():
@@ -223,30 +223,30 @@ def by_angle(title: str, columns: Sequence[str], rows: Mapping[str, Sequence[Seq
 
 
 def as_printed(words: str) -> Markup:
-    """Head of a row of the paper's own numbers."""
+    """Return the head of a row of printed values."""
     return Markup("<em>printed: {}</em>").format(words)
 
 
 def equation_of(candidate: Candidate, output: str) -> Equation:
-    """The equation of one angle."""
+    """Return the equation of one angle."""
     return next(e for e in candidate.model.equations if e.output == output)
 
 
 def computed_cells(candidate: Candidate, output: str) -> list[Cell]:
-    """Orders and coefficients of one equation."""
+    """Orders and significant coefficients of one equation."""
     orders, coefficients = letters_of(equation_of(candidate, output))
     return number_cells(four_digits(orders), {n: v for n, v in coefficients.items() if told(candidate, output, n)})
 
 
 def told(candidate: Candidate, output: str, letter: str) -> bool:
-    """Whether a coefficient is more than noise: one that its own standard error exceeds is none."""
+    """Whether a coefficient is at least as large as its standard error."""
     name = f"{letter}{printed.OUTPUTS.index(output) + 1}"
     error = 0.0 if candidate.result is None else candidate.result.standard_errors.get(name, 0.0)
     return not error > abs(candidate.model.coefficients.get(name, math.inf))
 
 
 def model_table(stage: Stage, title: str) -> Table:
-    """Table 4 or 5, computed and printed rows in turn."""
+    """Table 4 or 5, with computed and printed rows."""
     rows: dict[str, list[list[Cell]]] = {}
     for output in stage.outputs:
         beside = {"integer, Euler": printed.INTEGER[output]}
@@ -272,7 +272,7 @@ def model_table(stage: Stage, title: str) -> Table:
 
 
 def fits_table(stage: Stage) -> Table:
-    """Both errors of every model, and its fit on both inputs, as identified and from the current alone."""
+    """Table of both errors of every model, and its fits on both runs by the method's inputs and by the current."""
 
     def row(label: str, c: Candidate, output: str) -> list[Cell]:
         errors = c.estimation.equation_error[output].nr, c.estimation.output_error[output].nr
@@ -290,7 +290,7 @@ def fits_table(stage: Stage) -> Table:
 
 
 def near_table(found: Recomputed) -> Table:
-    """Both errors at the printed orders, and at those of the smallest equation error."""
+    """Table of both errors at the printed orders, and at those of the smallest equation error."""
     rows: list[list[Cell]] = []
     for stage in found.stages.values():
         for label, candidate in (("printed", stage.near), ("smallest equation error", stage.by_equation)):
@@ -314,7 +314,7 @@ def symbols_table() -> Table:
 
 
 def steps_table() -> Table:
-    """Table 2, every step with the function that does it."""
+    """Table 2, every step with its function."""
     rows = [
         [f"{k}. {step}", Markup(", ").join(Markup("<code>{}</code>").format(f) for f in functions.split(", ")), how]
         for k, (step, functions, how) in enumerate(STEPS, 1)
@@ -350,7 +350,7 @@ def parameters_table() -> Table:
 
 
 def integer_table() -> Table:
-    """What Table 3 and the effective parameters make of the integer-order rows."""
+    """Coefficients of the integer-order models from Table 3 and from the effective parameters."""
     rows: list[list[Cell]] = [
         [symbol_html(n), t + 0.0, e + 0.0, p, t / p, e / p] for n, (t, e, p) in table_3_coefficients().items()
     ]
@@ -369,7 +369,7 @@ def integer_table() -> Table:
 
 
 def saturation_table(found: Recomputed) -> Table:
-    """What p does: coefficients with the prior of the paper's kind, and with a weak one."""
+    """Coefficient a by innovation length p, with the paper's prior and with a weak one."""
     rows: dict[str, list[list[Cell]]] = {output: [] for _, output in found.angles}
     for stage, output in found.angles:
         of_p = {p: stage.candidates[f"p = {p}"] for p in printed.INNOVATION_LENGTHS}
@@ -410,12 +410,12 @@ def genetic_table(found: Recomputed) -> Table:
     return Table(title, ("angle", *HEADS), rows, groups=GROUPS, note=PRINTED_NOTE)
 
 
-#: What stands in a table for the labels of the models beside their rivals.
+#: Labels of the models beside the other optimizers.
 RIVALS = {"genetic": "genetic algorithm", PAIR[0]: "p = 7, K₀ = 1", PAIR[1]: f"p = 7, K₀ = {WEAK}"}
 
 
 def rivals_table(found: Recomputed) -> Table:
-    """Table 7, like for like."""
+    """Table 7 at equal budgets."""
     rows: dict[str, list[list[Cell]]] = {}
     for output, rival in found.rivals.items():
         rows[output] = []
@@ -439,7 +439,7 @@ def rivals_table(found: Recomputed) -> Table:
 
 
 def seeds_table(found: Recomputed) -> Table:
-    """What each seed came to, and with how many evaluations."""
+    """Error (45) of each optimizer and seed, with the number of evaluations."""
     seeds = list(dict.fromkeys(seed for rival in found.rivals.values() for seed in rival.genetic_run.errors))
     rows: dict[str, list[list[Cell]]] = {}
     for output, rival in found.rivals.items():
@@ -451,7 +451,7 @@ def seeds_table(found: Recomputed) -> Table:
 
 
 def bounds_table(found: Recomputed) -> Table:
-    """Bounds of both rivals."""
+    """Table of the bounds of both optimizers."""
     rows: list[list[Cell]] = []
     for output, rival in found.rivals.items():
         bounds = {letter_of(n): b for n, b in rival.genetic_run.bounds.items()}
@@ -467,7 +467,7 @@ def bounds_table(found: Recomputed) -> Table:
 
 
 def printed_reading_table(found: Recomputed, stage: Stage) -> Table:
-    """Table 4 or 5 as the paper computed it: ours, printed, and the ratio of both."""
+    """Table 4 or 5 as the paper computed it: recomputed, printed, and their ratio."""
     rows: dict[str, list[list[Cell]]] = {}
     for output in stage.outputs:
         made = found.as_printed[output]
@@ -496,7 +496,7 @@ def printed_reading_table(found: Recomputed, stage: Stage) -> Table:
 
 
 def ran_table(found: Recomputed) -> Table:
-    """The printed models under the paper's own current."""
+    """Table of the printed models under the paper's own current."""
     rows: dict[str, list[list[Cell]]] = {}
     for r in found.ran:
         a = f"a{printed.OUTPUTS.index(r.output) + 1}"
@@ -527,7 +527,7 @@ def ran_table(found: Recomputed) -> Table:
 
 
 def whole_table(found: Recomputed) -> Table:
-    """Whole and free orders on every arm."""
+    """Table of integer and free orders on every arm."""
     rows: list[list[Cell]] = []
     for f in found.panel.freed:
         for output in f.free:
@@ -542,7 +542,7 @@ def whole_table(found: Recomputed) -> Table:
 
 
 def panel_table(found: Recomputed) -> Table:
-    """Error and steps by p, arm, K0 and angle, on the first record of each arm."""
+    """Table of error and steps by p, arm, K0 and angle, on the first record of each arm."""
     rows: list[list[Cell]] = []
     seen = set()
     for t in found.panel.trials:

@@ -1,1 +1,1 @@
-"""Equations solved: records, free runs, frequency response, stability, other forms."""
+"""Simulation of fractional-order models."""

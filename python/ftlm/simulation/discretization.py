@@ -1,4 +1,4 @@
-"""A run and a structure become the record that the core computes on: pulse means of every signal."""
+"""Discretization of a run for a structure: block-pulse records of the core, and sample times on their grid."""
 
 from __future__ import annotations
 
@@ -22,18 +22,18 @@ from ftlm.structure.order import Order
 from ftlm.structure.structure import Initial, Offset, Structure, check_decided
 from ftlm.utils.validation import Floats, check_pulses, nearest
 
-#: The paper's number of block pulses, used where the record carries as many.
+#: Default number of block pulses, that of the paper, for runs with as many samples.
 PAPER_M = 2048
-#: Most pulses in one record: 2^24 of one signal are 128 MB.
+#: Maximum number of pulses of a record: 2^24 of one signal are 128 MB.
 MAX_M = 1 << 24
-#: A signal that stays below this loses digits of its squares to the end of the range of numbers.
+#: Minimum peak of a nonzero signal. Squares of smaller signals underflow.
 SMALLEST = 1e-140
 COULOMB = "coulomb_"
-#: Series of sensor filters that are kept: long ones of the grids at hand, those up to so many pulses of all of a fit.
+#: Number of cached series of sensor filters: long ones, and those of at most this many pulses.
 KEPT_LONG, SHORT, KEPT_SHORT = 4, 1 << 13, 32
 #: Initial terms as the core takes them.
 InitialTuple: TypeAlias = tuple[bool, list[float]] | tuple[bool, list[float], int] | tuple[bool, list[float], int, int]
-#: Which signals' sensors may have held something, where each signal began, answers of the filter to impulses.
+#: Which signals may have a filter transient, initial level of each signal, impulse responses of the filter.
 Begun: TypeAlias = tuple[tuple[bool, ...], tuple[float, ...], Floats | None]
 
 
@@ -54,18 +54,18 @@ class Record:
     sensor
         Series of the sensor filter, applied to every signal not measured through it, or None.
     initial
-        Initial terms, decided.
+        Resolved initial conditions.
     offset
         Unknown constant of each equation on this run.
     states
-        Free motions of the sensor filter beside the initial terms of every output that passes it.
-    held
-        Whether a signal came through a sensor that may still have held something when the run began.
-    levels
-        Where each signal began, in a run that is not from rest: derivatives above their equation's order are of what a
-        signal is above it. 0 of what the filter's free motion was taken out of.
-    answers
-        Pulse means of the filter's free motions, a row a state; None where it has others, and from rest.
+        Number of initial states of the sensor filter, estimated with the initial terms of every filtered output.
+    has_transient
+        Whether a signal may contain a transient of its sensor filter.
+    initial_levels
+        Initial level of each signal in a run with nonzero initial conditions, to which derivatives of improper terms
+        refer. 0 for signals from which the filter transient was removed.
+    filter_responses
+        Pulse means of the filter's impulse responses, one row per state; None if unavailable, and from rest.
     """
 
     signals: tuple[str, ...]
@@ -82,7 +82,7 @@ class Record:
 
     @property
     def start(self) -> InitialTuple:
-        """Initial terms as the core takes them."""
+        """Initial conditions as an argument of the core."""
         return initial_tuple(self.initial, self.offset, self.states)
 
     @property
@@ -91,11 +91,11 @@ class Record:
         return int(self.means.shape[1])
 
     def core(self) -> tuple[float, Floats, Floats | None]:
-        """Return the record as the core takes it."""
+        """Return the record as an argument of the core."""
         return self.step, self.means, self.sensor
 
     def begun(self) -> tuple[float, Floats, Floats | None] | tuple[float, Floats, Floats | None, Begun]:
-        """Return the record as the core takes it to drive equations."""
+        """Return the record with its filter transients as an argument of the core."""
         if not any(self.held) and not any(self.levels):
             return self.core()
         return (*self.core(), (self.held, self.levels, self.answers))
@@ -107,14 +107,14 @@ class Record:
 
 
 def default_m(runs: Sequence[Run], *, power_of_two: bool) -> int:
-    """Return the paper's 2 048 pulses, or as many as the shortest run carries (a power of two for Haar coordinates)."""
+    """Return the paper's 2 048 pulses, or as many as the shortest run supports (a power of two for Haar rows)."""
     carried = min(run.length for run in runs) - 1
     m = min(PAPER_M, carried)
     return 1 << (m.bit_length() - 1) if power_of_two and m > 0 else m
 
 
 def check_m(m: int, runs: Sequence[Run], *, power_of_two: bool) -> int:
-    """Refuse an m that is no number of pulses, that a run does not carry, or that Haar coordinates cannot take."""
+    """Raise ModelError for an invalid number of pulses, or one that a run or Haar rows do not support."""
     m = check_pulses(m, math.inf)
     for run in runs:
         carried = run.length - 1
@@ -132,13 +132,13 @@ def check_m(m: int, runs: Sequence[Run], *, power_of_two: bool) -> int:
 
 
 def record(run: Run, structure: Structure, m: int, *, filtered: bool = True) -> Record:
-    """Pulse means of every signal of a structure, delays and sensor filter honoured.
+    """Return pulse means of every signal of a structure, with delays and sensor filter applied.
 
-    Outputs are point samples taken as linear in between; inputs hold or are linear as the run says; m may exceed the
-    run's own grid only where nothing is measured against it. ``filtered`` puts signals that were not measured through
-    the sensor filter through it (equation error); a free run that no filtered signal drives leaves them. Refuses
-    signals that the run lacks, those so small that their squares vanish, delays of what is no input, and samples that
-    are missing where an equation needs them; over others stand straight lines, to which nothing may be fitted.
+    Outputs are interpolated linearly between samples; inputs by the intersample behavior of the run. m may exceed the
+    grid of the run only if nothing is compared with measurements. ``filtered`` passes signals that were not measured
+    through the sensor filter through it (equation error); a simulation without filtered inputs does not need that.
+    Raises for missing signals, signals whose squares underflow, delays of outputs, and missing samples of inputs. Other
+    missing samples are interpolated and must not be fitted.
     """
     _check_known(run, structure)
     check_held(run, structure)
@@ -179,7 +179,7 @@ def record(run: Run, structure: Structure, m: int, *, filtered: bool = True) -> 
 
 
 def _level(run: Run, structure: Structure, name: str, initial: Initial) -> float:
-    """Where a signal began; 0 from rest, of what came through the filter of an equation, and where it was not read."""
+    """Initial level of a signal; 0 from rest, for filtered inputs, and for a missing first sample."""
     if initial == "rest" or name not in run or (structure.behind_filter and structure.measured_through(name)):
         return 0.0
     first = float(acting(run, structure, name)[name][0])
@@ -187,7 +187,7 @@ def _level(run: Run, structure: Structure, name: str, initial: Initial) -> float
 
 
 def acting(run: Run, structure: Structure, name: str | None = None) -> Run:
-    """The run with its inputs, or one of them, as known saturations and dead zones let them act."""
+    """Return the run with known saturations and dead zones applied to its inputs, or to one of them."""
     free = next((limit for limit in structure.limits if limit.free is not None), None)
     if free is not None:
         raise ModelError(
@@ -199,14 +199,14 @@ def acting(run: Run, structure: Structure, name: str | None = None) -> Run:
 
 
 def driving(run: Run, structure: Structure, name: str | None = None) -> Run:
-    """The run with its signals, or one of them, as they drive equations: inputs acting, filters begun at rest."""
+    """Return the run with effective inputs: input nonlinearities applied, filter transients removed."""
     return without_held(acting(run, structure, name), structure, name)
 
 
 def check_held(run: Run, structure: Structure, known: Mapping[str, float] | None = None) -> None:
-    """Refuse the derivative of a jump: a held input above the order of the output that it drives.
+    """Raise ModelError for the derivative of a jump: a zero-order-hold input above the order of its equation.
 
-    ``known`` holds free orders that have one value.
+    ``known`` maps free orders with a single value to it.
     """
     for item in structure.equations:
         alpha = item.order.partly(known or {})
@@ -223,9 +223,9 @@ def check_held(run: Run, structure: Structure, known: Mapping[str, float] | None
 
 
 def records(runs: Sequence[Run], structure: Structure, m: int, *, filtered: bool = True) -> list[Record]:
-    """Records of several runs (see :func:`record`), made once for runs that were checked together.
+    """Return records of several runs (see :func:`record`), cached for runs that were checked together.
 
-    Records finer than the runs themselves are not kept: they are large, and nobody asks for one twice.
+    Records with a finer grid than the runs are large and used once, so they are not cached.
     """
 
     def made() -> list[Record]:
@@ -256,7 +256,7 @@ def sensor_series(structure: Structure, m: int, step: float) -> Floats | None:
 def _made(
     numerator: tuple[tuple[float, float], ...], denominator: tuple[tuple[float, float], ...], m: int, step: float
 ) -> Floats:
-    """The series of a filter on m pulses; every signal and every run of one step passes the same one."""
+    """Return the series of a filter on m pulses."""
     return locked(_core.filter_series(list(numerator), list(denominator), m, step))
 
 
@@ -264,7 +264,7 @@ _long_series, _short_series = lru_cache(maxsize=KEPT_LONG)(_made), lru_cache(max
 
 
 def _check_known(run: Run, structure: Structure) -> None:
-    """Refuse missing samples of what drives an equation, and of outputs that pass a filter before they are compared."""
+    """Raise DataError for missing samples of inputs, and of outputs that are filtered before comparison."""
     missing = run.missing
     if not missing:
         return
@@ -291,7 +291,7 @@ def _check_known(run: Run, structure: Structure) -> None:
 
 
 def whole(runs: Sequence[Run], what: str) -> None:
-    """Refuse runs with missing samples for what cannot leave them out."""
+    """Raise DataError for missing samples if an analysis cannot exclude them."""
     for run in runs:
         for name, gone in run.missing.items():
             raise DataError(
@@ -350,7 +350,7 @@ def structure_tuple(item: Equation, signals: Sequence[str]) -> tuple[int, float,
 
 
 def check_linear(equations: Sequence[Equation], what: str) -> None:
-    """Refuse friction where nothing knows it."""
+    """Raise ModelError for friction in a linear analysis."""
     for item in equations:
         if item.friction is not None:
             raise ModelError(
@@ -360,7 +360,7 @@ def check_linear(equations: Sequence[Equation], what: str) -> None:
 
 
 def linear_tuple(item: Equation, signals: Sequence[str]) -> tuple[int, float, list[tuple[int, float]]]:
-    """The linear part of an equation."""
+    """Return the linear part of an equation as an argument of the core."""
     index = {name: i for i, name in enumerate(signals)}
     terms = [(index[t.signal], t.order.constant) for t in item.terms]
     return index[item.output], item.order.constant, terms
@@ -380,7 +380,7 @@ def lattice_tuple(
 
 
 def affine(order: Order, names: Sequence[str]) -> tuple[float, list[float]]:
-    """Constant of an order, and its weight of each free order."""
+    """Return the constant of an order and its weights of the free orders."""
     weights = dict(order.weights)
     return order.constant, [weights.get(n, 0.0) for n in names]
 
@@ -393,7 +393,7 @@ def equation_tuple(
 
 
 def initial_tuple(initial: Initial, offset: Offset = "none", states: int = 0) -> InitialTuple:
-    """Return decided initial terms: whether Caputo's, else their exponents; numbers of offset terms, filter states."""
+    """Return resolved initial conditions for the core: Caputo or exponents, offset terms, filter states."""
     powers = [] if isinstance(initial, str) else list(initial)
     decided = (initial == "caputo", powers)
     if states:
@@ -402,16 +402,16 @@ def initial_tuple(initial: Initial, offset: Offset = "none", states: int = 0) ->
 
 
 def named_signals(error: ModelError, signals: Sequence[str]) -> ModelError:
-    """The core knows signals by number; people know them by name."""
+    """Return the error with names instead of signal numbers."""
     return ModelError(re.sub(r"signal (\d+)", lambda m: f"signal {signals[int(m[1])]!r}", str(error)))
 
 
 def prepare(
     runs: Sequence[Run], structure: Structure, m: int | None, *, power_of_two: bool, gaps: bool = False
 ) -> list[Record]:
-    """Make the records of runs for an estimator on the equation error, refusing what it cannot be given.
+    """Return the records of runs for an equation-error estimator, or raise for unsuitable data.
 
-    Missing samples are refused unless gaps are let pass by an estimator that leaves them out.
+    Missing samples raise DataError unless ``gaps`` is True, for an estimator that excludes them.
     """
     check_decided(structure.offset)
     if not gaps:
@@ -441,39 +441,39 @@ def prepare(
 
 
 def _is_offset(term: Term, item: Equation, prepared: Sequence[Record]) -> bool:
-    """Whether a free term of order 0 does on every run what an offset does."""
+    """Whether a free term of order 0 is equivalent to an offset on every run."""
     if term.fixed is not None or term.signal == item.output or term.order.names or term.order.constant != 0:
         return False
     return all(float(np.ptp(r.of(term.signal))) == 0.0 for r in prepared)
 
 
 def named_coefficients(item: Equation, raw: Sequence[float]) -> dict[str, float]:
-    """Free coefficients by name from the core's products of factor and coefficient."""
+    """Return free coefficients by name, from the core's products of factor and coefficient."""
     return {t.coefficient: c / t.factor for t, c in zip(item.terms, raw, strict=True) if isinstance(t.coefficient, str)}
 
 
 def has_own_times(run: Run, structure: Structure) -> bool:
-    """Whether a run's outputs are compared when they were read.
+    """Whether the outputs of a run are compared at nonuniform sample times.
 
-    Not where a number of an input is free, nor behind a filter of all.
+    False if an input parameter is free, or if all signals are filtered.
     """
     return run.readings is not None and not structure.free_inputs and not structure.behind_filter
 
 
 @dataclass(frozen=True, eq=False)
 class Instants:
-    """Times within a run, on its grid of pulses, and the commands as they were given.
+    """Sample times of a run on its grid of pulses, with the original input samples.
 
     Parameters
     ----------
     run, record
-        The run, and its pulses.
+        The run, and its pulse means.
     structure
-        Whose delays are honoured.
+        Structure with the delays.
     readings
-        Rows of the run at times of their own.
+        Nonuniform samples of the run.
     times
-        The times [s since the first row].
+        Sample times [s since the first sample].
     """
 
     run: Run
@@ -484,25 +484,25 @@ class Instants:
 
     @classmethod
     def of(cls, run: Run, record: Record, structure: Structure, times: Floats) -> Instants:
-        """At some times of a run; a regular one was read on its grid."""
+        """Build for given times of a run; a uniformly sampled run has the samples of its grid."""
         run = acting(run, structure)
         readings = run.readings or Readings(run.time, {n: run[n] for n in run.signals})
         return cls(run, record, structure, readings, times)
 
     @property
     def places(self) -> Floats:
-        """The times in pulses."""
+        """Sample times in units of pulses."""
         return np.asarray(np.minimum(self.times / self.record.step, float(self.record.m)))
 
     def jumps(self, name: str) -> tuple[Floats, Floats] | None:
-        """Places and sizes of the jumps of an input that holds in between; None for what does not jump."""
+        """Positions and sizes of the jumps of a zero-order-hold input; None for other signals."""
         if name not in self.run.inputs or self.run.intersample[name] != HELD:
             return None
         times, sizes = self.readings.jumps(name, self._delay(name), self._before(name))
         return np.asarray(times / self.record.step), sizes
 
     def values(self, name: str) -> Floats | None:
-        """A signal at the times, after it has changed there; None for one that is made of others."""
+        """Values of a signal just after the sample times; None for a derived signal."""
         if name in self.run.inputs:
             kind = self.run.intersample[name]
             return self.readings.at(name, kind, self.times, self._delay(name), self._before(name))
@@ -511,7 +511,7 @@ class Instants:
         return self.readings.at(name, "foh", self.times, 0.0, 0.0)
 
     def corners(self, name: str, order: float) -> Floats | None:
-        """What the pulses lack at the times of I^order of an input that jumps."""
+        """Correction to the pulse means of I^order of an input with jumps, at the sample times."""
         jumps = self.jumps(name)
         if jumps is None:
             return None
@@ -525,14 +525,14 @@ class Instants:
 
 
 def compared_times(run: Run, structure: Structure) -> Floats:
-    """When the samples of a run that are compared were read [s since its first row]."""
+    """Return the times of the compared samples of a run [s since its first sample]."""
     if run.readings is None or not has_own_times(run, structure):
         return run.time
     return run.readings.times[run.readings.compared(run.duration)]
 
 
 def compared_values(run: Run, structure: Structure, name: str) -> Floats:
-    """A signal at these times, as it was recorded; an output is NaN where it was not read."""
+    """Return the recorded values of a signal at these times; NaN for missing samples of an output."""
     if run.readings is None or not has_own_times(run, structure):
         return run[name]
     return run.readings.data[name][run.readings.compared(run.duration)]

@@ -1,12 +1,4 @@
-"""How a run starts: at rest, or in motion, with powers of time for what it did before.
-
-A fractional integral remembers all that was before the run: to c I^eta s it adds c/Gamma(eta) times the integral of
-(t + s)^(eta-1) over the past s, which is no finite sum. It is smooth but for a start like t^eta, so a few powers of t
-in quarters reproduce it to any noise; Caputo's own terms, those of a past in which nothing moved, do not. How many are
-needed follows from how far the run stands above its noise, never from how well they fit: a length chosen by the fit
-would make its intervals too short. The fit only decides between Caputo's terms and all of these, in favour of these
-wherever there is a doubt.
-"""
+"""Initial conditions of a run: rest, or initial terms for its past inputs, and initial state of the sensor filter."""
 
 from __future__ import annotations
 
@@ -24,25 +16,25 @@ from ftlm.utils.linalg import length
 from ftlm.utils.statistics import ROUNDING, chi_squared, huber_excess, is_rest, noise_of
 from ftlm.utils.validation import Floats
 
-#: Distance between the powers of time.
+#: Increment of the powers of time.
 QUARTER = 0.25
-#: Highest power, in quarters, that a signal REFERENCE times the deviation of its noise's mean needs: biases stay below
-#: a tenth of a standard error (benches/RESULTS.md).
+#: Ratio of a signal's norm to its noise standard deviation, and the highest power, in quarters, that it needs for
+#: biases below a tenth of a standard error (benches/RESULTS.md).
 REFERENCE, QUARTERS = 2500.0, 6
-#: One quarter more lets this factor less of the past through.
+#: Factor by which one more quarter reduces the unmodeled past.
 FACTOR = 2.5
-#: Fewest and most quarters.
+#: Minimum and maximum number of quarters.
 LEAST, MOST = 2, 12
-#: Samples a run has for each quarter at least.
+#: Minimum number of samples of a run per quarter.
 SPARSEST = 16
-#: Whole powers below this stand among the quarters always, so that their list is that of any order up to 3.
+#: Integer powers below this are always included, so that the list is the same for any order up to 3.
 WHOLE = 3
-#: Caputo's terms are enough where a past that holds no more would leave a larger misfit than theirs in this share of
-#: runs. The usual share of 1 or 5 % would let a weak past through unseen, with intervals too short for its bias. Beside
-#: an offset, which explains a first value away from zero by itself and which a history would hide, it is less.
+#: Significance level of the test of Caputo's terms against a full history. The usual 1 or 5 % would miss a weak past,
+#: with intervals too short for its bias. With an offset the level is lower: it explains a nonzero first value by
+#: itself, and a history would make it unidentifiable.
 DOUBT, DOUBT_BESIDE_OFFSET = 0.25, 0.02
-#: Share of an excess in squares that asks for a history as well: what few samples far out make of it is no history, but
-#: where squares are what is fitted, no fit is to leave more than one with fewer numbers does that has a history.
+#: Weight of the excess in the residual sum of squares, as an alternative to the robust excess. Few outliers must not
+#: require a history, but a least-squares fit must not be worse than one with a history and fewer parameters.
 OF_SQUARES = 0.25
 
 
@@ -52,13 +44,13 @@ def starts_at_rest(run: Run, structure: Structure) -> bool:
 
 
 def has_memory(structure: Structure) -> bool:
-    """Whether an order of a structure is free or no whole number: then what was before the run is no finite sum."""
+    """Whether an order is free or fractional, so that initial conditions are no finite sum."""
     orders = [o for e in structure.equations for o in (e.order, *(t.order for t in e.terms))]
     return any(o.names or o.constant != round(o.constant) for o in orders)
 
 
 def history(run: Run, structure: Structure) -> History:
-    """Powers of time for what the run did before its start, as many as its outputs' noise lets through."""
+    """Return powers of time for the past inputs of a run, as many as the noise of its outputs requires."""
     visible = 1.0
     for name in structure.outputs:
         if name in run:
@@ -75,7 +67,7 @@ def history(run: Run, structure: Structure) -> History:
 
 
 def decided(run: Run, structure: Structure) -> Initial:
-    """The initial terms of a structure on a run, where it leaves them open."""
+    """Return the initial conditions of a structure on a run, resolving ``"auto"``."""
     initial = structure.initial
     if initial == "auto":
         if starts_at_rest(run, structure):
@@ -86,29 +78,30 @@ def decided(run: Run, structure: Structure) -> Initial:
 
 
 def together(decisions: list[Initial]) -> Initial | None:
-    """One decision for runs of one fit, or None where they agree: the longest; a run at rest finds zeros for it."""
+    """Return common initial conditions for runs of one fit, the longest ones, or None if they are equal."""
     if len(set(decisions)) < 2:
         return None
     return max(decisions, key=lambda d: (isinstance(d, tuple), d == "caputo", len(d)))
 
 
 def decided_together(runs: Sequence[Run], structure: Structure) -> Initial:
-    """Initial terms of a fit of all runs together."""
+    """Return common initial conditions of a fit of all runs."""
     starts = [decided(run, structure) for run in runs]
     return together(starts) or starts[0]
 
 
 def misfit(few: Sequence[Floats], many: Sequence[Floats], sizes: Sequence[float]) -> float:
-    """By how much residuals with few initial terms exceed those with many, in units of noise.
+    """Excess of residuals with few initial terms over those with many, in units of noise.
 
-    Where the few are enough this is distributed as chi-squared, with as many degrees as there are terms more.
+    If the few terms suffice, it has a chi-squared distribution with the number of additional terms as degrees of
+    freedom.
 
     Parameters
     ----------
     few, many
-        Residuals of each output; infinite where a free run has no numbers, NaN where nothing was read.
+        Residuals of each output; infinite where a simulation is not finite, NaN at missing samples.
     sizes
-        Deviation of what was measured of each output.
+        Standard deviation of each measured output.
     """
     excess = 0.0
     for one, other, size in zip(few, many, sizes, strict=True):
@@ -119,7 +112,7 @@ def misfit(few: Sequence[Floats], many: Sequence[Floats], sizes: Sequence[float]
 
 
 def misfit_of_fits(few: Sequence[Floats], many: Sequence[Floats], sizes: Sequence[float]) -> float:
-    """The misfit of one fit beside another, or a share of what squares say of it where that is more."""
+    """Misfit between two fits, or a fraction of the excess in the sum of squares if that is larger."""
     squares = 0.0
     for one, other, size in zip(few, many, sizes, strict=True):
         there = ~np.isnan(one)
@@ -130,7 +123,7 @@ def misfit_of_fits(few: Sequence[Floats], many: Sequence[Floats], sizes: Sequenc
 
 
 def missed(measured: Floats, simulated: Floats) -> Floats:
-    """What a free run misses of what was read; infinite where it has no numbers, NaN where nothing was read."""
+    """Difference of measured and simulated samples; infinite if the simulation is, NaN at missing samples."""
     with np.errstate(invalid="ignore"):
         rows: Floats = measured - simulated
     rows[~np.isnan(measured) & ~np.isfinite(rows)] = np.inf
@@ -138,26 +131,27 @@ def missed(measured: Floats, simulated: Floats) -> Floats:
 
 
 def needed(structure: Structure, excess: float, terms: int) -> bool:
-    """Whether such an excess over residuals with so many terms more asks for a history beside Caputo's terms."""
+    """Whether an excess over residuals with additional terms requires a history instead of Caputo's terms."""
     doubt = DOUBT if structure.offset == "none" else DOUBT_BESIDE_OFFSET
     return terms > 0 and excess > chi_squared(terms, doubt)
 
 
-#: What a filter held is told from what came in over this share of the time in which its fastest pole turns, in which
-#: what came in is as good as a level and a slope; and over so many samples a number at least.
+#: Length of the fit of the transient, in time constants of the fastest pole, over which the filter's input is nearly a
+#: level and a slope; and minimum number of samples per parameter of the fit.
 SHOWN = 1.0
 SAMPLES = 2
-#: A filter whose fastest pole turns so often in a sample interval has forgotten what it held before anybody sees it.
+#: Product of fastest pole and sampling interval above which the transient has decayed before the second sample.
 FORGOTTEN = 1e3
-#: Answers of a filter that are kept: those of the grids at hand.
+#: Number of cached filter responses.
 KEPT = 4
 
 
 def without_held(run: Run, structure: Structure, name: str | None = None) -> Run:
-    """Return the run less the filter's free motion in its signals, or in one, that drive behind it.
+    """Return the run without the filter's transient in its signals, or in one signal, that enter as filtered inputs.
 
-    From rest the filter held nothing. Left as they are: outputs that drive no other equation, held or delayed commands,
-    and filters whose free motions are more than answers to impulses or gone before the second sample.
+    From rest there is no transient. Unchanged are outputs that enter no other equation, zero-order-hold or delayed
+    commands, and signals of filters whose transients are not impulse responses or have decayed before the second
+    sample.
     """
     sensor = structure.sensor_filter
     if sensor is None or not structure.behind_filter:
@@ -177,7 +171,7 @@ def without_held(run: Run, structure: Structure, name: str | None = None) -> Run
 
 
 def _drives(run: Run, structure: Structure, name: str) -> bool:
-    """Whether a signal that came through the filter drives an equation that is not its own."""
+    """Whether a filtered signal is an input of an equation other than its own."""
     if not structure.measured_through(name) or (structure.coupling == "simulated" and name in structure.outputs):
         return False
     if name in run.inputs and (run.intersample[name] == HELD or name in (*structure.delay, *structure.free_delays)):
@@ -186,7 +180,7 @@ def _drives(run: Run, structure: Structure, name: str) -> bool:
 
 
 def _held(samples: Floats, step: float, sensor: SensorFilter, states: int) -> Floats:
-    """The free motion of the filter at the samples of a signal: the first one is all free motion."""
+    """Transient of the filter at the samples of a signal; the first sample is all transient."""
     system, gain = _states(sensor)
     size = system.shape[0]
     fastest = _fastest(sensor)
@@ -211,10 +205,10 @@ def _held(samples: Floats, step: float, sensor: SensorFilter, states: int) -> Fl
 
 @lru_cache(maxsize=KEPT)
 def answers(sensor: SensorFilter, states: int, m: int, step: float) -> Floats | None:
-    """Pulse means of a filter's answers to an impulse and to derivatives of one, shape (states, m).
+    """Return pulse means of a filter's responses to an impulse and its derivatives, shape (states, m).
 
-    Pulses would have an impulse last for one of them, and its derivative for two. None of a filter with zeros, or that
-    forgets within a pulse.
+    On the pulse grid an impulse would last for one pulse and its derivative for two. None for a filter with zeros, or
+    with a transient that decays within a pulse.
     """
     if not sensor.holds_answers or not states or _fastest(sensor) * step > FORGOTTEN:
         return None
@@ -229,13 +223,13 @@ def answers(sensor: SensorFilter, states: int, m: int, step: float) -> Floats | 
 
 
 def _caught(system: Floats, gain: float, states: int) -> Floats:
-    """States after an impulse, and after derivatives of one, column by column."""
+    """Return the states after an impulse and after its derivatives, one column each."""
     # An impulse is caught by the last state; each derivative of one goes through the system once more.
     return np.stack([np.linalg.matrix_power(system, k)[:, -1] * gain for k in range(states)], axis=1)
 
 
 def _states(sensor: SensorFilter) -> tuple[Floats, float]:
-    """A filter without zeros as a chain of states, of which the first is its answer, and what the last one catches."""
+    """Return a filter without zeros as a chain of states with the output first, and its input gain."""
     powers = {int(order): 0.0 for _, order in sensor.denominator}
     for coefficient, order in sensor.denominator:
         powers[int(order)] += coefficient
@@ -246,12 +240,12 @@ def _states(sensor: SensorFilter) -> tuple[Floats, float]:
 
 
 def _fastest(sensor: SensorFilter) -> float:
-    """How fast the fastest pole of a filter without zeros is [rad/s]."""
+    """Magnitude of the fastest pole of a filter without zeros [rad/s]."""
     return float(np.max(np.abs(np.linalg.eigvals(_states(sensor)[0])), initial=0.0))
 
 
 def _motions(system: Floats, begun: Floats, count: int, state: int) -> Floats:
-    """A state at so many samples, a unit of time apart, from each of several beginnings, shape (count, beginnings)."""
+    """Return one state at unit time steps for several initial states, shape (count, initial states)."""
     power = exponential(system)
     states = begun[None]
     while states.shape[0] < count:
@@ -261,7 +255,7 @@ def _motions(system: Floats, begun: Floats, count: int, state: int) -> Floats:
 
 
 def exponential(matrix: Floats) -> Floats:
-    """Exponential of a small matrix: Taylor's series of a part so small that its terms soon vanish, squared again."""
+    """Exponential of a small matrix by scaling and squaring of a Taylor series."""
     halvings = max(0, math.ceil(math.log2(max(float(np.linalg.norm(matrix, 1)), 1e-300))) + 1)
     part = matrix / 2.0**halvings
     term = total = np.eye(matrix.shape[0])

@@ -1,4 +1,4 @@
-"""Free runs of bodies some of which may stick, and what a run of them starts with."""
+"""Simulation of equations with friction, and their initial conditions."""
 
 from __future__ import annotations
 
@@ -34,15 +34,16 @@ from ftlm.utils.linalg import solved
 from ftlm.utils.statistics import chi_squared, colour
 from ftlm.utils.validation import Floats
 
-#: Evaluations in which level, velocity and offset of a run are found, and the share of the cost that ends the search.
+#: Maximum number of evaluations for level, velocity and offset of a run, and relative change of the cost that
+#: terminates.
 EVALUATIONS = 60
 STILL = 1e-12
 
 
 def motion_with_friction(model: Solved, rec: Record, powers: Sequence[Sequence[tuple[float, float]]]) -> _core._Motion:
-    """Outputs of equations some of which have friction, initial terms by equation as (exponent, coefficient).
+    """Simulate equations with friction, for initial terms by equation as (exponent, coefficient).
 
-    Impulses (-1, -2, ...) stand in the outputs for what the filter that these pass still held.
+    Impulses (-1, -2, ...) represent the initial state of the sensor filter of these outputs.
 
     Returns
     -------
@@ -57,15 +58,15 @@ def motion_with_friction(model: Solved, rec: Record, powers: Sequence[Sequence[t
 
 
 def strength(item: Equation) -> tuple[float, float, float]:
-    """Numbers fc, fs and vs of an equation's friction."""
+    """Friction parameters fc, fs and vs of an equation."""
     return (item.friction or Friction(0.0)).law
 
 
 def begun(model: Solved, run: Run, rec: Record, every: int, near: list[float] | None = None) -> dict[str, Any]:
-    """Initial terms and offsets that bring a free run with friction closest to a run, ``every`` pulses an interval.
+    """Fit initial terms and offsets of a simulation with friction, ``every`` pulses per sampling interval.
 
-    They change when a body sticks and slides, so that they are found by descent, from where and how fast the run starts
-    or from states that are near.
+    They affect when a body sticks and slides, so they are found by optimization, from level and velocity at the start
+    of the run or from nearby states.
 
     Returns
     -------
@@ -114,7 +115,7 @@ def begun(model: Solved, run: Run, rec: Record, every: int, near: list[float] | 
 
 
 def known_law(item: Equation, signals: Sequence[str]) -> tuple[int, tuple[float, list[float]], list[Any]]:
-    """An identified equation as the core takes one in which everything might be free."""
+    """Return an identified equation as the core's equation with free parameters, all of them fixed."""
     output, alpha, terms = linear_tuple(item, signals)
     numbers: list[Any] = [
         (s, (order, []), (float(t.fixed or 0.0), [])) for (s, order), t in zip(terms, item.terms, strict=True)
@@ -123,7 +124,7 @@ def known_law(item: Equation, signals: Sequence[str]) -> tuple[int, tuple[float,
 
 
 def check_regular(run: Run, model: Solved) -> None:
-    """Refuse samples at times of their own."""
+    """Raise ModelError for nonuniform samples."""
     if has_own_times(run, model.structure):
         output = model.outputs[model.structure.sticks[0]]
         raise ModelError(
@@ -132,20 +133,20 @@ def check_regular(run: Run, model: Solved) -> None:
         )
 
 
-#: First refinement of the record's own grid, doubled until the response stands still. Two pulses an interval are the
-#: least from which a sample follows that no jump of a held input at its instant has reached.
+#: First refinement of the record's grid, doubled until converged. Two pulses per interval are the minimum for a sample
+#: that is independent of a jump of a zero-order-hold input at its time.
 FIRST_REFINEMENT = 2
-#: Refinement at which a run with friction is told what it starts with: its own error is a few 1e-5 of the run there.
+#: Refinement of the fit of initial terms with friction. The relative error there is a few 1e-5.
 FRICTION_REFINEMENT = 4
-#: Orders closer than this are one order.
+#: Difference below which two orders count as equal.
 GRAIN = 1e-9
-#: A power of t this close to that of an offset cannot be told from it: an order just above a whole one brings a power
-#: that just below it is not there, and t^1 beside D^1.0003 is a constant force.
+#: Distance of a power of t from that of an offset below which both are not separately identifiable. An order just above
+#: an integer adds a power that one just below does not, and t^1 in an equation with D^1.0003 acts as a constant force.
 STAND_IN = 0.05
-#: Orders of integration from which on a kink is as smooth as pulses follow.
+#: Order of integration from which on a slope discontinuity is resolved by the pulses.
 SMOOTH = 2.0
-#: Share of a response of an initial term that others must leave for it to be told from them: the joint fit's. Where a
-#: model grows all its responses become one mode, and another share would print another fit than was made.
+#: Relative residual of the response to an initial term on the others, below which it is collinear; the value of the
+#: joint fit. Responses of an unstable model become collinear, and another value would print another fit.
 SPANNED = 1e-12
 
 Terms = Mapping[str, Mapping[float, float]]
@@ -153,19 +154,19 @@ Terms = Mapping[str, Mapping[float, float]]
 
 @dataclass(frozen=True)
 class Sampled:
-    """Point samples of a free run.
+    """Output samples of a simulation.
 
     Parameters
     ----------
     outputs
-        Shape (outputs, N), measured through the sensor filter where they are; not finite where the run diverges. At the
-        rows of the run, or of its readings within its grid.
+        Shape (outputs, N), filtered for outputs measured through the sensor filter; not finite if the model diverges.
+        At the samples of the run, or at its nonuniform sample times.
     initial
         Coefficients of the initial terms, by output and exponent.
     refinement
-        Pulses a sample interval on the finest grid that was used.
+        Pulses per sampling interval on the finest grid.
     change
-        What halving the step moves, as a share of each output's largest value; infinite before there were three grids.
+        Change on halving the step, relative to the largest value of each output; infinite before there are three grids.
     """
 
     outputs: Floats
@@ -175,9 +176,9 @@ class Sampled:
 
 
 def initial_exponents(item: Equation, initial: Initial, offset: Offset, states: int = 0) -> list[float]:
-    """Exponents of the initial terms and the offset of an equation whose orders are numbers, distinct and ascending.
+    """Exponents of initial terms and offset of an equation with fixed orders, distinct and ascending.
 
-    Those of the states of a sensor filter are -1, -2 and on.
+    Those of the states of a sensor filter are -1, -2 and so on.
     """
     alpha = item.order.constant
     found = {round(e, 9) for e in offset_exponents(alpha, offset).values()} | {-1.0 - k for k in range(states)}
@@ -190,17 +191,17 @@ def initial_exponents(item: Equation, initial: Initial, offset: Offset, states: 
 
 
 def begun_terms(model: Solved, found: Mapping[str, Any]) -> dict[str, dict[float, float]]:
-    """Initial terms by output and exponent of the only run of a fit with friction."""
+    """Return initial terms by output and exponent from a single-run fit with friction."""
     return {o: dict(terms) for o, terms in zip(model.outputs, found["powers"][0], strict=True)}
 
 
 def own_times(model: Solved, run: Run) -> Floats | None:
-    """When the samples of a run that are compared were read [s], where its rows have times of their own."""
+    """Return the times of the compared samples of a run [s] if they are nonuniform, else None."""
     return compared_times(run, model.structure) if has_own_times(run, model.structure) else None
 
 
 def started(model: Solved, run: Run) -> Solved:
-    """The model with its initial terms decided on a run: Caputo's where the run's samples ask for no other history."""
+    """Return the model with initial conditions resolved on a run: Caputo's unless the samples require a history."""
     start = decided(run, model.structure)
     long = replace(model, structure=replace(model.structure, initial=start))
     if model.structure.initial != "auto" or not isinstance(start, History):
@@ -222,9 +223,9 @@ def started(model: Solved, run: Run) -> Solved:
 def sampled(
     model: Solved, run: Run, every: int, initial: Terms | None, times: Floats | None = None
 ) -> tuple[Floats, dict[str, dict[float, float]]]:
-    """Samples on ``every`` pulses a sample interval, shape (outputs, N), and initial terms; they may not be finite.
+    """Return samples (outputs, N) on ``every`` pulses per sampling interval, and initial terms; may be not finite.
 
-    At the instants of the grid, or at times of their own [s].
+    At the sample times of the grid, or at given times [s].
     """
     rec = record(run, model.structure, (run.length - 1) * every, filtered=model.structure.behind_filter)
     at = None if times is None else Instants.of(run, rec, model.structure, times)
@@ -247,7 +248,7 @@ def sampled(
 
 
 def initial_names(model: Solved, initial: Initial) -> list[tuple[str, float]]:
-    """Output and power of every initial term and offset of a run that starts like this."""
+    """Return output and power of every initial term and offset for given initial conditions."""
     structure = model.structure
     states = structure.filter_states(initial)
     return [
@@ -258,7 +259,7 @@ def initial_names(model: Solved, initial: Initial) -> list[tuple[str, float]]:
 
 
 def unit_samples(model: Solved, run: Run, every: int, names: Sequence[tuple[str, float]]) -> list[Floats]:
-    """Samples of all outputs for a unit of each initial term, by output and power, while nothing else drives."""
+    """Return samples of all outputs for unit initial terms, by output and power, without inputs."""
     rec = record(run, model.structure, (run.length - 1) * every, filtered=model.structure.behind_filter)
     return _columns(model, rec, every, names, _free_and_units(model, rec, names)[1], None)
 
@@ -271,7 +272,7 @@ def _columns(
     units: Sequence[Floats],
     at: Instants | None,
 ) -> list[Floats]:
-    """Samples of units of initial terms from their pulse means."""
+    """Return samples for unit initial terms from their pulse means."""
     none: dict[str, dict[float, float]] = {o: {} for o in model.outputs}
     still = replace(rec, means=np.zeros_like(rec.means))
     return [
@@ -281,9 +282,9 @@ def _columns(
 
 
 def measured_samples(model: Solved, run: Run, every: int, rec: Record | None = None) -> Floats:
-    """What the outputs are compared with, shape (outputs, N): as measured, or filtered where the equation is.
+    """Return the samples to compare with, shape (outputs, N): as measured, or filtered if the equation is.
 
-    NaN where an output was not read.
+    NaN at missing samples of an output.
     """
     through = model.structure.measured_through
     if not model.structure.behind_filter or all(map(through, model.outputs)):
@@ -295,7 +296,7 @@ def measured_samples(model: Solved, run: Run, every: int, rec: Record | None = N
 def fitted(
     model: Solved, measured: Floats, driven: Floats, names: Sequence[tuple[str, float]], columns: Sequence[Floats]
 ) -> tuple[Floats, dict[str, dict[float, float]]]:
-    """Initial terms that bring the run closest to what was measured, by least squares, and the run with them."""
+    """Fit initial terms to measured samples by least squares; return the simulation with them, and the terms."""
     deviation = np.nanstd(measured, axis=1, keepdims=True)
     # What was not read weighs nothing.
     unread = np.isnan(measured)
@@ -318,9 +319,9 @@ def fitted(
 
 
 def _responses(model: Solved, rec: Record, terms: Terms) -> Floats:
-    """Pulse means of the outputs, before the sensor filter: all together, or each driven by the measured others.
+    """Return pulse means of the outputs before the sensor filter: coupled, or each with the measured others as inputs.
 
-    Impulses (-1, -2, ...) stand in them for what the filter that they pass still held.
+    Impulses (-1, -2, ...) represent the initial state of the sensor filter.
     """
     if model.structure.has_friction:
         return motion_with_friction(model, rec, [sorted(terms[o].items()) for o in model.outputs])["outputs"]
@@ -333,9 +334,9 @@ def _responses(model: Solved, rec: Record, terms: Terms) -> Floats:
 
 
 def _free_and_units(model: Solved, rec: Record, names: Sequence[tuple[str, float]]) -> tuple[Floats, list[Floats]]:
-    """Pulse means of all outputs, before the sensor filter: of the run at rest, and for a unit of each initial term.
+    """Return pulse means of all outputs before the sensor filter: from rest, and for a unit of each initial term.
 
-    A unit (output, power) acts while nothing else drives.
+    A unit (output, power) acts without inputs.
     """
     equations = [equation_tuple(e, rec.signals) for e in model.equations]
     inputs, outputs, core = list(rec.inputs), model.outputs, rec.begun()
@@ -360,11 +361,11 @@ def _free_and_units(model: Solved, rec: Record, names: Sequence[tuple[str, float
 def _read(
     model: Solved, run: Run | None, rec: Record, every: int, means: Floats, terms: Terms, at: Instants | None
 ) -> Floats:
-    """Samples at the instants from pulse means: what integrates from the left, what feeds through as it is there.
+    """Return samples from pulse means: integrals from the left, direct feedthrough with its value at the sample.
 
-    The last two pulses before each instant are extended to it: no jump of a held input lies in them, so the
-    extrapolation crosses none of the kinks t^alpha that jumps leave. At times of their own, among which jumps lie
-    anywhere, samples follow from the pulses around them and the kinks that these do not show.
+    The last two pulses before each sample time are extrapolated to it. No jump of a zero-order-hold input lies in them,
+    so the extrapolation crosses no slope discontinuity t^alpha of a jump. At nonuniform sample times, between which
+    jumps may lie anywhere, samples follow from the pulses around them and the kink correction.
     """
     names, structure = model.outputs, model.structure
     coupled = structure.coupling == "simulated"
@@ -427,10 +428,10 @@ def _read(
 
 
 def _early(model: Solved, run: Run, rec: Record, every: int) -> Floats:
-    """What the mean of the pulses on either side of each inner sample sees too early, shape (outputs, N - 2).
+    """Early part of the mean of the pulses on either side of each inner sample, shape (outputs, N - 2).
 
-    Half of what the first pulse after a jump or a corner of what drives answers, of which only the direct gain is there
-    at the sample: the joint fit's.
+    It is half of the response of the first pulse after a jump or a corner of the inputs, of which only the direct gain
+    acts at the sample, as in the joint fit.
     """
     names, structure, count = model.outputs, model.structure, len(model.outputs)
     coupled = structure.coupling == "simulated"
@@ -464,20 +465,20 @@ def _early(model: Solved, run: Run, rec: Record, every: int) -> Floats:
 
 
 def _first(eta: float, step: float) -> float:
-    """What a pulse of a term that is integrated by eta answers within itself; below 0 by the reciprocal scheme."""
+    """Response within its own pulse of a term integrated by eta; below 0 by the reciprocal scheme."""
     value: float = step ** abs(eta) / math.gamma(abs(eta) + 2.0)
     return value if eta >= 0.0 else 1.0 / value
 
 
 def _finite_readings(rest: Floats, at: Instants) -> Floats:
-    """Readings of what is smooth; not finite from where a run leaves the range of numbers."""
+    """Interpolate smooth signals at the sample times; not finite from an overflow on."""
     return _core.read_at(np.ascontiguousarray(rest), at.places)
 
 
 def _kinks(model: Solved, run: Run | None, at: Instants, terms: Terms) -> Floats:
-    """What the pulses do not show of the kinks at the times: of jumps of inputs, and of initial terms at the start.
+    """Kink correction at the sample times: slope discontinuities of input jumps and of initial terms.
 
-    Jumps by themselves, and once through the output's own terms, as the joint fit has them.
+    It includes the direct path of a jump and one pass through the output's own terms, as in the joint fit.
     """
     names, coupled = model.outputs, model.structure.coupling == "simulated"
     out = np.zeros((len(names), at.times.size))
@@ -501,14 +502,14 @@ def _kinks(model: Solved, run: Run | None, at: Instants, terms: Terms) -> Floats
 
 
 def high_frequency_gain(sensor: SensorFilter) -> float:
-    """What a sensor filter makes of a jump at once: 0 unless its numerator is of the denominator's order."""
+    """Gain of a sensor filter for a jump: 0 unless numerator and denominator have the same order."""
     highest = max(order for coefficient, order in sensor.denominator if coefficient)
     top, bottom = (sum(c for c, order in part if order == highest) for part in (sensor.numerator, sensor.denominator))
     return top / bottom
 
 
 def leading_gain(sensor: SensorFilter) -> float:
-    """Jump of a sensor filter's answer to the derivative of an impulse that it just answers with one, else 0."""
+    """Jump of a sensor filter's response to the lowest derivative of an impulse that gives one, else 0."""
     orders = [max((o for c, o in part if c), default=0.0) for part in (sensor.numerator, sensor.denominator)]
     if abs(orders[1] - orders[0] - sensor.relative_degree) > GRAIN:
         return 0.0
@@ -520,7 +521,7 @@ def leading_gain(sensor: SensorFilter) -> float:
 
 
 def _at_instants(run: Run, rec: Record, structure: Structure, name: str, every: int, at: Instants | None) -> Floats:
-    """Values of a signal just after the instants."""
+    """Values of a signal just after the sample times."""
     if at is not None:
         values = at.values(name)
         return _core.read_at(rec.of(name)[None], at.places)[0] if values is None else values
@@ -535,23 +536,23 @@ def _at_instants(run: Run, rec: Record, structure: Structure, name: str, every: 
     return np.append(means[::every], means[-1])
 
 
-#: A run whose first values look like rest is in motion where its residuals would ask for a history in this share of
-#: runs at rest only: a first value near zero is rare for a run in motion, and common for one at rest. At a share of
-#: 0.001 pasts that bias orders by five standard errors still go unseen, at 0.05 each twentieth run from rest pays.
+#: Significance level of the test of rest for runs whose first values are near zero, which is rare in motion and common
+#: at rest. At 0.001 initial conditions that bias orders by five standard errors are missed. At 0.05 one in twenty runs
+#: from rest is rejected.
 RARE = 0.01
 
 
-#: A run is said to have been in motion if estimating its past halves what the model leaves over at least, by so many
-#: points of fit, and to this many standard deviations or less; a model that misses more than MISSES of them from rest
-#: tells nothing of the run.
+#: Nonzero initial conditions are reported if a history reduces the residual to this ratio, by at least this drop, and
+#: to at most this value, all in standard deviations of the output. A model with a larger residual from rest than the
+#: last value is not conclusive.
 HALVES, POINTS, FOLLOWS, MISSES = 0.5, 0.01, 0.2, 3.0
 
 
 @dataclass(frozen=True)
 class Left:
-    """What a structure leaves over of a run from rest and with a history, a row an output.
+    """Residuals of a run from rest and with a history, one row per output.
 
-    ``terms`` are those of the history, ``sizes`` those of the outputs.
+    ``terms`` is the number of terms of the history, ``sizes`` are the standard deviations of the outputs.
     """
 
     rest: Floats
@@ -561,7 +562,7 @@ class Left:
 
 
 def in_motion(structure: Structure, runs: Sequence[Run]) -> bool:
-    """Whether what a solved structure leaves over of runs from rest, of all together, asks for a history."""
+    """Whether the residuals of a model from rest, on all runs together, require a history."""
     left = []
     for run in runs:
         if (one := _left(structure, run)) is None:
@@ -571,7 +572,7 @@ def in_motion(structure: Structure, runs: Sequence[Run]) -> bool:
 
 
 def _asks(left: Sequence[Left]) -> bool:
-    """Whether all together ask for a history."""
+    """Whether all runs together require a history."""
     terms = sum(one.terms for one in left)
     excess = sum(misfit([*one.rest], [*one.past], one.sizes.tolist()) for one in left)
     # Noise that is coloured is followed by slow terms in any run.
@@ -580,7 +581,7 @@ def _asks(left: Sequence[Left]) -> bool:
 
 
 def _left(structure: Structure, run: Run) -> Left | None:
-    """The free runs of both starts beside the measurement; None without numbers."""
+    """Residuals of simulations from rest and with a history; None if they are not finite."""
     ends, terms = [], 0
     for start in ("rest", history(run, structure)):
         model = Solved(replace(structure, initial=start))
@@ -596,7 +597,7 @@ def _left(structure: Structure, run: Run) -> Left | None:
 
 
 def looked_like_rest(model: Solved, runs: Sequence[Run]) -> list[str]:
-    """Names of the runs that a model which leaves initial terms open takes for at rest, and that were in motion."""
+    """Return names of the runs that start near zero but had nonzero initial conditions."""
     structure = model.structure
     if structure.initial != "auto" or structure.has_friction or not has_memory(structure):
         return []
@@ -605,6 +606,6 @@ def looked_like_rest(model: Solved, runs: Sequence[Run]) -> list[str]:
 
 
 def _told_by(left: Left) -> bool:
-    """Whether a model follows a run with a history, and misses it from rest, by enough to be said."""
+    """Whether a model explains a run with a history, and not from rest, by enough for a report."""
     rest, past = (np.sqrt(np.nanmean(end**2, axis=1)) / left.sizes for end in (left.rest, left.past))
     return bool(np.any((past <= HALVES * rest) & (rest - past >= POINTS) & (past <= FOLLOWS) & (rest <= MISSES)))

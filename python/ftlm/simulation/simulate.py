@@ -1,4 +1,4 @@
-"""Free runs: a model's outputs from a run's inputs."""
+"""Simulation of a model on the inputs of a run; explicit Euler baseline."""
 
 from __future__ import annotations
 
@@ -18,18 +18,18 @@ from ftlm.utils.validation import Floats, real_number
 
 
 def compared(runs: Sequence[Run], model: Solved, m: int) -> list[Record]:
-    """Records that free runs are compared with: their outputs are the measured ones, filtered as those of a free run.
+    """Return the records with which simulations are compared: measured outputs, filtered like the simulated ones.
 
-    Free runs follow from their inputs, then pass the sensor filter where outputs were measured through it; where a
-    filtered signal drives one, all signals are taken behind the filter.
+    Simulated outputs pass the sensor filter if they were measured through it. If a filtered signal is an input of a
+    simulation, all signals are filtered.
     """
     return records(runs, model.structure, m, filtered=model.structure.behind_filter)
 
 
 def respond(model: Solved, rec: Record) -> tuple[dict[str, Floats], dict[str, dict[float, float]]]:
-    """Pulse means of the model's outputs on one of its :func:`compared` records, and initial terms by exponent.
+    """Return pulse means of the outputs on one of the :func:`comparison_records`, and initial terms by exponent.
 
-    The initial terms are those that bring the response closest to the measured outputs.
+    The initial terms minimize the distance to the measured outputs.
     """
     structure = model.structure
     coupled = structure.coupling == "simulated"
@@ -65,33 +65,33 @@ def simulate(
     initial: Mapping[str, Mapping[float, float]] | None = None,
     largest_m: int = 1 << 22,
 ) -> Run:
-    """Point samples of a model's outputs on a run's inputs, at the run's instants.
+    """Simulate the outputs of a model on the inputs of a run, at its sample times.
 
-    The grid is the record's own, refined under the inputs' inter-sample behaviour (a held command stays exact) and
-    extrapolated in the step (its powers 2, 3 and 4), until halving the step moves no output by more than ``tolerance``
-    of its largest value. A sample belongs to its instant after the input of its row has acted: a term of the equation's
-    own order (direct feed-through) shows at once, everything else is continuous there.
+    The step of the record is refined under the intersample behavior of the inputs (a zero-order hold stays exact), with
+    Richardson extrapolation (powers 2, 3 and 4), until halving the step changes no output by more than ``tolerance`` of
+    its largest value. A sample is the value just after the input of its row has changed. A term of the equation's own
+    order (direct feedthrough) acts without delay; everything else is continuous there.
 
     Parameters
     ----------
     model
-        The model. With measured coupling the run must hold the measured other outputs.
+        The model. With measured coupling the run must contain the other outputs.
     run
-        The run; measured values of the modelled outputs are not used.
+        The run; measured values of the modeled outputs are not used.
     tolerance
-        Relative change at which refinement ends.
+        Relative change at which refinement terminates.
     initial
-        Coefficients of initial terms, by output and exponent; default at rest. Those of another record mean nothing.
-        Behind a sensor filter -1 and -2 are an impulse and its derivative, which stand for the filter's own state.
+        Coefficients of initial terms, by output and exponent; default at rest. They are valid for this record only.
+        After a sensor filter, -1 and -2 are an impulse and its derivative, which represent the filter's initial state.
         An offset c of the equation is the exponent alpha with the coefficient c / Gamma(alpha + 1); default none.
     largest_m
-        Most pulses; beyond it the change that is left is an error.
+        Maximum number of pulses; a larger remaining change raises ConvergenceError.
 
     Returns
     -------
     Run
-        The inputs as they are and the simulated outputs, with the run's step and length. Outputs that are measured
-        through the sensor filter are filtered; all of them are where a filtered signal drives the run.
+        The inputs and the simulated outputs, with the step and length of the run. Outputs measured through the sensor
+        filter are filtered, and all of them if a filtered signal is an input.
 
     Raises
     ------
@@ -100,7 +100,7 @@ def simulate(
     ModelError
         An equation that cannot be solved for its output, or a tolerance that is not positive.
     ConvergenceError
-        An unstable model (with the first index that is not finite), or a response that still moves at ``largest_m``.
+        Overflow of an unstable model (with the time), or a response that has not converged at ``largest_m`` pulses.
     """
     check_solved(model)
     if not isinstance(run, Run):
@@ -141,13 +141,13 @@ def simulate(
 
 
 def _units(model: Solved, run: Run) -> dict[str, str]:
-    """Units of inputs and simulated outputs; where the run or the model does not say, the other may."""
+    """Units of inputs and simulated outputs, from the run or the model."""
     inputs = {n: run.units[n] or model.units.get(n, "") for n in run.inputs}
     return inputs | {n: model.units.get(n, "") or run.units.get(n, "") for n in model.outputs}
 
 
 def _completed(run: Run, model: Solved) -> Run:
-    """Return the run with zeros for outputs that it lacks: what is simulated need not be there, and is never read."""
+    """Return the run with zeros for missing outputs; simulated outputs are never read."""
     missing = [o for o in model.outputs if o not in run]
     if not missing:
         return run
@@ -162,27 +162,27 @@ def _completed(run: Run, model: Solved) -> Run:
 
 
 def explicit_euler(model: Solved, run: Run, *, step: Literal["record"] = "record") -> dict[str, Floats]:
-    """Integer-order model stepped by explicit Euler at the run's step from rest, as the paper ran its baseline.
+    """Simulate an integer-order model by explicit Euler at the step of the run, as in the paper's baseline.
 
     Parameters
     ----------
     model
-        All orders whole; see :func:`ftlm.link_model` for the manual's.
+        Integer orders only; see :func:`ftlm.link_model` for the manual's.
     run
-        Its inputs drive the model; the paper's step is 0.002 s.
+        Run with the inputs; the step of the paper is 0.002 s.
     step
         Only the record's own.
 
     Returns
     -------
     dict
-        Point samples by output. Not finite where Euler's step is unstable, which for the second stage's hub pole
-        (-500 1/s) at 2 ms is nearly the case.
+        Samples by output. Not finite if the step is unstable; for the hub pole of the second joint (-500 1/s) a step
+        of 2 ms is near the limit.
 
     Raises
     ------
     ModelError
-        An order that is not whole.
+        A fractional order.
     """
     if step != "record":
         raise ModelError(f"step = {step!r} is not known; Euler steps at the record's own step: resample the run")

@@ -1,4 +1,4 @@
-"""The limit for step 0 of samples on ever finer grids, each of half the step of the one before (Romberg's triangle)."""
+"""Refinement of the step of a simulation until converged: Richardson extrapolation, and superposition for long records."""
 
 from __future__ import annotations
 
@@ -34,17 +34,16 @@ from ftlm.simulation.output_samples import (
 )
 from ftlm.utils.validation import Floats
 
-#: Powers of the step that the error of a sample has: the second is the pulse scheme's; the third comes with reading an
-#: instant from the pulses before it; then the next of both. A kink t^eta leaves powers in between, which these columns
-#: do not take away, but none makes the error larger by more than a small factor.
+#: Powers of the step in the error of a sample: 2 from the block-pulse scheme, 3 from extrapolation to a sample time,
+#: and 4 from the next term of both. A slope discontinuity t^eta adds powers in between, which these columns do not
+#: eliminate, but none of them increases the error by more than a small factor.
 POWERS = (2, 3, 4)
-#: A column is taken for the power that it still has where halving the step divided what it moves by this share of that
-#: power's factor at least.
+#: A column has the error of its power if halving the step reduced its change by at least this fraction of 2^power.
 SEEN = 0.5
-#: Where no power is known, halving the step divided what moves by this factor at least (by the root of two, and a
-#: little less), in as many samples as if so many alone moved: one number is told by theirs.
+#: For an unknown power: minimum reduction of the change on halving the step (slightly below the square root of two),
+#: and minimum effective number of samples from which the reduction is estimated.
 LEAST_RATIO, FEW = 1.4, 8.0
-#: Grids that tell such a factor, and whether it is one.
+#: Number of grids needed to estimate such a reduction factor and to test it.
 GRIDS = 4
 
 
@@ -55,17 +54,16 @@ def _moved(new: Floats, old: Floats) -> Floats:
 
 @dataclass(frozen=True)
 class Told:
-    """What grids tell of the limit.
+    """Estimate of the limit for zero step.
 
     Parameters
     ----------
     samples
-        The samples there.
+        Extrapolated samples.
     change
-        By which share of its largest value another halving would move each output; infinite before there were three
-        grids.
-    beside
-        The numbers beside the samples there.
+        Change of each output on another halving, relative to its largest value; infinite before there are three grids.
+    initial_terms
+        Extrapolated initial terms.
     """
 
     samples: Floats
@@ -75,19 +73,19 @@ class Told:
 
 @dataclass
 class Limit:
-    """What grids of 1, 1/2, 1/4, … of a step say together; samples have the shape (outputs, N).
+    """Richardson table of grids of 1, 1/2, 1/4, … of a step; samples have the shape (outputs, N).
 
     Parameters
     ----------
     rows
-        Of the last grids, finest last: the samples, and those with one power of the step after another taken away.
-    beside
-        The same of numbers beside them, such as initial terms that were fitted on each grid.
-    moved
-        By which share of its largest value halving the step moved each output in each of these columns, for the last
-        two halvings; infinite for the samples themselves.
+        Last grids, finest last: the samples, then those with one power of the step after another eliminated.
+    initial_terms
+        The same for initial terms fitted on each grid.
+    changes
+        Change of each output in each column on the last two halvings, relative to its largest value; infinite for the
+        samples themselves.
     measure
-        That share, of samples on a grid and on the one before.
+        Function that gives this relative change between samples on a grid and on the previous one.
     """
 
     rows: list[list[Floats]] = field(default_factory=list)
@@ -96,7 +94,7 @@ class Limit:
     measure: Callable[[Floats, Floats], Floats] = _moved
 
     def add(self, samples: Floats, beside: Floats | None = None) -> None:
-        """The samples on the next grid; a grid without finite numbers tells nothing, and everything begins anew."""
+        """Add samples on the next grid; samples that are not finite restart the table."""
         before = self.rows[-1] if self.rows else []
         both = bool(before) and bool(np.all(np.isfinite(before[0])) and np.all(np.isfinite(samples)))
         row = extrapolated(samples, before if both else [])
@@ -110,9 +108,9 @@ class Limit:
         self.moved = [*self.moved, moved][-2:]
 
     def told(self, owners: Sequence[int] = (), *, enough: float = 0.0) -> Told:
-        """What another halving would move least; the numbers beside belong to these outputs.
+        """Return the estimate that another halving changes least; ``owners`` are the outputs of the initial terms.
 
-        Where it moves a column by no more than what is enough, no other is looked for.
+        If the change of a column is at most ``enough``, no other estimate is tried.
         """
         column, change = self.best
         found = Told(self.rows[-1][column], change, self.beside[-1][column])
@@ -123,9 +121,10 @@ class Limit:
         return min((one for one in every if one is not None), key=lambda one: float(np.max(_known(one.change))))
 
     def _by_ratio(self, column: int, owners: NDArray[np.intp]) -> Told | None:
-        """The limit of a column whose error shrinks by a factor of its own, if the grid before told one as well.
+        """Extrapolate a column with an error of unknown power, if the previous grid gave a reduction factor as well.
 
-        Kinks t^eta leave powers in between, and orders that meet logarithms, which no power of the triangle takes away.
+        Slope discontinuities t^eta add intermediate powers, and coinciding orders add logarithms, which the table does
+        not eliminate.
         """
         oldest, older, old, new = (row[column] for row in self.rows)
         second, third = (row[column] for row in self.beside[-2:])
@@ -139,9 +138,9 @@ class Limit:
 
     @property
     def best(self) -> tuple[int, Floats]:
-        """The column that another halving would move least, and by which share of each output's largest value.
+        """Column that another halving changes least, and its change relative to the largest value of each output.
 
-        Infinite before there were three grids.
+        Infinite before there are three grids.
         """
         row, last = self.rows[-1], self.moved[-1]
         found: tuple[int, Floats] = (len(row) - 1 if len(row) <= 2 else 1, unknown(row[0].shape[0]))
@@ -158,7 +157,7 @@ class Limit:
 
 
 def extrapolated(fine: Floats, coarse: Sequence[Floats]) -> list[Floats]:
-    """A row of the triangle from numbers on a grid and the row of twice its step."""
+    """Return a row of the table from values on a grid and the row of twice its step."""
     row = [fine]
     with np.errstate(invalid="ignore", over="ignore"):
         for power, before in zip(POWERS, coarse, strict=False):
@@ -168,9 +167,10 @@ def extrapolated(fine: Floats, coarse: Sequence[Floats]) -> list[Floats]:
 
 
 def still_to_go(older: Floats, old: Floats, new: Floats) -> Floats | None:
-    """By which share of its last move each output moves yet, if one move after another is smaller by the same factor.
+    """Ratio of the remaining change to the last change of each output, for changes that shrink by a constant factor.
 
-    That is Aitken's, told by all samples of an output together; None where few of them move, or not ever less.
+    This is Aitken's method with one factor for all samples of an output. None if few samples change, or do not
+    converge.
     """
     with np.errstate(invalid="ignore", over="ignore", divide="ignore"):
         now, before = new - old, old - older
@@ -185,31 +185,30 @@ def still_to_go(older: Floats, old: Floats, new: Floats) -> Floats | None:
 
 
 def unknown(outputs: int) -> Floats:
-    """The change of outputs of which nothing is known."""
+    """Return an infinite change of each output."""
     return np.full(outputs, np.inf)
 
 
 def _known(change: Floats) -> Floats:
-    """Without numbers, a change is as large as can be."""
+    """Replace NaN by infinity."""
     return np.where(np.isnan(change), np.inf, change)
 
 
-#: Intervals from which on a record is long: below, whole grids cost as little.
+#: Minimum number of intervals of a long record. Below it, refinement of the whole grid costs no more.
 LONG = 1 << 14
-#: Pieces of an answer begin at its end divided by powers of this, the first of them not below so many intervals: half
-#: the step on one costs what the whole did.
+#: Pieces of a response start at its end divided by powers of this ratio, down to this minimum number of intervals.
+#: Halving the step on a piece costs as much as the whole response did.
 RATIO, SHORTEST = 8, 128
-#: Pulses an interval on which all of an answer is known. On the first, answers jump where inputs do: the piece where
-#: they start is without it.
+#: Pulses per interval of the grids that cover the whole response. The coarsest grid is not used for the first piece,
+#: where responses jump with the inputs.
 WHOLE = (1, 2, 4)
-#: An answer whose later half exceeds its first by this factor belongs to a run that grows: what sums up would be
-#: rounding.
+#: Ratio of the second to the first half of a response above which the model is unstable and the sum loses its digits.
 GROWTH = 1e3
 
 
 @dataclass
 class Piece:
-    """A part of all answers, from one interval to before another, on its finest grid, and its limit for step 0."""
+    """Piece of all responses, from one interval to before another, on its finest grid, and its limit for zero step."""
 
     first: int
     end: int
@@ -219,18 +218,18 @@ class Piece:
 
 @dataclass(frozen=True)
 class Answers:
-    """A model on a run, as a sum of answers: to every sample of what drives it, to first samples, to initial terms.
+    """Simulation as a sum of responses: to every sample of the inputs, to first samples, and to initial terms.
 
     Parameters
     ----------
     model
-        The model from rest, its limits of inputs done.
+        Model from rest, without input nonlinearities.
     run
-        The run; of it only names, step and how inputs act in between.
-    drivers
-        Samples of what drives, as they act.
-    begun
-        Signals whose first sample acts otherwise than later ones, and those samples.
+        Run of which only names, step and intersample behavior are used.
+    inputs
+        Samples of the inputs, after input nonlinearities.
+    first_samples
+        First samples of the signals for which they act differently from later ones.
     names
         Output and power of the initial terms.
     """
@@ -248,7 +247,7 @@ class Answers:
 
     @classmethod
     def of(cls, model: Solved, run: Run, names: Sequence[tuple[str, float]]) -> Answers | None:
-        """Those of a run; None where it is no such sum."""
+        """Build for a run; None if superposition does not apply."""
         structure = model.structure
         outputs, coupled = model.outputs, structure.coupling == "simulated"
         read = [(e, t) for e in model.equations for t in e.terms]
@@ -273,7 +272,7 @@ class Answers:
         return cls(still, run, moving, {n: float(moving[n][0]) for n in ramps if moving[n][0]}, names)
 
     def on(self, every: int, intervals: int) -> Floats:
-        """All answers on so many pulses an interval, a block of rows an answer; not finite where there are none."""
+        """Compute all responses on a grid, one block of rows per response; NaN if the equations are singular there."""
         try:
             return self._on(every, intervals)
         except ModelError:
@@ -294,7 +293,7 @@ class Answers:
         return np.concatenate([*blocks, *first, *more]) if blocks or more else np.zeros((0, intervals + 1))
 
     def _unit(self, name: str, intervals: int, row: int) -> Run:
-        """A run of nothing but one sample of one signal."""
+        """Return a run with a single unit sample of one signal."""
 
         def of(signal: str) -> Floats:
             out = np.zeros(intervals + 1)
@@ -311,7 +310,7 @@ class Answers:
         )
 
     def summed(self, answers: Floats, first: int, weights: Sequence[float]) -> Floats:
-        """What answers from one interval on make of the run behind it, shape (outputs, N - first).
+        """Superpose responses from one interval on, shape (outputs, N - first).
 
         The weights are those of the initial terms.
         """
@@ -328,7 +327,7 @@ class Answers:
         return out
 
     def parts(self, answers: Floats) -> tuple[Floats, list[Floats]]:
-        """The run without initial terms, and what a unit of each does."""
+        """Return the simulation without initial terms, and the responses to unit initial terms."""
         units = answers.reshape(-1, self.count, answers.shape[1])[len(self.drivers) + len(self.begun) :]
         return self.summed(answers, 0, [0.0] * len(self.names)), list(units)
 
@@ -336,7 +335,7 @@ class Answers:
 def long_run(model: Solved, run: Run, initial: Terms | None, *, tolerance: float, largest_m: int) -> Sampled | None:
     """Samples of a long run, as :func:`ftlm.simulation.step_refinement.refined` has them; None for one that whole grids must tell.
 
-    The initial terms of the model are decided. The refinement is that of the whole record.
+    The initial conditions of the model are resolved. The refinement is that of the whole record.
     """
     own = run.length - 1
     if own < LONG or WHOLE[-1] * own > largest_m or model.structure.has_friction:
@@ -385,7 +384,7 @@ def long_run(model: Solved, run: Run, initial: Terms | None, *, tolerance: float
 
 
 def _refined(pieces: Sequence[Piece], answers: Answers, tolerance: float, largest_m: int) -> Floats:
-    """Halve the step on the pieces that still move, until all together do not, or pulses run out; what is left."""
+    """Halve the step on pieces that have not converged; return the remaining change."""
     while True:
         changes = [p.limit.told().change for p in pieces]
         left = np.asarray(sum(c[: answers.count] for c in changes))
@@ -406,7 +405,7 @@ def _refined(pieces: Sequence[Piece], answers: Answers, tolerance: float, larges
 
 
 def _edges(own: int) -> list[tuple[int, int]]:
-    """Pieces of answers over so many intervals."""
+    """Return the ranges of the pieces of responses over a number of intervals."""
     ends = [own + 1]
     while ends[0] // RATIO >= SHORTEST:
         ends.insert(0, ends[0] // RATIO)
@@ -414,7 +413,7 @@ def _edges(own: int) -> list[tuple[int, int]]:
 
 
 def _dies_away(rows: Floats) -> bool:
-    """Whether answers do not grow by so much that their sum would lose its digits."""
+    """Whether responses do not grow so much that their sum loses its digits."""
     if not np.all(np.isfinite(rows)):
         return False
     half = rows.shape[1] // 2
@@ -425,19 +424,19 @@ def _dies_away(rows: Floats) -> bool:
 def refined(
     model: Solved, run: Run, initial: Terms | None, *, tolerance: float, largest_m: int = MAX_M, on_grid: bool = False
 ) -> Sampled:
-    """Samples on grids refined, and extrapolated in the step, until they stand still or the pulses run out.
+    """Simulate samples on refined grids, with Richardson extrapolation, until converged or out of pulses.
 
     A long record is refined only as far as that moves it (:func:`ftlm.simulation.step_refinement.long_run`).
 
     Parameters
     ----------
     initial
-        Coefficients of initial terms by output and exponent; None: those that bring the run closest to the measured
-        outputs, each weighted by its own deviation.
+        Coefficients of initial terms by output and exponent. None: fit them to the measured outputs, each weighted by
+        its standard deviation.
     tolerance
-        Change, as a share of each output's largest value, at which refinement ends.
+        Change, relative to the largest value of each output, at which refinement terminates.
     on_grid
-        Whether the instants are those of the run's grid although its rows have times of their own.
+        Whether to use the uniform grid of a run with nonuniform samples.
     """
     own = run.length - 1
     every = FIRST_REFINEMENT
@@ -468,7 +467,7 @@ def refined(
 
 
 def _like(terms: Terms, values: Floats) -> dict[str, dict[float, float]]:
-    """Initial terms of these outputs and exponents with other values."""
+    """Return initial terms with the same outputs and exponents and other values."""
     left = iter(values.tolist())
     return {o: {e: next(left) for e in powers} for o, powers in terms.items()}
 
@@ -476,7 +475,7 @@ def _like(terms: Terms, values: Floats) -> dict[str, dict[float, float]]:
 def _tried(
     model: Solved, run: Run, every: int, initial: Terms | None, times: Floats | None, *, last: bool = False
 ) -> tuple[Floats, dict[str, dict[float, float]]]:
-    """Samples on one grid; no numbers where it happens to make the equations unsolvable, unless it is the last try."""
+    """Simulate on one grid; NaN if the equations are singular there, unless it is the last grid."""
     try:
         return sampled(model, run, every, initial, times)
     except ModelError:

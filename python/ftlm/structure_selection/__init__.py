@@ -1,1 +1,1 @@
-"""Which terms and orders of a structure earn their place: candidates, what they predict, the choice in words."""
+"""Structure selection: candidates, cross-validation, ranking and choice."""

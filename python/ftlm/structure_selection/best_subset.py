@@ -1,11 +1,4 @@
-"""All subsets of what drives one equation, judged in closed form before any is fitted.
-
-Once the own terms of an equation of whole orders are given, its free run is a sum of the responses to what drives it.
-One evaluation at a point of a lattice of own coefficients gives every response, initial terms and offsets projected
-out, and the products of these are all that any subset needs: its least-squares coefficients on some runs, and what they
-leave over on another one. So each subset is fitted and judged exactly at the points of the lattice, at the price of the
-points and not of the subsets.
-"""
+"""Best-subset search over the input terms of one equation, with scores in closed form."""
 
 from __future__ import annotations
 
@@ -32,35 +25,35 @@ from ftlm.utils.validation import Floats
 
 Item = TypeVar("Item")
 Made = TypeVar("Made")
-#: Terms that drive from which on subsets are screened; fewer are grown as quickly.
+#: Minimum number of input terms for best-subset screening. Stepwise selection is as fast for fewer.
 LEAST_DRIVES = 3
-#: Samples of a run that the screening sees at least.
+#: Minimum number of samples of a subsampled run.
 SAMPLES = 1000
-#: Spacing of the lattice of frequencies (in logarithms), shares of damping, and how often the spacing is halved around
-#: what came out best.
+#: Spacing of the grid in ln(frequency), damping factors, and number of times that the spacing is halved around the best
+#: points.
 SPACING = 0.15
 DAMPING = tuple(np.geomspace(0.006, 4.0, 10).tolist())
 ZOOMS = 2
-#: Subsets that decide where the lattice is refined.
+#: Number of subsets around whose points the grid is refined.
 LEADING = 24
-#: Subsets that are tried one and all; of more, as many of the best of each size are widened.
+#: Maximum number of subsets for an exhaustive search. Beyond it, the best subsets of each size are extended.
 ALL = 4096
-#: Share of the diagonal below which a response is not told from the others.
+#: Ridge added to the scaled normal matrix, for collinear responses.
 UNTOLD = 1e-12
-#: Points that one task computes.
+#: Number of grid points per task.
 CHUNK = 16
 
 
 class Pool(Protocol):
-    """What does work for items in their order."""
+    """Pool that maps a function over items, in their order."""
 
     def quietly(self, work: Callable[[Item], Made], items: Sequence[Item]) -> list[Made]:
-        """Work done for each item."""
+        """Return the results for the items, in their order."""
 
 
 @dataclass(frozen=True)
 class Screened:
-    """A subset, where its fit starts, and what it left over on the lattice: mean over folds of ln(1 - fit / 100)."""
+    """Subset with the initial guess of its fit, and its score on the grid: mean over folds of ln(1 - fit / 100)."""
 
     change: Change
     start: Mapping[str, float]
@@ -69,7 +62,7 @@ class Screened:
 
 @dataclass(frozen=True)
 class Column:
-    """A driving term at one of its whole orders."""
+    """Input term at one of its integer orders."""
 
     coefficient: str
     signal: str
@@ -77,13 +70,13 @@ class Column:
     names: tuple[str, ...]
 
     def term(self, term: Term, name: str) -> Term:
-        """The term at this order with a coefficient of its own."""
+        """Return the term at this order with a coefficient of its own."""
         return replace(term, order=Order(self.place), coefficient=name)
 
 
 @dataclass(frozen=True)
 class Ground:
-    """Own terms at whole orders, whose coefficients a lattice has, and the columns that may drive them."""
+    """Base model: own terms at integer orders with coefficients from a grid, and columns of possible input terms."""
 
     inside: Inside
     variant: Variant
@@ -98,7 +91,7 @@ class Ground:
         return self.structure.equations[0].order.constant
 
     def lattice(self) -> Iterator[tuple[float, ...]]:
-        """Logarithms of frequency and of damping, as many as own coefficients are free."""
+        """Yield logarithms of frequency and of damping, as many as there are free own coefficients."""
         if not self.own:
             yield ()
             return
@@ -109,14 +102,14 @@ class Ground:
             yield from [(w,)] if len(self.own) == 1 else [(w, math.log(g)) for g in DAMPING]
 
     def coefficients(self, point: tuple[float, ...]) -> dict[str, float]:
-        """Own coefficients at a point: the lower order's is the power of a frequency, the higher one damps."""
+        """Own coefficients at a point: a power of the frequency for the lower order, damping for the higher."""
         w = math.exp(point[0]) if point else 1.0
         shares = [1.0, math.exp(point[1]) if len(point) > 1 else 1.0]
         ordered = sorted(self.own, key=lambda item: item[1])
         return {n: -g * w ** (self.top - order) for (n, order), g in zip(ordered, shares, strict=False)}
 
     def stable(self, point: tuple[float, ...]) -> bool:
-        """Whether the free run dies away there; where no own coefficient is free nothing is asked."""
+        """Whether the model is stable at a point; True if no own coefficient is free."""
         if not point:
             return True
         values = self.coefficients(point)
@@ -134,16 +127,16 @@ class Ground:
 
 @dataclass
 class Products:
-    """Products of the responses of a ground's columns and of what is left without any, by point and run."""
+    """Inner products of the responses of the columns and of the residual without inputs, by point and run."""
 
     points: list[tuple[float, ...]]
     values: Floats
 
 
 def screened(inside: Inside, folds: Folds, pool: Pool) -> list[Screened]:
-    """Every subset at whole orders, best prediction first; none where there is nothing to choose from.
+    """Return every subset at integer orders, best prediction first; empty if the screening does not apply.
 
-    Several runs, or a run that judges, are needed: the blocks of one run share the terms that it starts with.
+    It needs several runs, or a validation run: blocks of one run share initial terms.
     """
     # Subsets are compared as bodies that slide; friction that may be left out is added to the best.
     inside = Inside(inside.sliding)
@@ -169,7 +162,7 @@ def screened(inside: Inside, folds: Folds, pool: Pool) -> list[Screened]:
 
 
 def grounds(inside: Inside, runs: tuple[Run, ...]) -> Iterator[Ground]:
-    """Own terms at whole orders, at most two of them, with and without an offset."""
+    """Yield base models: at most two own terms at integer orders, with and without an offset."""
     structure = inside.structure
     item = structure.equations[0]
     own = [t for t in item.terms if t.signal == item.output]
@@ -196,7 +189,7 @@ def grounds(inside: Inside, runs: tuple[Run, ...]) -> Iterator[Ground]:
 
 
 def _places(inside: Inside, term: Term, top: float) -> list[float | None]:
-    """Whole orders of an own term below the highest, and None where it may be left out."""
+    """Integer orders of an own term below the highest, and None if it is optional."""
     out: list[float | None] = [None] if term.coefficient in inside.droppable else []
     places = inside.wholes(term.order.names[0]) if term.order.is_single else [term.order.constant]
     return out + [p for p in places if p < top]
@@ -210,7 +203,7 @@ def _ground(
     free: tuple[tuple[str, float], ...],
     runs: tuple[Run, ...],
 ) -> Ground | None:
-    """Own terms and every column that can drive them; None where there is none, or not all of them are linear."""
+    """Return a base model with every possible column; None if there is none, or not all are linear."""
     item = inside.structure.equations[0]
     known = [t for t in item.terms if t.signal != item.output and t.fixed is not None]
     kept = [replace(t, order=Order(p)) for t, p in own]
@@ -253,7 +246,7 @@ def _with_terms(structure: Structure, terms: Sequence[Term], top: float, offset:
 
 
 def _drives(structure: Structure, terms: Sequence[Term], top: float, runs: Sequence[Run]) -> bool:
-    """Whether these terms are an equation that the runs can drive."""
+    """Whether these terms form an equation that the runs can simulate."""
     try:
         made = decided(_with_terms(structure, terms, top, "none"), runs)
         Grid(FreeProblem.of(made), runs[:1], [1.0], decimation=_thinning(runs)).experiments  # noqa: B018
@@ -269,9 +262,9 @@ def _thinning(runs: Sequence[Run]) -> int:
 def judged_subsets(
     ground: Ground, folds: Folds, pool: Pool, points: Sequence[tuple[float, ...]] | None = None
 ) -> list[Screened]:
-    """Subsets of a ground's columns by what they leave over on the runs that they are not fitted to.
+    """Score subsets of the columns of a base model by their residuals on validation data.
 
-    Own coefficients are those of some points, or of a lattice that is refined around the best.
+    Own coefficients are those of given points, or of a grid refined around the best points.
     """
     problem = FreeProblem.of(ground.structure)
     grid = Grid(problem, ground.runs, [1.0], decimation=_thinning(ground.runs))
@@ -326,7 +319,7 @@ def _products(
     places: Sequence[int],
     point: tuple[float, ...],
 ) -> Floats | None:
-    """Products by run of the responses to the columns, last what is left over without them; None where one diverges."""
+    """Inner products by run of the responses to the columns and of the residual; None if a response diverges."""
     values = ground.coefficients(point)
     coefficients = [values.get(n, 0.0) for n in problem.coefficients]
     try:
@@ -340,7 +333,7 @@ def _products(
 
 
 def _change(ground: Ground, subset: Sequence[int]) -> Change | None:
-    """A subset as a variant."""
+    """Return a subset as a change to a variant; None if it is invalid."""
     chosen = [ground.columns[k] for k in subset]
     whole = {**ground.variant.held(), **{n: c.place for c in chosen for n in c.names}}
     kept = ground.variant.kept | {c.coefficient for c in chosen}
@@ -352,7 +345,7 @@ def _change(ground: Ground, subset: Sequence[int]) -> Change | None:
 
 @dataclass(frozen=True)
 class Verdict:
-    """What a subset leaves over, the points at which it is fitted by fold, last on all runs, and coefficients there."""
+    """Score of a subset, its grid points by fold (last: all runs), and its coefficients there."""
 
     score: float
     points: tuple[int, ...]
@@ -361,7 +354,7 @@ class Verdict:
 
 @dataclass(frozen=True)
 class Judge:
-    """How subsets are judged: runs that each fold fits (last: all), the one that it judges, and sizes of outputs."""
+    """Scorer of subsets: estimation runs by fold (last: all), validation run by fold, and output powers."""
 
     columns: tuple[Column, ...]
     fitted: tuple[tuple[int, ...], ...]
@@ -370,7 +363,7 @@ class Judge:
 
     @classmethod
     def of(cls, ground: Ground, folds: Folds, spread: Sequence[float], ends: Sequence[int]) -> Judge:
-        """Of the folds on a ground's runs."""
+        """Build from the folds on the runs of a base model."""
 
         def place(run: Run) -> int:
             return next(k for k, r in enumerate(ground.runs) if r is run)
@@ -385,7 +378,7 @@ class Judge:
         )
 
     def one(self, products: Floats, pooled: Floats, subset: Sequence[int]) -> Verdict:
-        """A subset fitted on the runs of each fold at the point that suits it best, and judged on what was left out."""
+        """Fit a subset on the runs of each fold at its best point, and score it on the validation run."""
         keys = [*subset, -1]
         cut = pooled[:, :, keys][:, :, :, keys]
         matrix, right, rest = cut[..., :-1, :-1], cut[..., :-1, -1], cut[..., -1, -1]
@@ -404,7 +397,7 @@ class Judge:
         return Verdict(float(np.mean(scores)), tuple(points.tolist()), tuple(found[points[-1], -1].tolist()))
 
     def every(self, products: Products) -> dict[tuple[int, ...], Verdict]:
-        """Every subset, or the best of each size widened where there are too many."""
+        """Score every subset; if there are too many, extend the best of each size."""
         values = products.values
         pooled = np.stack([values[:, list(runs)].sum(axis=1) for runs in self.fitted], axis=1)
         choices: dict[str, list[int]] = {}

@@ -1,4 +1,4 @@
-"""Structures inside another one: terms left out, orders whole or free, with and without an offset."""
+"""Structures nested in another one: fewer terms, integer or free orders, with and without an offset."""
 
 from __future__ import annotations
 
@@ -13,26 +13,26 @@ from ftlm.structure.equation import Equation, Term
 from ftlm.structure.input_nonlinearity import input_name
 from ftlm.structure.structure import Structure, narrowed
 
-#: Whole orders that stand for a free one.
+#: Integer values that replace a free order.
 WHOLE = (0.0, 1.0, 2.0, 3.0)
 
 
 @dataclass(frozen=True)
 class Variant:
-    """A structure inside another.
+    """Structure nested in another one.
 
     Parameters
     ----------
     kept
         Coefficients of the terms that it has.
-    whole
-        Orders that are numbers in it, by name; all others are free.
+    integer_orders
+        Orders with integer values, by name; all others are free.
     offset
         Whether each run has an unknown constant.
     inputs
-        Free delays and limits of inputs that it has; the others do not delay, do not limit.
-    rubs
-        Frictions that it has, as :attr:`Inside.frictions` calls them.
+        Free delays and input nonlinearities that it has; the other inputs have no delay and no nonlinearity.
+    frictions
+        Frictions that it has, by the names of :attr:`NestedStructures.frictions`.
     """
 
     kept: frozenset[str]
@@ -42,18 +42,18 @@ class Variant:
     rubs: frozenset[str] = frozenset()
 
     def held(self) -> dict[str, float]:
-        """Whole orders by name."""
+        """Integer orders by name."""
         return dict(self.whole)
 
     def with_whole(self, values: Mapping[str, float | None]) -> Variant:
-        """The same with some orders whole, or free where they are None."""
+        """Return the variant with some orders integer, or free where the value is None."""
         known = {**self.held(), **values}
         return replace(self, whole=tuple(sorted((n, v) for n, v in known.items() if v is not None)))
 
 
 @dataclass(frozen=True)
 class Change:
-    """A step from one variant to another, in words."""
+    """Change from one variant to another, with a description."""
 
     words: str
     variant: Variant
@@ -61,18 +61,17 @@ class Change:
 
 @dataclass(frozen=True)
 class Inside:
-    """A structure and everything inside it.
+    """A structure and all structures nested in it.
 
-    Terms with a free coefficient of their own may be left out where the structure is one equation without laws; orders
-    that stand alone may be whole; an offset that is allowed, free delays and limits, and friction of free size may be
-    left out.
+    Optional are terms with a free coefficient of their own (for one equation without laws), an allowed offset, free
+    delays and input nonlinearities, and friction of free size. Orders that stand alone may be integer.
     """
 
     structure: Structure
 
     @property
     def droppable(self) -> tuple[str, ...]:
-        """Coefficients of terms that may be left out."""
+        """Coefficients of optional terms."""
         structure = self.structure
         if structure.has_order_law or structure.coefficient_law or len(structure.equations) > 1:
             return ()
@@ -80,12 +79,12 @@ class Inside:
 
     @property
     def offset_allowed(self) -> bool:
-        """Whether an offset is one of the choices."""
+        """Whether an offset is optional."""
         return self.structure.offset in ("auto", "constant")
 
     @property
     def frictions(self) -> dict[str, str | None]:
-        """Frictions that may be left out, each with the one that it needs: what falls with speed needs Coulomb's."""
+        """Optional frictions, each with the one that it requires: Stribeck friction requires Coulomb friction."""
         out: dict[str, str | None] = {}
         for item in self.structure.equations:
             rubs = item.friction
@@ -99,7 +98,7 @@ class Inside:
         return out
 
     def _rubbing(self, item: Equation, rubs: frozenset[str]) -> Equation:
-        """An equation with no friction but some, and what may not be left out."""
+        """Return an equation with the given optional frictions and all mandatory ones."""
         found, own, choices = item.friction, f"friction of {item.output}", self.frictions
         if found is None:
             return item
@@ -110,12 +109,12 @@ class Inside:
 
     @property
     def sliding(self) -> Structure:
-        """The structure without the frictions that may be left out."""
+        """Structure without its optional frictions."""
         equations = tuple(self._rubbing(e, frozenset()) for e in self.structure.equations)
         return replace(self.structure, equations=equations)
 
     def build(self, variant: Variant) -> Structure:
-        """The structure of a variant."""
+        """Return the structure of a variant."""
         structure, droppable = self.structure, set(self.droppable)
         equations = []
         for item in structure.equations:
@@ -138,7 +137,7 @@ class Inside:
         return replace(made, offset=asked)
 
     def possible(self, variant: Variant) -> bool:
-        """Whether a variant is a structure: its own orders differ and lie below the highest."""
+        """Whether a variant is valid: its own orders differ and are below the highest."""
         try:
             made = self.build(variant)
         except ModelError:
@@ -153,7 +152,7 @@ class Inside:
         return True
 
     def wholes(self, name: str) -> list[float]:
-        """Whole values that a free order may take."""
+        """Integer values that a free order may take."""
         problem = FreeProblem.of(self.structure)
         low, high = problem.bounds[problem.orders.index(name)]
         return [v for v in WHOLE if low <= v <= high and (v > 0 or name not in self._highest)] or [
@@ -165,7 +164,7 @@ class Inside:
         return {n for e in self.structure.equations for n in e.order.names}
 
     def skeletons(self) -> Iterator[Change]:
-        """The simplest structures: whole orders, the output's own terms, and one thing that drives it."""
+        """Yield the simplest structures: integer orders, the output's own terms, and one input term."""
         free = [n for n in self.structure.order_names if n in self._highest]
         tops: list[dict[str, float]] = [{}]
         for name in free:
@@ -185,7 +184,7 @@ class Inside:
                 yield from self._adding(base, term)
 
     def top(self, variant: Variant) -> tuple[float | None, ...]:
-        """Highest orders of a variant where they are whole."""
+        """Integer values of the highest orders of a variant; None for a free one."""
         held = variant.held()
         return tuple(held.get(n) for n in sorted(self._highest))
 
@@ -196,7 +195,7 @@ class Inside:
         return any(term in e.terms and term.signal == e.output for e in self.structure.equations)
 
     def _with_own_terms(self, top: Mapping[str, float]) -> Variant | None:
-        """All own terms whose whole orders differ, and every term that may not be left out."""
+        """Return the variant of all own terms with distinct integer orders and all mandatory terms."""
         droppable = self.droppable
         whole: dict[str, float] = dict(top)
         kept: list[str] = []
@@ -236,7 +235,7 @@ class Inside:
         return variant if self.possible(variant) or not alone else None
 
     def _adding(self, variant: Variant, term: Term) -> Iterator[Change]:
-        """A term more, its order at each of its whole values."""
+        """Yield variants with one more term, its order at each of its integer values."""
         assert isinstance(term.coefficient, str)
         kept = variant.kept | {term.coefficient}
         if not term.order.names:
@@ -254,13 +253,13 @@ class Inside:
                 yield Change(f"+ {self._term_in(one, term)}", one)
 
     def _term_in(self, variant: Variant, term: Term) -> str:
-        """A term as it stands in a variant."""
+        """Text of a term in a variant."""
         made = self.build(variant)
         found = next(t for e in made.equations for t in e.terms if t.coefficient == term.coefficient)
         return str(found)
 
     def richest(self, variant: Variant) -> Variant:
-        """The variant with every term that it has room for, each at a whole order that no other term of it has."""
+        """Return the variant with every term that fits, each at an integer order that no other term of it has."""
         for item in self.structure.equations:
             for term in item.terms:
                 if term.coefficient in self.droppable and term.coefficient not in variant.kept:
@@ -270,7 +269,7 @@ class Inside:
         return variant
 
     def larger(self, variant: Variant) -> Iterator[Change]:
-        """Every variant with one thing more: a term, a free order, an offset."""
+        """Yield every variant with one more term, free order or offset."""
         for item in self.structure.equations:
             for term in item.terms:
                 if term.coefficient in self.droppable and term.coefficient not in variant.kept:
@@ -289,7 +288,7 @@ class Inside:
                 yield Change(name, replace(variant, rubs=variant.rubs | {name}))
 
     def smaller(self, variant: Variant) -> Iterator[Change]:
-        """Every variant with one thing less."""
+        """Yield every variant with one term, free order or offset fewer."""
         made = self.build(variant)
         for item in made.equations:
             for term in item.terms:
@@ -314,13 +313,13 @@ class Inside:
 
 
 def worded(structure: Structure) -> str:
-    """A structure in one line, with the numbers of inputs that are free in it."""
+    """Return a structure as one line, with the free parameters of its inputs."""
     free = "".join(f", {item.words} free" for item in structure.free_inputs)
     return str(structure).replace("\n", "; ") + free
 
 
 def signature(structure: Structure) -> str:
-    """What a structure is but for the names of its numbers: two that differ in nothing else are one candidate."""
+    """Return a text of a structure without parameter names; equal texts mean the same candidate."""
     parts = []
     for item in structure.equations:
         terms = sorted(
@@ -334,12 +333,12 @@ def signature(structure: Structure) -> str:
 
 
 def named(structures: Sequence[Structure] | Mapping[str, Structure]) -> dict[str, Structure]:
-    """Candidates by name; one that has none is called by its equation, one with ``offset="auto"`` is two.
+    """Return candidates by name, the default name being the equation; one with ``offset="auto"`` gives two candidates.
 
     Raises
     ------
     ModelError
-        No candidate, something that is none, or two that are the same but for the names of their numbers.
+        No candidate, an object that is no structure, or two that differ in parameter names only.
     """
     items = (
         list(structures.items())
@@ -374,7 +373,7 @@ def named(structures: Sequence[Structure] | Mapping[str, Structure]) -> dict[str
 
 
 def _content(structure: Structure) -> str:
-    """All that a candidate is, whatever its numbers are called and in which order its terms stand."""
+    """Return a text of a candidate that is independent of parameter names and of the order of its terms."""
     if structure.has_order_law or structure.coefficient_law:
         return repr(structure)
     rest = (

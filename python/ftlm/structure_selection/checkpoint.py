@@ -1,9 +1,4 @@
-"""The store of a selection: every fit and judgement as it ends, so that one that was stopped goes on where it was.
-
-A selection is the same steps whoever takes them, so what is kept is what each step came to, under a digest of what was
-asked. The file has the frames of an order search's store (see :mod:`ftlm.search.store`); the first tells of which runs,
-candidates and validation it is.
-"""
+"""Checkpoint file of a structure selection: every fit and validation as it ends, for resumption."""
 
 from __future__ import annotations
 
@@ -30,21 +25,21 @@ from ftlm.structure_selection.cross_validation import Trial
 from ftlm.utils.validation import Floats
 
 Made = TypeVar("Made")
-#: Number of how a candidate is fitted and judged; answers of different ones must not be joined.
+#: Version of fit and validation. Results of different versions must not be combined.
 ALGORITHM = 3
-#: Errors that a candidate may end with; any other is none of its own.
+#: Errors of a candidate's fit. Any other error is a defect.
 End: TypeAlias = Literal["ConvergenceError", "DataError", "ModelError"]
 ENDS: dict[End, type[FtlmError]] = {
     "ConvergenceError": ConvergenceError,
     "DataError": DataError,
     "ModelError": ModelError,
 }
-#: Bytes of a number.
+#: Size of a double [bytes].
 DOUBLE = 8
 
 
 def _plain(value: object) -> object:
-    """Numbers of NumPy as those of Python, and powers of a history as those that they are."""
+    """Convert NumPy numbers to Python numbers, and a history to its powers."""
     if isinstance(value, (np.floating, np.integer, np.bool_)):
         return value.item()
     if isinstance(value, tuple):
@@ -61,7 +56,7 @@ def _digest(value: object) -> bytes:
 
 
 class Request(msgspec.Struct, frozen=True, forbid_unknown_fields=True, tag="selection"):
-    """The first frame: digests of what a selection is of."""
+    """First frame: digests of runs, candidates and validation."""
 
     algorithm: int
     version: str
@@ -71,7 +66,7 @@ class Request(msgspec.Struct, frozen=True, forbid_unknown_fields=True, tag="sele
 
     @classmethod
     def of(cls, runs: Sequence[Run], candidates: object, judges: Sequence[Run], words: str) -> Request:
-        """Of runs, what is chosen from, and how it is judged."""
+        """Build from runs, candidates, validation runs and the description of the validation."""
         return cls(
             ALGORITHM,
             __version__,
@@ -81,13 +76,13 @@ class Request(msgspec.Struct, frozen=True, forbid_unknown_fields=True, tag="sele
         )
 
     def difference(self, other: Request) -> str | None:
-        """Say what sets another request apart, or None."""
+        """Describe the difference to another request, or return None."""
         words = {"runs": "of other runs", "candidates": "of other candidates", "validation": "by another validation"}
         return next((said for n, said in words.items() if getattr(self, n) != getattr(other, n)), None)
 
 
 def _told(run: Run) -> list[object]:
-    """All that a fit sees of a run."""
+    """Return all data of a run that affect a fit."""
     own = run.readings
     times = [] if own is None else [own.times.tobytes(), {n: v.tobytes() for n, v in own.data.items()}]
     samples = {n: np.ascontiguousarray(run[n], "<f8").tobytes() for n in run.signals}
@@ -95,23 +90,23 @@ def _told(run: Run) -> list[object]:
 
 
 class Refused(msgspec.Struct, frozen=True, forbid_unknown_fields=True, tag="refused"):
-    """A candidate that cannot be fitted."""
+    """Error of a candidate's fit."""
 
     kind: End
     words: str
 
     @classmethod
     def of(cls, error: FtlmError) -> Refused | None:
-        """Write an error; None for what ftlm itself did wrong, which is no candidate's answer."""
+        """Serialize an error; None for an internal error, which is no result of a candidate."""
         return next((cls(n, str(error)) for n, kind in ENDS.items() if type(error) is kind), None)
 
     def error(self) -> FtlmError:
-        """Give it back."""
+        """Deserialize the error."""
         return ENDS[self.kind](self.words)
 
 
 class FitFile(msgspec.Struct, frozen=True, forbid_unknown_fields=True, tag="fit"):
-    """A fit; arrays are little-endian doubles."""
+    """Fit on file; arrays are little-endian doubles."""
 
     orders: dict[str, float]
     coefficients: dict[str, float]
@@ -135,7 +130,7 @@ class FitFile(msgspec.Struct, frozen=True, forbid_unknown_fields=True, tag="fit"
 
     @classmethod
     def of(cls, joint: JointFit) -> FitFile:
-        """Write a fit by squares, whose intervals are quadratic."""
+        """Serialize a least-squares fit with Wald intervals."""
         growth = joint.growth
         return cls(
             joint.orders,
@@ -164,7 +159,7 @@ class FitFile(msgspec.Struct, frozen=True, forbid_unknown_fields=True, tag="fit"
         return len(self.orders) + len(self.coefficients) + len(self.inputs)
 
     def problem(self) -> str | None:
-        """What does not fit together, or None."""
+        """Describe inconsistent data, or return None."""
         if len(self.covariance) != DOUBLE * self._count**2 or len(self.on_grid) != DOUBLE * self._count:
             return f"a covariance or values of other than its {self._count} numbers"
         if any(len(e) % DOUBLE for part in self.residuals for e in part.values()):
@@ -174,7 +169,7 @@ class FitFile(msgspec.Struct, frozen=True, forbid_unknown_fields=True, tag="fit"
         return None
 
     def joint(self) -> JointFit:
-        """Give it back."""
+        """Deserialize the fit."""
         count = self._count
         told = History(self.initial) if self.history and not isinstance(self.initial, str) else self.initial
         return JointFit(
@@ -200,7 +195,7 @@ class FitFile(msgspec.Struct, frozen=True, forbid_unknown_fields=True, tag="fit"
 
 
 class JudgementFile(msgspec.Struct, frozen=True, forbid_unknown_fields=True, tag="judgement"):
-    """What became of a candidate that was fitted, which is asked with its fit."""
+    """Validation of a fitted candidate; the key includes its fit."""
 
     numbers: int
     estimation: dict[str, float]
@@ -215,7 +210,7 @@ class JudgementFile(msgspec.Struct, frozen=True, forbid_unknown_fields=True, tag
 
     @classmethod
     def of(cls, trial: Trial) -> JudgementFile:
-        """Write a judgement."""
+        """Serialize a trial."""
         validation = {n: dict(part) for n, part in trial.validation.items()}
         return cls(
             trial.numbers,
@@ -231,7 +226,7 @@ class JudgementFile(msgspec.Struct, frozen=True, forbid_unknown_fields=True, tag
         )
 
     def trial(self, name: str, structure: Structure, joint: JointFit) -> Trial:
-        """Give it back."""
+        """Deserialize the trial."""
         return Trial(
             name,
             structure,
@@ -250,7 +245,7 @@ class JudgementFile(msgspec.Struct, frozen=True, forbid_unknown_fields=True, tag
 
 
 class SubsetFile(msgspec.Struct, frozen=True, forbid_unknown_fields=True):
-    """A subset that was screened."""
+    """Subset of the best-subset search on file."""
 
     words: str
     kept: tuple[str, ...]
@@ -263,29 +258,29 @@ class SubsetFile(msgspec.Struct, frozen=True, forbid_unknown_fields=True):
 
     @classmethod
     def of(cls, one: Screened) -> SubsetFile:
-        """Write one."""
+        """Serialize a subset."""
         v = one.change.variant
         kept, inputs, rubs = (tuple(sorted(names)) for names in (v.kept, v.inputs, v.rubs))
         return cls(one.change.words, kept, v.whole, v.offset, inputs, rubs, dict(one.start), one.score)
 
     def screened(self) -> Screened:
-        """Give it back."""
+        """Deserialize the subset."""
         variant = Variant(frozenset(self.kept), self.whole, self.offset, frozenset(self.inputs), frozenset(self.rubs))
         return Screened(Change(self.words, variant), self.start, self.score)
 
 
 class SubsetsFile(msgspec.Struct, frozen=True, forbid_unknown_fields=True, tag="subsets"):
-    """All subsets that were screened."""
+    """All subsets of the best-subset search on file."""
 
     each: tuple[SubsetFile, ...]
 
     @classmethod
     def of(cls, subsets: Sequence[Screened]) -> SubsetsFile:
-        """Write them."""
+        """Serialize all subsets."""
         return cls(tuple(SubsetFile.of(s) for s in subsets))
 
     def subsets(self) -> list[Screened]:
-        """Give them back."""
+        """Deserialize all subsets."""
         return [s.screened() for s in self.each]
 
 
@@ -293,7 +288,7 @@ Answer = Refused | FitFile | JudgementFile | SubsetsFile
 
 
 class Kept(msgspec.Struct, frozen=True, forbid_unknown_fields=True, tag="kept"):
-    """What a step came to, under the digest of what was asked."""
+    """Result of a step, with the digest of its arguments."""
 
     asked: bytes
     answer: Answer
@@ -311,7 +306,7 @@ def _array(data: bytes) -> Floats:
 
 
 class Store:
-    """What a selection came to so far, locked until it is closed; threads may ask it side by side."""
+    """Results of a selection so far, locked until closed; safe for concurrent threads."""
 
     def __init__(self, path: str | os.PathLike[str], request: Request) -> None:
         self._known: dict[bytes, Answer] = {}
@@ -386,7 +381,7 @@ class Store:
         write: Callable[[Made], Answer | None],
         read: Callable[[Answer], Made],
     ) -> Made:
-        """What was asked, from the store, or computed and kept; what is no answer is not kept."""
+        """Return a stored result, or compute and store it; a None result is not stored."""
         key = _digest(asked)
         with self._lock:
             answer = self._known.get(key)
@@ -408,7 +403,7 @@ class Store:
         refine: bool,
         compute: Callable[[], JointFit | FtlmError],
     ) -> JointFit | FtlmError:
-        """A fit on all runs, or why there is none."""
+        """Return a fit on all runs, or its error."""
 
         def write(made: JointFit | FtlmError) -> Answer | None:
             if isinstance(made, JointFit):
@@ -427,7 +422,7 @@ class Store:
     def judgement(
         self, name: str, structure: Structure, joint: JointFit, fine: bool, compute: Callable[[], Trial]
     ) -> Trial:
-        """A fitted candidate on what it never saw."""
+        """Return the trial of a fitted candidate on validation data."""
 
         def read(answer: Answer) -> Trial:
             if not isinstance(answer, JudgementFile):
@@ -438,7 +433,7 @@ class Store:
         return self.recalled(asked, compute, JudgementFile.of, read)
 
     def subsets(self, structure: Structure, compute: Callable[[], list[Screened]]) -> list[Screened]:
-        """Subsets that were screened."""
+        """Return all screened subsets."""
 
         def read(answer: Answer) -> list[Screened]:
             if not isinstance(answer, SubsetsFile):
@@ -448,7 +443,7 @@ class Store:
         return self.recalled(("subsets", structure), compute, SubsetsFile.of, read)
 
     def close(self) -> None:
-        """Give the lock back."""
+        """Close the file and release the lock."""
         self._log.close()
 
     def __enter__(self) -> Store:

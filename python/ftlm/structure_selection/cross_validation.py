@@ -1,4 +1,4 @@
-"""A candidate tried: fitted on what it may see, judged by free runs on what it may not."""
+"""Cross-validation of a candidate structure: folds, fit, and score of the simulation on validation data."""
 
 from __future__ import annotations
 
@@ -22,18 +22,18 @@ from ftlm.utils.linalg import length
 from ftlm.utils.statistics import colour
 from ftlm.validation.comparison import compare
 
-#: Blocks of a run, and the rows that one has at least.
+#: Number of blocks of a run, and minimum number of samples of a block.
 BLOCKS = 4
 LEAST_BLOCK = 50
-#: Relative error of free runs on a block.
+#: Relative tolerance of simulations on a block.
 TOLERANCE = 1e-4
-#: A free run counts as lost below this fit, however far below: one candidate that runs away is not told from another.
+#: Lower limit of the fit [%] in scores; diverging candidates are not distinguished.
 LOST = -100.0
 
 
 @dataclass(frozen=True)
 class Fold:
-    """Runs to fit, and what is judged: a run of its own, or rows of one of them, whose outputs the fit does not see."""
+    """Estimation runs and validation data: another run, or samples of a run that are masked in the fit."""
 
     runs: tuple[Run, ...]
     judged: Run
@@ -41,22 +41,24 @@ class Fold:
 
     @property
     def name(self) -> str:
-        """What is judged."""
+        """Name of the validation data."""
         if self.rows is None:
             return self.judged.name
         step = self.judged.step
         return f"{self.judged.name} {self.rows[0] * step:g}-{self.rows[1] * step:g} s"
 
     def seen(self, outputs: Sequence[str]) -> tuple[Run, ...]:
-        """Runs as the fit of some outputs sees them."""
+        """Runs for the fit, with the validation samples of the given outputs masked."""
         if self.rows is None:
             return self.runs
         return tuple(masked(r, outputs, self.rows) if r is self.judged else r for r in self.runs)
 
     def fit_percent(self, model: Model) -> dict[str, float]:
-        """Free run of a model on what was left out, in percent by output; from what was seen, where that begins.
+        """Return the fit of a simulation on the validation data in percent, by output.
 
-        Of a run in motion at its start the first rows are judged with its own initial terms, as a whole run is.
+        Initial terms are those of the estimation data of the same run.
+
+        For a run with nonzero initial conditions the first block has initial terms of its own, as a whole run has.
         """
         outputs = model.outputs
         if self.rows is None:
@@ -76,7 +78,7 @@ class Fold:
 
 
 def masked(run: Run, outputs: Sequence[str], rows: tuple[int, int]) -> Run:
-    """A run whose outputs were not read in some rows."""
+    """Return a run with missing output samples in a range of rows."""
     signals = {n: np.array(run[n]) for n in run.outputs}
     for name in outputs:
         signals[name][rows[0] : rows[1]] = np.nan
@@ -93,16 +95,16 @@ def masked(run: Run, outputs: Sequence[str], rows: tuple[int, int]) -> Run:
 
 @dataclass(frozen=True)
 class Folds:
-    """What candidates are fitted on and what they are judged on.
+    """Estimation and validation data of all candidates.
 
     Parameters
     ----------
     runs
-        What numbers are finally estimated from.
+        Runs of the final estimate.
     parts
-        Folds; what one judges, it does not fit to.
-    words
-        How, in words.
+        Folds; the validation data of a fold are excluded from its fit.
+    description
+        Description of the validation.
     """
 
     runs: tuple[Run, ...]
@@ -111,12 +113,12 @@ class Folds:
 
     @classmethod
     def of(cls, runs: Run | Sequence[Run], validation: str | Run | Sequence[Run]) -> Folds:
-        """Leave one run out, leave one block of a run out, or runs of their own.
+        """Build folds by leaving out runs, leaving out blocks, or from separate validation runs.
 
         Raises
         ------
         ModelError
-            Words that are not known, one run where several are needed, or a validation run that is fitted to.
+            An unknown option, one run where several are needed, or a validation run that is an estimation run.
         DataError
             Runs that do not fit together, or that are too short to be cut.
         """
@@ -151,13 +153,13 @@ class Folds:
 
 
 def _same(one: Run, other: Run) -> bool:
-    """Whether two runs hold the same samples."""
+    """Whether two runs have the same samples."""
     names = one.signals
     return one.length == other.length and all(np.array_equal(one[n], other[n], equal_nan=True) for n in names)
 
 
 def blocks(run: Run) -> list[tuple[int, int]]:
-    """Rows of as many blocks of nearly the same length."""
+    """Return row ranges of blocks of nearly equal length."""
     if run.length < LEAST_BLOCK * BLOCKS:
         raise DataError(
             f"{run.name} has {run.length} rows, too few to be cut into {BLOCKS} blocks; give validation= another run"
@@ -167,37 +169,37 @@ def blocks(run: Run) -> list[tuple[int, int]]:
 
 @dataclass(frozen=True)
 class Trial:
-    """A candidate and what became of it.
+    """A candidate structure with its fit and its validation.
 
     Parameters
     ----------
     name
-        The candidate in words.
+        Description of the candidate.
     structure
-        It.
-    numbers
-        How many numbers were estimated: orders, coefficients, numbers of inputs, and an offset of each run.
+        Structure of the candidate.
+    parameters
+        Number of estimated parameters: orders, coefficients, input parameters, and an offset of each run.
     estimation
-        Fit in percent on what it was fitted to, by output.
+        Fit in percent on estimation data, by output.
     validation
-        Fit in percent on each run or block that it was not fitted to, by output.
+        Fit in percent on each validation run or block, by output.
     scores
         ln(1 - fit / 100) of each, outputs of one after another; lower is better.
     bic
-        Schwarz's criterion of the residuals' squares, samples counted as their colour lets them; None before it is
-        known how coloured the best residuals are.
+        Schwarz's criterion of the residual sum of squares, with an effective number of samples for correlated
+        residuals; None before the correlation of the best residuals is known.
     values, errors
         Estimates and standard errors on all runs, by name.
-    idle
-        Numbers whose 95 % interval holds the value at which they do nothing: 0 for a coefficient.
-    grows
-        Whether it has a pole with a positive real part: within a run the inputs may hide what it does, later nothing.
+    insignificant
+        Coefficients whose 95 % interval contains 0.
+    unstable
+        Whether the model has a pole with a positive real part. Inputs may hide the instability within a run.
     failed
-        Why there are no figures; None where there are.
+        Reason of a failed fit; None for a valid trial.
     joint
-        The fit on all runs.
-    fine
-        Whether its grid was refined until it no longer mattered.
+        Fit on all runs.
+    refined
+        Whether the grid was refined until converged.
     """
 
     name: str
@@ -217,41 +219,41 @@ class Trial:
 
     @property
     def score(self) -> float:
-        """Mean of the scores; infinite where there are none."""
+        """Mean of the scores; infinite without scores."""
         return float(np.mean(self.scores)) if self.scores else math.inf
 
     @property
     def unseen(self) -> float:
-        """Mean fit in percent on what it was not fitted to."""
+        """Mean fit in percent on validation data."""
         fits = [v for part in self.validation.values() for v in part.values()]
         return float(np.mean(fits)) if fits else math.nan
 
     @property
     def parts(self) -> dict[str, float]:
-        """Fit in percent on each part that was left out, in words, one after another as scores are."""
+        """Fit in percent on each part of the validation data by name, in the order of the scores."""
         return {f"{output} of {name}": fit for name, part in self.validation.items() for output, fit in part.items()}
 
     @property
     def least(self) -> float:
-        """The least fit in percent on what it was not fitted to."""
+        """Worst fit in percent on validation data."""
         return min(self.parts.values(), default=math.nan)
 
     @property
     def looseness(self) -> float:
-        """Mean logarithm of the relative standard errors of its numbers; lower is better told."""
+        """Mean log relative standard error of the parameters; lower is better."""
         relative = [self.errors.get(n, math.inf) / max(abs(v), 1e-12) for n, v in self.values.items()]
         return float(np.mean([math.log(min(max(r, 1e-12), 1e12)) for r in relative])) if relative else 0.0
 
     @property
     def seen(self) -> float:
-        """Mean fit in percent on what it was fitted to."""
+        """Mean fit in percent on estimation data."""
         return float(np.mean(list(self.estimation.values()))) if self.estimation else math.nan
 
 
 def decided(structure: Structure, runs: Sequence[Run]) -> Structure:
-    """The structure with initial terms of one kind for whole and for fractional orders: none from rest, else Caputo's.
+    """Return the structure with fixed initial conditions: none from rest, else Caputo's for any orders.
 
-    A history of more terms the more orders are free would let a richer candidate fit what no model says.
+    A history has more terms the more orders are free, so a richer candidate could fit more than its model explains.
     """
     if structure.initial != "auto":
         return structure
@@ -267,12 +269,12 @@ def fit(
     refine: bool = True,
     near: JointFit | None = None,
 ) -> JointFit:
-    """The lowest of the fits from some starts, or from an automatic start where there are none.
+    """Return the best of the fits from some initial guesses, or from an automatic initialization without any.
 
-    Where there is a fit of this structure to nearly these runs, it goes on from there.
+    A fit of this structure to nearly the same runs (`near`) is used as a warm start.
 
-    Friction that no start knows may have no descent from 0 to where it is: automatic starts stand beside the given
-    ones, in which it is 0.
+    Friction missing in the initial guesses may have no descent direction at 0. Automatic initial guesses are then added
+    to the given ones, in which it is 0.
     """
     asked = decided(structure, runs)
     if near is not None:
@@ -296,12 +298,12 @@ def fit(
 
 
 def power(joint: JointFit) -> float:
-    """What a fit leaves over: mean over outputs of ln of the residuals' mean square, weighted by nothing."""
+    """Mean over outputs of ln of the mean square residual, unweighted."""
     return float(np.mean([2.0 * math.log(max(v, 1e-300)) for v in joint.noise.values()]))
 
 
 def model_of(structure: Structure, joint: JointFit, runs: Sequence[Run]) -> Model:
-    """A fit as a model."""
+    """Return a fit as a model."""
     problem = FreeProblem.of(replace(structure, initial=joint.initial))
     numbers = problem.named(list(joint.coefficients.values()))
     made = decided(structure, runs).with_orders(joint.orders).with_coefficients(numbers).with_inputs(joint.inputs)
@@ -309,7 +311,7 @@ def model_of(structure: Structure, joint: JointFit, runs: Sequence[Run]) -> Mode
 
 
 def judged(name: str, structure: Structure, folds: Folds, joint: JointFit, *, fine: bool = False) -> Trial:
-    """A candidate fitted on all runs, fitted anew for each fold from there, and judged on what was left out."""
+    """Refit a candidate on each fold from its fit on all runs, and evaluate it on the validation data."""
     model = model_of(structure, joint, folds.runs)
     estimation = compare(model, list(folds.runs)).fit_percent
     grows = not structure.has_friction and model.stability(coupling=structure.coupling).unstable_poles > 0
@@ -344,10 +346,11 @@ def judged(name: str, structure: Structure, folds: Folds, joint: JointFit, *, fi
 
 
 def least_unseen(joint: JointFit, folds: Folds) -> float:
-    """What a candidate leaves over on what it was not fitted to at least, as its score; -infinity where nothing tells.
+    """Lower bound of the score on validation data from the fit on all runs; -infinity if there is none.
 
-    A fit without a fold leaves no less on all runs than the fit on all of them, and no more on the rest: so it leaves
-    no less on that fold. Of several outputs that holds of the sum of their weighted squares, not of each.
+    A fit without a fold has at least the residual of the full fit on all runs, and at most its residual on the rest. So
+    it has at least the residual of the full fit on that fold. For several outputs this holds for the weighted sum of
+    squares, not for each output.
     """
     if not joint.converged:
         return -math.inf
@@ -374,7 +377,7 @@ def least_unseen(joint: JointFit, folds: Folds) -> float:
 
 
 def refined(trial: Trial, folds: Folds, joint: JointFit) -> Trial:
-    """A candidate with a fit on all runs on grids so fine that its numbers no longer depend on them."""
+    """Return a trial with a fit on all runs on grids refined until converged."""
     estimation = compare(model_of(trial.structure, joint, folds.runs), list(folds.runs)).fit_percent
     return replace(
         trial,
@@ -388,24 +391,24 @@ def refined(trial: Trial, folds: Folds, joint: JointFit) -> Trial:
 
 
 def idle(joint: JointFit) -> tuple[str, ...]:
-    """Coefficients that the runs do not tell from 0."""
+    """Coefficients that do not differ significantly from 0."""
     intervals = joint.intervals
     return tuple(n for n in joint.coefficients if intervals[n][0] <= 0.0 <= intervals[n][1])
 
 
 def numbers_of(structure: Structure, joint: JointFit, folds: Folds) -> int:
-    """Numbers that were estimated."""
+    """Number of estimated parameters."""
     each = {"none": 0, "auto": 0, "constant": 1, "ramp": 2}[structure.offset]
     return len(joint.names) + each * len(structure.equations) * len(folds.runs)
 
 
 def spread(joint: JointFit) -> float:
-    """How much more sums of the residuals scatter than those of white noise."""
+    """Largest ratio of the variance of sums of residuals to that of white noise, at least 1."""
     return max([1.0, *(colour(read(e)) for part in joint.residuals for e in part.values())])
 
 
 def criterion(joint: JointFit, numbers: int, scatter: float) -> float:
-    """Schwarz's criterion where `scatter` samples tell as much as one; doi:10.1214/aos/1176344136."""
+    """Schwarz's criterion with `scatter` samples per effective sample; doi:10.1214/aos/1176344136."""
     samples = joint.samples / scatter
     each = samples / max(len(joint.noise), 1)
     return sum(each * 2.0 * math.log(max(v, 1e-300)) for v in joint.noise.values()) + numbers * math.log(samples)

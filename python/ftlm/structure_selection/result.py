@@ -1,4 +1,4 @@
-"""What a selection found: candidates ranked, the chosen one, and why."""
+"""Result of a structure selection: ranked candidates, the chosen one, and the reason."""
 
 from __future__ import annotations
 
@@ -15,33 +15,33 @@ from ftlm.utils.files import to_frame
 from ftlm.utils.formatting import Cell
 from ftlm.validation.comparison import finite
 
-#: Rows that are printed, and a fit [%] below which one is as bad as another.
+#: Maximum number of printed rows, and the fit [%] below which values are not distinguished.
 SHOWN, HOPELESS = 12, -1000.0
-#: Said of a candidate whose free run grows.
+#: Note on an unstable candidate.
 GROWS = " (grows without bound)"
 
 
 @dataclass(frozen=True)
 class Selection(Reported):
-    """Candidates tried on runs, the chosen one, and the reason.
+    """Candidates evaluated on runs, the chosen one, and the reason.
 
     Parameters
     ----------
     trials
-        Every candidate that was judged, by how well it predicts what it was not fitted to; those that fail on a part of
-        it on which another one does not come after, those that cannot be fitted last.
+        Every validated candidate, best prediction of the validation data first. Candidates that fail on a part on
+        which another one does not come later, those without a fit last.
     chosen
-        Which of them was chosen.
+        Index of the chosen one.
     best
-        The chosen structure identified on all runs, from automatic starts as well.
+        Identification of the chosen structure on all runs, also from automatic initial guesses.
     validation
-        How candidates were judged, in words.
+        Description of the validation.
     reason
-        Why this one, in words.
+        Reason of the choice.
     fitted
-        How many candidates were fitted in all; of each step of a growth only the most promising are judged.
+        Total number of fitted candidates. Only the most promising ones of each step are validated.
     warnings
-        What speaks against the choice.
+        Findings against the choice.
     """
 
     trials: tuple[Trial, ...]
@@ -69,7 +69,7 @@ class Selection(Reported):
         return out
 
     def table(self) -> Table:
-        """Candidates as a table of a page."""
+        """Return the candidates as a table of a page."""
         columns = (
             "structure",
             "numbers",
@@ -89,7 +89,7 @@ class Selection(Reported):
         )
 
     def figure(self) -> Figure:
-        """Fit where fitted and where unseen of the best candidate with each number of estimates."""
+        """Chart estimation and validation fit of the best candidate with each number of parameters."""
         best: dict[int, Trial] = {}
         for trial in (t for t in self.trials if t.failed is None):
             if trial.numbers not in best or trial.score < best[trial.numbers].score:
@@ -121,7 +121,7 @@ class Selection(Reported):
         return Page("Selection of a structure", sections, self.winner.name)
 
     def to_frame(self) -> Any:
-        """Candidates as a pandas frame by rank."""
+        """Return the candidates as a pandas frame, by rank."""
         rows = [
             {
                 "rank": k + 1,
@@ -181,7 +181,7 @@ class Selection(Reported):
 
 
 def _row(trial: Trial) -> str:
-    """A candidate in a line."""
+    """Text line of a candidate."""
     if trial.failed is not None:
         return f"{'-':>9}{'-':>9}{'-':>10}{trial.numbers:>9}  {trial.name}: {trial.failed}"
     told = trial.name + (GROWS if trial.grows else "")
@@ -189,5 +189,5 @@ def _row(trial: Trial) -> str:
 
 
 def percent(fit: float) -> str:
-    """A fit as a table has it: how far below nothing one is that predicts nothing, nobody needs to know."""
+    """Format a fit; values below the minimum are not distinguished."""
     return f"{fit:.2f}" if not fit < HOPELESS else f"< {HOPELESS:.0f}"

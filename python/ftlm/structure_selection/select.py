@@ -1,4 +1,4 @@
-"""Structures that are asked for in no words: one output, any inputs, whole orders first."""
+"""Automatic candidate structures: one output, any inputs, integer orders first."""
 
 from __future__ import annotations
 
@@ -23,15 +23,16 @@ from ftlm.structure_selection.cross_validation import Folds, Trial, criterion, s
 from ftlm.structure_selection.result import Selection, percent
 from ftlm.structure_selection.stepwise import MOST_ALIKE, SAME, Work, grown, listed
 
-#: Highest whole orders that are tried.
+#: Integer values of the highest order of the candidates.
 ORDERS = (1, 2, 3, 4)
 
 
 def automatic(runs: Sequence[Run], output: str | None = None) -> list[Structure]:
-    """Equations of one output driven by every input, of each whole order, to be grown and pruned.
+    """Return equations of one output with every input as an upper bound for the selection, one for each integer order.
 
-    Each has all own derivatives below its order and each input; the highest order and those of one own term and of one
-    input may become free. A measured input (``"foh"``) may be differentiated, a command that holds may not.
+    Each has all derivatives of the output below its order and each input. The highest order and those of one own term
+    and of one input may become free. A measured input (``"foh"``) may be differentiated, a zero-order-hold command may
+    not.
 
     Raises
     ------
@@ -62,19 +63,19 @@ def automatic(runs: Sequence[Run], output: str | None = None) -> list[Structure]
 
 
 def _reach(run: Run, name: str, order: int) -> tuple[float, float, float]:
-    """Orders at which an input may enter."""
+    """Range (low, high, increment) of the order of an input."""
     return (0.0, float(order) if run.intersample[name] == "foh" else max(order - 1.0, 0.05), 0.05)
 
 
-#: Schwarz criteria closer than this tell nothing; doi:10.1080/01621459.1995.10476572.
+#: Difference of Schwarz criteria that is not significant; doi:10.1080/01621459.1995.10476572.
 ALIKE = 2.0
 #: Difference of Schwarz criteria that is very strong evidence; the same source.
 STRONG = 10.0
-#: Folds from which on the scatter over them says something, and one-sided 95 % quantiles of Student's t from there on.
+#: Minimum number of folds for a test on their scatter, and one-sided 95 % quantiles of Student's t from there on.
 FOLDS, STUDENT_95 = 3, (2.92, 2.35, 2.13, 2.02, 1.94, 1.89, 1.86, 1.83, 1.81)
-#: What one leaves over of a part that it fails on, as a score, if it is that much more than another leaves there.
+#: Score above which a candidate fails on a part, if it also exceeds the best score there by the second value.
 FAILS, OUTDONE = math.log(0.5), math.log(2.0)
-#: Candidates of a list beyond which somebody has made a mistake.
+#: Maximum number of listed candidates.
 MOST = 10_000
 
 
@@ -87,36 +88,38 @@ def select(
     progress: Callable[[int, int], None] | None = None,
     store: str | os.PathLike[str] | None = None,
 ) -> Selection:
-    """Choose the terms and orders that earn their place on runs that they were not fitted to.
+    """Choose the terms and orders that improve the prediction of validation data significantly.
 
-    A structure is grown: from the simplest one inside it (whole orders, the output's own terms, one thing that drives),
-    a term, a free order, a delay, friction or an offset more at a time, each fitted by output error from the last
-    optimum, the two most promising by Schwarz's criterion judged by free runs on what they were not fitted to (the
-    second where what it leaves over on all runs lets it matter). Where two steps in a row predict no better, it is
-    pruned, one thing less at a time. A list is judged whole, from automatic starts. None is chosen that fails on a run
-    or a block (it leaves more than half of it, and twice what another one leaves) where one fails on fewer. Chosen is,
-    among those that predict as well as the best (what is left over is within 1 %, or, up to 5 %, three or more folds do
-    not tell the difference from 0 at 95 %, or all samples are very strong evidence), the one with the least Schwarz
-    criterion, samples counted as the colour of the residuals lets them; of those alike in that the one with the fewest
-    numbers, of the lowest order, best where unseen.
+    The given structure is an upper bound. Forward selection starts from the simplest nested structure (integer orders,
+    own terms of the output, one input term) and adds one term, free order, delay, friction or offset at a time. Each
+    candidate is fitted by output error from the previous optimum. The two best by Schwarz's criterion are simulated on
+    the validation data (the second only if its residual on all runs leaves it a chance). After two steps without
+    improvement, backward elimination removes one thing at a time. Listed structures are all validated, from automatic
+    initial guesses.
+
+    A candidate fails on a run or a block if its residual is more than half of the output and twice that of another one.
+    Candidates with the fewest failures are eligible. Of those that predict as well as the best, the one with the least
+    Schwarz criterion is chosen, with samples counted by the autocorrelation of the residuals. Prediction is as good if
+    the residual is within 1 %, or within 5 % if the difference over three or more folds is not significant at 95 % or
+    all samples are very strong evidence. Ties are broken by fewer parameters, lower order, and better prediction.
 
     Parameters
     ----------
     runs
         One run or several with the same names and units.
     candidates
-        A structure, whose inside is searched; several structures, by name or by their equations; or ``"auto"``: one
-        output, every input, whole orders 1 to 4 and the fractional ones that earn their place.
+        A structure, whose nested structures are searched; several structures, by name or by their equations; or
+        ``"auto"``: one output, every input, integer orders 1 to 4 and fractional ones that improve the score.
     validation
-        ``"runs"``: each run is judged by a fit on the others, the default where there are several; ``"blocks"``: each
-        quarter of every run by a fit on the rest, the default for one run; or runs that are fitted to by nobody.
+        ``"runs"``: each run is predicted by a fit on the others, the default for several runs. ``"blocks"``: each
+        quarter of every run by a fit on the rest, the default for one run. Or separate validation runs.
     threads
-        Candidates at a time, by default all cores; the result does not depend on it.
+        Number of candidates fitted concurrently, by default all cores; the result does not depend on it.
     progress
         Called with (candidates fitted, candidates known of so far).
     store
-        File that keeps every fit as it ends: the same call with the same file goes on where it was stopped, with
-        Ctrl-C or by the machine, and comes to the same bits.
+        Checkpoint file with every finished fit. The same call with the same file resumes an interrupted selection and
+        gives the same bits.
 
     Returns
     -------
@@ -129,20 +132,20 @@ def select(
         Runs that do not fit together or the structure, that are too short to be cut, or that excite nothing; a store
         of another selection, in use, damaged, or that cannot be written.
     ModelError
-        No candidates, two that are the same but for the names of their numbers, more than 10 000, no validation run,
-        words that are not known, one run where several are needed, a validation run that is fitted to.
+        No candidates, two that differ in parameter names only, more than 10 000, no validation run, an unknown option,
+        one run where several are needed, a validation run that is also an estimation run.
     ConvergenceError
         No candidate that can be fitted.
 
     Notes
     -----
-    Initial terms are those of whole orders (none from rest, else level and velocity, Caputo's) unless the structure
-    says otherwise: with a history, which has more terms the more orders are free, candidates could not be compared.
-    Growth costs one fit for each thing that may be added, at each step; of records of more than some 1800 samples every
-    one of these is looked at on thinned samples first, and those far behind are not fitted. Where three or more terms
-    drive one equation and whole runs judge, every subset of them at whole orders is fitted and judged in closed form
-    first, on a lattice of the own coefficients, and growth begins with the best. Of a list of more than 200 candidates
-    a ``UserWarning`` says, after the first ones, how long the rest takes.
+    Initial terms are those of integer orders (none from rest, else level and velocity, Caputo's) unless the structure
+    states otherwise. A history has more terms the more orders are free, so candidates could not be compared. Forward
+    selection costs one fit for each possible addition, at each step. For records of more than about 1800 samples the
+    candidates are prescreened on subsampled records, and only survivors are fitted. With three or more input terms in
+    one equation and validation on whole runs, every subset at integer orders is first scored in closed form on a grid
+    of the own coefficients, and selection starts from the best. For a list of more than 200 candidates a
+    ``UserWarning`` estimates the remaining time after the first ones.
     """
     # Checked here as identify checks it: threads is a whole number, at least 1.
     workers = Settings.check(coefficients="least-squares", threads=threads).threads
@@ -180,7 +183,7 @@ def select(
 
 
 def _found(work: Work, searched: Sequence[Structure], every: Mapping[str, Structure]) -> Selection:
-    """What structures grown inside some, and those of a list, come to."""
+    """Evaluate nested and listed structures, and choose."""
     for structure in searched:
         grown(Inside(structure), work)
     if every:
@@ -189,7 +192,7 @@ def _found(work: Work, searched: Sequence[Structure], every: Mapping[str, Struct
 
 
 def _chosen(work: Work, folds: Folds) -> Selection:
-    """Rank what was judged, choose, and identify the choice."""
+    """Rank the trials, choose one, and identify its structure."""
     there = [t for t in work.trials if t.joint is not None]
     if not there:
         why = next((f"; {t.name}: {t.failed}" for t in work.trials), "")
@@ -238,7 +241,7 @@ def _chosen(work: Work, folds: Folds) -> Selection:
 
 
 def _failures(every: Sequence[Trial]) -> list[list[str]]:
-    """Parts that each predicts badly and another one, that does not grow, leaves far less of."""
+    """Parts that each trial predicts badly and another, stable one predicts far better."""
     left = [dict(zip(t.parts, t.scores, strict=False)) for t in every]
     least: dict[str, float] = {}
     for scores in (part for part, t in zip(left, every, strict=True) if not t.grows):
@@ -248,16 +251,16 @@ def _failures(every: Sequence[Trial]) -> list[list[str]]:
 
 
 def _ranked(every: Sequence[Trial]) -> list[Trial]:
-    """The best first: what fails nowhere, then by what is left over on the mean.
+    """Sort trials, best first: fewest failures, then the mean score.
 
-    A mean of logarithms makes good on three blocks what is lost on the fourth, and a user cannot.
+    A mean of logarithms offsets a failure on one block by good fits on the others, which a user cannot.
     """
     failures = dict(zip(map(id, every), map(len, _failures(every)), strict=True))
     return sorted(every, key=lambda t: (t.failed is not None, t.grows, failures[id(t)], t.score, t.numbers, t.name))
 
 
 def _peers(ranked: Sequence[Trial]) -> list[int]:
-    """Places of those that grow, and fail, no more than the best does."""
+    """Indices of trials that are no less stable, and fail no more often, than the best."""
     best, failures = ranked[0], [len(f) for f in _failures(ranked)]
     return [
         k for k, t in enumerate(ranked) if t.failed is None and t.grows == best.grows and failures[k] <= failures[0]
@@ -265,11 +268,12 @@ def _peers(ranked: Sequence[Trial]) -> list[int]:
 
 
 def _as_good(trial: Trial, best: Trial) -> bool:
-    """Whether a candidate predicts like the best: within 1 %, or up to 5 % if folds do not tell the difference from 0.
+    """Whether a trial predicts like the best: within 1 %, or up to 5 % if the difference over folds is not significant.
 
-    The best is the luckiest of many: a single standard error would refuse a true structure for it in one case of ten.
-    Where one block alone says what the others cannot, leaving it out costs the truth far more than 5 %: very strong
-    evidence on all samples lets it stand beside. So it does, within 5 %, where folds are too few to tell a scatter.
+    The best is a maximum over many candidates, so one standard error would reject a true structure in one case of ten.
+    If one block contains information that the others lack, omitting it costs the true structure far more than 5 %: very
+    strong evidence on all samples keeps it eligible. It does so within 5 % if there are too few folds to estimate a
+    scatter.
     """
     apart = np.array(trial.scores) - np.array(best.scores)
     far, likely = trial.score - best.score, _bic(trial) <= _bic(best) - STRONG
@@ -281,9 +285,9 @@ def _as_good(trial: Trial, best: Trial) -> bool:
 
 
 def _winner(near: Sequence[Trial]) -> Trial:
-    """Of those that predict alike, the one with the least criterion; of those alike in that, the best where unseen.
+    """Return the trial with the least criterion of those that predict equally; ties go to fewer parameters.
 
-    From rest an equation differentiated throughout is the same equation: of these it is the one of the lowest order.
+    From rest an equation differentiated throughout is the same equation, so the lowest order wins.
     """
     least = min(_bic(t) for t in near)
     alike = [t for t in near if _bic(t) <= least + ALIKE]
@@ -291,7 +295,7 @@ def _winner(near: Sequence[Trial]) -> Trial:
 
 
 def _whole_order(trial: Trial) -> int:
-    """The highest orders to the next whole number, all equations together."""
+    """Sum over equations of the highest order rounded to an integer."""
     return sum(round(e.order.partly(trial.values).constant) for e in trial.structure.equations)
 
 
@@ -300,9 +304,9 @@ def _bic(trial: Trial) -> float:
 
 
 def _as_judged(trial: Trial, folds: Folds) -> Structure:
-    """The structure with the initial terms that it was judged with.
+    """Return the structure with the initial terms of its validation.
 
-    From rest none are needed, and none are forbidden: what it is told of next may be a run in motion.
+    From rest no initial terms are needed, but they stay allowed: a later run may have nonzero initial conditions.
     """
     if trial.joint is None or (trial.structure.initial == "auto" and trial.joint.initial == "rest"):
         return trial.structure
@@ -310,7 +314,7 @@ def _as_judged(trial: Trial, folds: Folds) -> Structure:
 
 
 def _reason(winner: Trial, best: Trial, ranked: Sequence[Trial]) -> str:
-    """Why the winner is the winner."""
+    """Describe why the winner was chosen."""
     lead = f"Chosen: {winner.name} ({winner.numbers} numbers, {percent(winner.unseen)} % where unseen)"
     peers = [ranked[k] for k in _peers(ranked)]
     if winner is best:
@@ -336,7 +340,7 @@ def _reason(winner: Trial, best: Trial, ranked: Sequence[Trial]) -> str:
 
 
 def _failing(winner: Trial, ranked: Sequence[Trial]) -> str:
-    """Which candidate predicts better on the mean and fails somewhere, and where the winner itself does, in words."""
+    """Describe better candidates that fail on a part, and failures of the winner."""
     failures = dict(zip(map(id, ranked), _failures(ranked), strict=True))
     told = ""
     ahead = [t for t in ranked if failures[id(t)] and t.score < winner.score and t.grows == winner.grows]

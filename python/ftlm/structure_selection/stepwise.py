@@ -1,4 +1,4 @@
-"""Candidates of one step looked at on thinned samples, so that long records are fitted by those alone that may lead."""
+"""Prescreening of candidates on subsampled records; only survivors are fitted on all samples."""
 
 from __future__ import annotations
 
@@ -33,29 +33,29 @@ from ftlm.structure_selection.cross_validation import (
 )
 from ftlm.utils.resources import pool
 
-#: Samples of the thinned records, and evaluations of a descent on them: those of a race of starts whose best go on; by
-#: how much more than the best one leaves others are out of it.
+#: Number of samples of the subsampled records, maximum number of evaluations of an optimization on them (the budget of
+#: a rung of the multistart), and ratio to the lowest cost above which a candidate is excluded.
 COARSE_SAMPLES, SECOND_LAP, CONTENDER = 1200, 60, 3.0
 
 Item = TypeVar("Item")
 MadeGlance = TypeVar("MadeGlance")
-#: A structure and where it starts.
+#: A structure and its initial guesses.
 Start = tuple[Structure, Sequence[Mapping[str, float]]]
 
 
 class Pool(Protocol):
-    """What does work for items in their order."""
+    """Pool that maps a function over items, in their order."""
 
     def quietly(self, work: Callable[[Item], MadeGlance], items: Sequence[Item]) -> list[MadeGlance]:
-        """Work done for each item."""
+        """Return the results for the items, in their order."""
 
 
 def contenders(runs: Sequence[Run], starts: Sequence[Start], least: int, pool: Pool) -> list[int]:
-    """Places of the structures that are fitted on all samples, in their order.
+    """Return indices of the structures to fit on all samples, in their order.
 
-    Left out are those whose descents on thinned samples, as many evaluations as those ahead in a race of starts have,
-    leave more than the best by the factor that ends such a race; never so many that fewer than `least` are left. Of
-    records that are not thinned, and of bodies that may stick, none is.
+    A structure is excluded if its cost on subsampled records, with the budget of a rung of the multistart, exceeds the
+    lowest cost by the factor of the multistart. At least `least` structures remain. Records too short for subsampling
+    and structures with friction are not prescreened.
     """
     every = list(range(len(starts)))
     decimation = max(1, round(min(run.length - 1 for run in runs) / COARSE_SAMPLES))
@@ -77,7 +77,7 @@ def contenders(runs: Sequence[Run], starts: Sequence[Start], least: int, pool: P
 
 
 def _level(runs: Sequence[Run], structure: Structure, points: Sequence[Mapping[str, float]], decimation: int) -> float:
-    """The least that descents from some points leave on thinned samples, every output weighing alike."""
+    """Lowest cost of optimizations from some initial guesses on subsampled records, outputs weighted equally."""
     problem = FreeProblem.of(structure)
     grid = Grid(
         problem, runs, [1.0 / (COARSE_SHARE * size) for size in output_sizes(runs, structure)], decimation=decimation
@@ -93,45 +93,45 @@ def _level(runs: Sequence[Run], structure: Structure, points: Sequence[Mapping[s
 
 
 Made = TypeVar("Made")
-#: Where an order that becomes free starts besides its whole value.
+#: Initial guesses of an order that becomes free, relative to its integer value.
 SHIFTS = (0.0, -0.4, 0.4)
-#: Where a free number of an input starts, as shares of its interval.
+#: Initial guesses of a free input parameter, as fractions of its interval.
 SHARES = (0.1, 0.3, 0.6, 0.9)
-#: Steps in a row that predict no better, after which growth ends.
+#: Number of consecutive steps without a better prediction at which forward selection terminates.
 PATIENCE = 2
-#: Prediction is better where what is left over falls by more than this share.
+#: Relative decrease of the validation residual that counts as a better prediction.
 BETTER = 0.005
-#: Two predictions are alike where what they leave over differs by no more than this share.
+#: Relative difference of validation residuals up to which two predictions count as equal.
 SAME = 0.01
-#: The most that counts as alike, whatever the scatter.
+#: Upper limit of that difference, for any scatter over folds.
 MOST_ALIKE = 0.05
-#: Subsets that were screened are fitted where what they leave over is within this share of the best's, at most so many,
-#: and the best of each number of terms.
+#: Screened subsets are fitted if their residual is within this relative margin of the best one, up to this number. The
+#: best subset of each size is fitted in addition.
 NEAR, LEADING = 0.03, 8
-#: Candidates of a list from which on the time that they take is estimated first.
+#: Number of listed candidates above which the total time is estimated first.
 MANY = 200
-#: ln of the multiple of the best's residuals beyond which no root of an equation that keeps its terms is grown.
+#: Score gap to the best initial structure above which one is not extended, for equations without optional terms.
 DOMINATED = math.log(2.0)
-#: Changes of a step that are judged on unseen runs: the best by criterion.
+#: Number of changes per step, best by criterion, that are evaluated on validation data.
 JUDGED = 2
 
 
 @dataclass
 class Work:
-    """How candidates are tried, and who is told.
+    """Evaluation of candidates, and its progress callback.
 
     Parameters
     ----------
     folds
-        What they are fitted on and judged on.
+        Estimation and validation data.
     threads
-        Candidates at a time; what comes out does not depend on it.
+        Number of candidates evaluated concurrently; the result does not depend on it.
     progress
-        Called with (candidates fitted, candidates known of so far).
+        Called with (candidates fitted, candidates so far).
     clock
-        Seconds that pass.
+        Clock in seconds.
     store
-        What is already known of it, and what is kept of each step.
+        Checkpoint file with the results of each step.
     """
 
     folds: Folds
@@ -144,12 +144,12 @@ class Work:
     trials: list[Trial] = field(default_factory=list)
 
     def each(self, work: Callable[[Item], Made], items: Sequence[Item]) -> list[Made]:
-        """Work done for each item, in their order, and told."""
+        """Return the results for candidates, in their order, with progress reports."""
         self.known += len(items)
         return self._in_order(work, items, self._told)
 
     def quietly(self, work: Callable[[Item], Made], items: Sequence[Item]) -> list[Made]:
-        """The same of work that is no candidate's fit."""
+        """Return the results for items, in their order, without progress reports."""
         return self._in_order(work, items, lambda: None)
 
     def _told(self) -> None:
@@ -166,7 +166,7 @@ class Work:
         return out
 
     def judge(self, name: str, structure: Structure, joint: JointFit | FtlmError, *, fine: bool = False) -> Trial:
-        """A fitted candidate on what it never saw."""
+        """Evaluate a fitted candidate on validation data."""
         if isinstance(joint, FtlmError):
             return Trial(name, structure, len(FreeProblem.of(structure).names), failed=str(joint))
 
@@ -179,7 +179,7 @@ class Work:
         return compute() if self.store is None else self.store.judgement(name, structure, joint, fine, compute)
 
     def refined(self, trial: Trial) -> Trial:
-        """A candidate whose numbers do not depend on the step of the grid."""
+        """Return a candidate refitted until its parameters are independent of the step of the grid."""
         if trial.fine:
             return trial
         joint = self.fitted(trial.structure, [trial.values])
@@ -192,7 +192,7 @@ class Work:
     def fitted(
         self, structure: Structure, starts: Sequence[Mapping[str, float]], *, refine: bool = True
     ) -> JointFit | FtlmError:
-        """A fit on all runs, or why there is none."""
+        """Fit a candidate on all runs; return the error if the fit fails."""
 
         def compute() -> JointFit | FtlmError:
             try:
@@ -203,7 +203,7 @@ class Work:
         return compute() if self.store is None else self.store.fit(structure, starts, refine, compute)
 
     def screened(self, inside: Inside) -> list[Screened]:
-        """Every subset of what drives, best first."""
+        """Return every subset of input terms, best first."""
 
         def compute() -> list[Screened]:
             return screened(inside, self.folds, self)
@@ -223,9 +223,9 @@ class Fitted:
 def starts_from(
     structure: Structure, values: Mapping[str, float], whole: Mapping[str, float]
 ) -> list[dict[str, float]]:
-    """Where a structure starts that has what `values` knows, orders that were `whole`, and coefficients that were 0.
+    """Return initial guesses from known `values`, orders that were `whole`, and coefficients that were 0.
 
-    Friction that `values` does not know is in none of them.
+    Friction missing in `values` is missing in the initial guesses.
     """
     problem = FreeProblem.of(structure)
     usual: dict[str, list[float]] = {}
@@ -240,12 +240,13 @@ def starts_from(
 
 
 def grown(inside: Inside, work: Work) -> list[Trial]:
-    """Candidates on the way from the simplest structures up, and down again, each judged; in the order tried.
+    """Select structures stepwise from the simplest ones upwards, then downwards; return all validated trials in order.
 
-    Each whole value of the highest orders is a root of its own: what is best among the simplest need not be what the
-    best grows from. Where several signals drive, one may stand for all the others: the best is also come to from above,
-    from everything at whole orders, one thing less at a time. Where so many signals drive that subsets can be screened,
-    growth begins with the best of them all; where no term may be left out, everything free is a root beside.
+    Each integer value of the highest orders is an initial structure of its own: the best of the simplest structures
+    need not be nested in the best one. With several inputs, one may act as a proxy for the others, so the best
+    structure is also approached from the full structure at integer orders by backward elimination. If there are enough
+    input terms for best-subset screening, selection starts from the best subset. If no term is optional, the structure
+    with all orders free is a second initial structure.
     """
     subsets = work.screened(inside)
     found = _from_subsets(inside, work, subsets)
@@ -276,7 +277,7 @@ def grown(inside: Inside, work: Work) -> list[Trial]:
 
 
 def _finished(inside: Inside, work: Work, ends: Sequence[tuple[Trial, Fitted]], tried: set[str]) -> list[Trial]:
-    """What is as good as the best, and what is left of it when one thing after another is taken away."""
+    """Eliminate terms backward from each forward-selection result that is as good as the best."""
     least = min(_rank(trial) for trial, _ in ends)
     for trial, at in ends:
         if (trial.grows, trial.score) <= (least[0], least[1] + SAME):
@@ -285,9 +286,9 @@ def _finished(inside: Inside, work: Work, ends: Sequence[tuple[Trial, Fitted]], 
 
 
 def _from_everything(inside: Inside, work: Work) -> list[Trial]:
-    """Equations that keep their terms, under a law or coupled: from the whole orders up, and from all orders free down.
+    """Select from integer orders upwards, and from all orders free downwards, for equations without optional terms.
 
-    Growth from whole orders is left out where these leave over far more than all orders free do on unseen runs.
+    Forward selection from integer orders is skipped if their validation residual far exceeds that with all orders free.
     """
     structure = inside.structure
     full = Variant(frozenset(structure.coefficient_names), (), structure.offset == "constant")
@@ -311,7 +312,7 @@ def _from_everything(inside: Inside, work: Work) -> list[Trial]:
 
 
 def _from_subsets(inside: Inside, work: Work, subsets: Sequence[Screened]) -> list[tuple[Trial, Fitted]]:
-    """The best subsets fitted and judged, and what the best of them grows to when its orders become free."""
+    """Fit and validate the best subsets; extend the best of them by free orders."""
     if not subsets:
         return []
     ahead = [s for s in subsets if s.score <= subsets[0].score + NEAR][:LEADING]
@@ -334,19 +335,19 @@ def _from_subsets(inside: Inside, work: Work, subsets: Sequence[Screened]) -> li
 
 
 def _rank(trial: Trial) -> tuple[bool, float]:
-    """What a candidate is compared by: whether its free run grows without bound, then what it leaves over."""
+    """Sort key of a candidate: instability first, then the score."""
     return trial.grows, trial.score
 
 
 def values_of(joint: JointFit) -> dict[str, float]:
-    """Everything free by name."""
+    """Return all free parameters by name."""
     return dict(zip(joint.names, joint.values.tolist(), strict=True))
 
 
 def _upwards(
     inside: Inside, work: Work, chosen: Fitted, tried: set[str], judged_already: Trial | None = None
 ) -> tuple[Trial, Fitted]:
-    """One thing more after another, as long as prediction gets better; the best of the way."""
+    """Add one thing at a time while prediction improves; return the best result on the way."""
     best = judged_already or _judged(inside, work, [chosen])[0]
     best_at, idle = chosen, 0
     tried.add(_key(inside, chosen.change))
@@ -367,19 +368,19 @@ def _upwards(
 
 
 def _hopeless(best: Trial) -> float:
-    """What a candidate leaves over that is neither better than the best nor alike."""
+    """Score above which a candidate is neither better than the best nor equal to it."""
     return math.inf if best.grows else best.score + MOST_ALIKE
 
 
 def _is_better(trial: Trial, than: Trial) -> bool:
-    """Whether a candidate predicts better than another by more than nothing."""
+    """Whether a candidate predicts significantly better than another."""
     return _rank(trial) < (than.grows, than.score - BETTER)
 
 
 def _downwards(
     inside: Inside, work: Work, low: Fitted, others: Sequence[Mapping[str, float]], tried: set[str]
 ) -> tuple[Trial, Fitted] | None:
-    """One thing less after another from everything at whole orders, all the way; the best of the way."""
+    """Eliminate one term at a time from the full structure at integer orders; return the best on the way."""
     full = inside.richest(low.change.variant)
     if len(full.kept) - len(low.change.variant.kept) < 2:
         return None
@@ -408,10 +409,10 @@ def _downwards(
 def _judged(
     inside: Inside, work: Work, ahead: Sequence[Fitted], *, beyond: float = math.inf, margin: float = 0.0
 ) -> list[Trial]:
-    """Fitted variants on what they never saw: all, or as many of the first of them as may matter.
+    """Evaluate fitted variants on validation data: all, or only the first ones if the others cannot matter.
 
-    One that leaves over more than `beyond` already where it is fitted waits for those before it, and is not judged if
-    it leaves more than the best of these does where unseen, by the margin: it predicts no better.
+    A variant whose lower bound of the score exceeds `beyond` waits for those before it. It is skipped if the bound
+    exceeds their best score by more than the margin.
     """
 
     def one(fitted: Fitted) -> Trial:
@@ -428,7 +429,7 @@ def _judged(
 
 
 def _tried(inside: Inside, work: Work, at: Fitted, changes: Sequence[Change]) -> list[Fitted]:
-    """Changes fitted from where one is, best first; of long records those alone that may lead."""
+    """Fit changes from the current optimum, best first; for long records only survivors of the prescreening."""
     values = values_of(at.joint)
     starts: list[Start] = []
     for change in changes:
@@ -441,7 +442,7 @@ def _tried(inside: Inside, work: Work, at: Fitted, changes: Sequence[Change]) ->
 
 
 def _by_criterion(inside: Inside, work: Work, pairs: Sequence[tuple[Change, JointFit | FtlmError]]) -> list[Fitted]:
-    """Those that were fitted, by Schwarz's criterion, all with the colour of the best residuals among them."""
+    """Sort fitted variants by Schwarz's criterion, with the correlation of the best residuals among them."""
     there = [(c, j) for c, j in pairs if not isinstance(j, FtlmError)]
     if not there:
         return []
@@ -452,7 +453,7 @@ def _by_criterion(inside: Inside, work: Work, pairs: Sequence[tuple[Change, Join
 
 
 def _pruned(inside: Inside, work: Work, best: Trial, at: Fitted, tried: set[str]) -> None:
-    """One thing less after another, as long as prediction is no worse."""
+    """Eliminate one thing at a time while prediction does not get worse."""
     while True:
         changes = [c for c in _new(inside, inside.smaller(at.change.variant), tried) if _beside(c, at)]
         steps = _tried(inside, work, at, changes)
@@ -465,7 +466,7 @@ def _pruned(inside: Inside, work: Work, best: Trial, at: Fitted, tried: set[str]
 
 
 def _beside(change: Change, at: Fitted) -> bool:
-    """Whether orders that become whole move to the next whole number on either side of their estimate."""
+    """Whether orders that become integer move to an adjacent integer of their estimate."""
     values = values_of(at.joint)
     return all(abs(v - values[n]) < 1.0 for n, v in change.variant.whole if n in values)
 
@@ -475,7 +476,7 @@ def _key(inside: Inside, change: Change) -> str:
 
 
 def _new(inside: Inside, changes: Iterable[Change], tried: set[str]) -> list[Change]:
-    """Changes to what was not tried, each once."""
+    """Return changes to untried variants, each once."""
     return list({key: c for c in changes if (key := _key(inside, c)) not in tried}.values())
 
 
@@ -484,7 +485,7 @@ def _name(inside: Inside, fitted: Fitted) -> str:
 
 
 def listed(candidates: Mapping[str, Structure], work: Work) -> list[Trial]:
-    """Candidates of a list, each from automatic starts."""
+    """Evaluate listed candidates, each from automatic initial guesses."""
 
     def one(item: tuple[str, Structure]) -> Trial:
         name, structure = item
@@ -510,7 +511,7 @@ def listed(candidates: Mapping[str, Structure], work: Work) -> list[Trial]:
 
 
 def duration(seconds: float) -> str:
-    """Seconds, minutes or hours, in two figures."""
+    """Format seconds as seconds, minutes or hours, with two digits."""
     for unit, size in (("h", 3600.0), ("min", 60.0)):
         if seconds >= 2.0 * size:
             return f"{seconds / size:.2g} {unit}"

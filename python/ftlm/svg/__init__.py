@@ -1,1 +1,1 @@
-"""Drawing that knows no result: text, axes, lines, heat maps, tables, pages."""
+"""SVG and HTML drawing, independent of results: charts, tables, pages."""

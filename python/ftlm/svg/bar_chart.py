@@ -1,4 +1,4 @@
-"""Bars: how often values occur, and figures of several things side by side."""
+"""Bar charts: histograms and grouped bars."""
 
 from __future__ import annotations
 
@@ -15,22 +15,22 @@ from ftlm.svg.line_chart import LINES
 from ftlm.utils.formatting import number, shortened
 from ftlm.utils.validation import Floats
 
-#: Most bars of a histogram.
+#: Most bars of a histogram, and its height [px].
 MOST_BARS = 41
 HEIGHT = 190.0
-#: Height of one bar of several things [px].
+#: Height of one bar of a grouped bar chart [px].
 BAR = 16.0
-#: Letters of a name beside its bars.
+#: Longest label beside a bar [characters].
 MOST_LETTERS = 26
 
 
 def histogram(values: ArrayLike, *, title: str, x_label: str, caption: str = "") -> Figure:
-    """How often values occur, beside the normal curve of the same mean and deviation.
+    """Return a histogram with the normal density of the same mean and standard deviation.
 
     Parameters
     ----------
     values
-        Shape (N,); those that are not finite are left out, and counted in the caption.
+        Shape (N,); non-finite values are left out and counted in the caption.
     title, x_label
         Text, with units.
     caption
@@ -134,28 +134,27 @@ def bar_chart(
     caption: str = "",
     width: int = 720,
 ) -> Figure:
-    """Figures of several things as bars, those of one thing together.
+    """Return a chart of horizontal bars, grouped by name.
 
     Parameters
     ----------
     names
-        Of the things, from above.
+        Group names, from top to bottom.
     groups
-        (what the figures are, one figure a thing), at most five.
+        (series name, one value per group name), at most five.
     title, x_label
         Text, with units.
     low, high
-        Ends of the axis; a bar beyond them ends there, its number says how far it goes. By default from 0 to the
-        largest.
+        Axis limits, by default from 0 to the largest value. A bar beyond them is truncated and labeled with its value.
     caption
         Sentence below.
     width
-        Of the wide drawing, in pixels; it scales.
+        Width of the wide drawing [px]; it scales.
 
     Raises
     ------
     DataError
-        Nothing to draw, more than five groups, or figures that are not one a name.
+        Nothing to draw, more than five series, or a series without one value per name.
     """
     tables = [(name, np.asarray(values, dtype=np.float64)) for name, values in groups]
     if not names or not 0 < len(tables) < len(LINES):

@@ -1,4 +1,4 @@
-"""Points of the complex plane, such as poles, with the sector in which they may not lie."""
+"""Complex plane: pole map and Nyquist locus."""
 
 from __future__ import annotations
 
@@ -17,7 +17,7 @@ from ftlm.utils.validation import Complex
 
 #: Height of the plot, and half the size of a cross [px].
 HEIGHT, CROSS = 260.0, 5.0
-#: Share of the plot that is left free around the farthest point.
+#: Axis limits relative to the farthest point.
 MARGIN = 1.18
 
 
@@ -30,23 +30,23 @@ def plane_chart(
     sector: float = math.pi / 2,
     caption: str = "",
 ) -> Figure:
-    """Crosses in the complex plane, with the same unit in both directions.
+    """Return a chart of crosses in the complex plane with equal axis units.
 
     Parameters
     ----------
     points
-        Where they are, finite; conjugate ones are both given.
+        Finite values; both members of a conjugate pair are given.
     title, x_label, y_label
         Text, with units.
     sector
-        Half-angle [rad] around the positive axis that is shaded: what is in it is not stable.
+        Half-angle [rad] of the shaded unstable sector around the positive axis.
     caption
         Sentence below.
 
     Raises
     ------
     DataError
-        A point that is not finite, or a sector that is no angle between 0 and pi.
+        A point that is not finite, or a sector outside (0, pi).
     """
     values = np.asarray(list(points), dtype=np.complex128)
     bad = ~np.isfinite(values)
@@ -111,21 +111,21 @@ def _drawing(values: Complex, far: float, sector: float, words: tuple[str, str, 
     return svg(width, round(top + h + 44), title, described, out, narrow=narrow)
 
 
-#: Height of the plot, radius of a dot [px].
+#: Height of the plot and radius of a dot [px].
 HEIGHT_LOCUS, DOT = 240.0, 2.6
-#: Share of the data's reach that is left free around it.
+#: Margin around the data as a share of their range.
 MARGIN_LOCUS = 0.06
 
 
 def locus_chart(
     curve: ArrayLike, points: ArrayLike, *, title: str, x_label: str, y_label: str, caption: str = ""
 ) -> Figure:
-    """A curve and dots in the complex plane.
+    """Return a chart of a curve and points in the complex plane.
 
     Parameters
     ----------
     curve
-        The model's values, complex, in the order of frequency; those that are not finite are left out.
+        Model values, complex, in order of frequency; non-finite values are left out.
     points
         Measured values, complex, finite.
     title, x_label, y_label

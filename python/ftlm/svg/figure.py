@@ -1,4 +1,4 @@
-"""A figure, and the pieces of SVG that every drawing has."""
+"""Figure, SVG elements, axes and ticks."""
 
 from __future__ import annotations
 
@@ -15,28 +15,28 @@ from numpy.typing import ArrayLike, NDArray
 from ftlm.utils.formatting import SUPERSCRIPTS
 from ftlm.utils.validation import Floats
 
-#: Width of the drawing for telephones; its text stays as large as the wide one's.
+#: Width of the drawing for narrow screens; its text is as large as in the wide one.
 NARROW = 360
 #: Width of charts that stand side by side.
 SMALL = 520
-#: Text at 12 px: width of a letter, height of a line.
+#: Width of a character and height of a line at 12 px [px].
 LETTER, LINE = 6.7, 15
 
 
 @dataclass(frozen=True)
 class Figure:
-    """A chart of a report; `line_chart` makes them.
+    """Chart of a report; `line_chart` returns one.
 
     Parameters
     ----------
     title
-        What is shown.
+        Title.
     svg
-        The drawing, trusted markup.
+        Drawing, trusted markup.
     narrow
-        The same for narrow screens, or empty.
+        Drawing for narrow screens, or empty.
     caption
-        What the eye cannot see in the drawing, such as values that are not finite.
+        Information that the drawing cannot show, such as non-finite values.
     """
 
     title: str
@@ -51,7 +51,7 @@ class Figure:
 
 
 class Figures(tuple[Figure, ...]):
-    """Charts that belong together: a notebook shows them, :func:`print` names them."""
+    """Tuple of charts; notebooks show them, :func:`print` lists their titles."""
 
     __slots__ = ()
 
@@ -72,7 +72,7 @@ def svg(
     narrow: bool,
     attributes: str = "",
 ) -> Markup:
-    """A whole drawing with what is said of it to those who listen."""
+    """Return a drawing with its description for screen readers."""
     return Markup(
         '<svg class="chart {}" role="img" viewBox="0 0 {} {}" width="{}" height="{}"{}>'
         "<title>{}</title><desc>{}</desc>{}</svg>"
@@ -90,26 +90,26 @@ def svg(
 
 
 def svg_text(x: float, y: float, text: str, anchor: str) -> Markup:
-    """A word whose start, middle or end is at a place."""
+    """Return text whose start, middle or end is at a point."""
     return Markup('<text x="{:.1f}" y="{:.1f}" text-anchor="{}">{}</text>').format(x, y, anchor, text)
 
 
 def text_width(text: str) -> float:
-    """Width in pixels, more or less."""
+    """Approximate width of a text [px]."""
     return LETTER * sum(2 if unicodedata.east_asian_width(c) in "WF" else 1 for c in text)
 
 
-#: Points of one line in the wide chart: two for every pixel column of its plot, so no peak is lost on any screen.
+#: Points of a line in the wide chart: two per pixel column, so that no peak is lost.
 POINTS = 1500
-#: Differences below this are none: denormal numbers have too few digits for an axis.
+#: Smallest difference between axis limits; denormal numbers have too few digits.
 TINY = 1e-290
-#: The axis follows the measured line, and not one that strays from it by more than this many times its height.
+#: Lines that leave the range of the measured line by more than this many times its height do not extend the axis.
 STRAY = 3.0
 
 
 @dataclass(frozen=True)
 class Ticks:
-    """Round numbers on an axis: values, labels, and the power of ten that all labels leave out, as ×10⁻³ and as -3."""
+    """Ticks of an axis: values, labels, and their common power of ten, as ×10⁻³ and as -3."""
 
     values: list[float]
     labels: list[str]
@@ -125,7 +125,7 @@ def ticks(low: float, high: float, most: int = 6) -> Ticks:
     low, high
         Ends, low < high.
     most
-        About as many ticks; at least two come.
+        Approximate number of ticks; at least two are returned.
     """
     raw = (high - low) / max(most, 1)
     exponent = math.floor(math.log10(raw))
@@ -147,7 +147,7 @@ def ticks(low: float, high: float, most: int = 6) -> Ticks:
 
 
 def log_ticks(low: float, high: float, most: int) -> Ticks:
-    """Ticks between 10**low and 10**high: powers of ten, or 1-2-5 between them where the powers are few."""
+    """Ticks between 10**low and 10**high: powers of ten, or a 1-2-5 series if there are few powers."""
     every = max(1, math.ceil((high - low) / most))
     first, last = math.ceil(low / every - 1e-9), math.floor(high / every + 1e-9)
     powers = [k * every for k in range(first, last + 1)]
@@ -165,19 +165,19 @@ def log_ticks(low: float, high: float, most: int) -> Ticks:
 
 
 def decimate(y: ArrayLike, most: int = POINTS) -> NDArray[np.intp]:
-    """Return indices of the points that draw a line: first, last, and smallest and largest of every stretch.
+    """Return indices of points that represent a line: first, last, minimum and maximum of every block.
 
     Parameters
     ----------
     y
-        Values; those that are not finite are left out.
+        Values; non-finite values are left out.
     most
-        Most indices, at least 4.
+        Largest number of indices, at least 4.
 
     Returns
     -------
     ndarray of int
-        Ascending. All finite values where they are no more than ``most``.
+        Ascending indices. All finite values if they are no more than ``most``.
     """
     values = np.asarray(y, dtype=np.float64)
     finite = np.flatnonzero(np.isfinite(values))
@@ -193,7 +193,7 @@ def decimate(y: ArrayLike, most: int = POINTS) -> NDArray[np.intp]:
 
 
 def limits(values: list[Floats], margin: float) -> tuple[float, float]:
-    """Return ends of an axis that holds these values with a margin, never equal."""
+    """Return distinct axis limits for these values with a margin."""
     finite = np.concatenate(values) if values else np.empty(0)
     if finite.size == 0:
         return 0.0, 1.0
@@ -205,6 +205,6 @@ def limits(values: list[Floats], margin: float) -> tuple[float, float]:
 
 
 def snapped(low: float, high: float) -> tuple[float, float]:
-    """Move ends to a round number that is near: pulses begin half a step after 0 and end half a step before 10."""
+    """Extend limits to a near tick: block pulses begin half a step after 0 and end half a step before 10."""
     values = ticks(low - 0.01 * (high - low), high + 0.01 * (high - low), 9).values
     return min(low, values[0]), max(high, values[-1])

@@ -1,4 +1,4 @@
-"""Heat maps: scores over two axes."""
+"""Heat map of scores over two axes, and correlation matrix."""
 
 from __future__ import annotations
 
@@ -19,22 +19,22 @@ from ftlm.utils.validation import Floats
 
 @dataclass(frozen=True)
 class Landscape:
-    """Scores of a lattice over two orders, the others as in the best model.
+    """Scores over two orders, the other orders fixed at the best model.
 
     Parameters
     ----------
     names
-        The two orders, across and upward.
+        The two orders, horizontal and vertical.
     x, y
         Their values, ascending.
     scores
-        Shape (y, x); infinite where a pair is no candidate or its free run diverges.
+        Shape (y, x); infinite for pairs that are no candidates or whose simulation diverges.
     others
-        What the other numbers do, in words.
+        Treatment of the other parameters, as text.
     score
-        What the score is, in words.
+        Name of the score.
     correlation
-        Of the two orders in a joint fit; not a number otherwise.
+        Correlation of the two orders in a joint fit, otherwise NaN.
     """
 
     names: tuple[str, str]
@@ -46,20 +46,20 @@ class Landscape:
     correlation: float = math.nan
 
 
-#: From best to worst, after viridis reversed in lightness: dark is good on white, and every step differs in lightness.
+#: From best to worst, reversed viridis: dark is good on white, and lightness is monotone.
 HEAT = ("#440154", "#472c7a", "#3b518b", "#2c718e", "#21908d", "#27ad81", "#5cc863", "#aadc32", "#fde725")
 NO_SCORE = "#9aa3ad"
 
 
 def heat_map(landscape: Landscape, *, title: str = "") -> Figure:
-    """Scores of an order lattice over two of its orders, best dark.
+    """Return a heat map of scores over two orders; the best scores are dark.
 
     Parameters
     ----------
     landscape
-        From :func:`ftlm.report.landscape`.
+        Scores, such as ``landscape`` returns.
     title
-        Default: says what is shown.
+        Title; the default names both orders.
     """
     across, upward = landscape.names
     heading = title or f"Score over {symbol(across)} and {symbol(upward)}"
@@ -84,7 +84,7 @@ def heat_map(landscape: Landscape, *, title: str = "") -> Figure:
 
 
 def _classes(scores: Floats, low: float, high: float) -> NDArray[np.intp]:
-    """Step of the logarithm that each score is in; -1 where there is none."""
+    """Color class of each score on a logarithmic scale; -1 without a score."""
     first, span = math.log(low), math.log(high) - math.log(low)
     with np.errstate(divide="ignore", invalid="ignore"):
         place = (np.log(scores) - first) / (span if span > 0 else 1.0)
@@ -93,14 +93,14 @@ def _classes(scores: Floats, low: float, high: float) -> NDArray[np.intp]:
 
 
 def _rectangle(x: float, y: float, width: float, height: str, colour: str) -> Markup:
-    """A cell, a little wider than its place, so that no seam shows."""
+    """Return a cell, slightly enlarged to hide seams."""
     return Markup('<rect x="{:.1f}" y="{:.1f}" width="{:.1f}" height="{}" fill="{}"/>').format(
         x, y, width + 0.3, height, colour
     )
 
 
 def _picked(count: int, most: int) -> list[int]:
-    """Indices of about as many cells as have room for a label, first and last among them."""
+    """Indices of the cells that get a label, first and last included."""
     return sorted({round(k) for k in np.linspace(0, count - 1, most).tolist()})
 
 
@@ -142,34 +142,34 @@ def _heat_drawing(
     return svg(width, round(bottom + below), title, described, out, narrow=narrow)
 
 
-#: From -1 to 1, blue over a light grey to vermilion: both ends dark, and the middle reads black.
+#: From -1 to 1, blue over light gray to vermilion; black text is readable in the middle.
 SCALE = ("#1f4e8c", "#4b80bd", "#8fb3d9", "#c8d9ea", "#eceff1", "#f4d5c4", "#e9a27f", "#cf6535", "#9c3009")
-#: Cells with these colours carry white numbers.
+#: Indices of colors that need white text.
 DARK = {0, 1, 7, 8}
 NO_VALUE = "#9aa3ad"
-#: Largest cell, and the smallest one that has room for its number [px].
+#: Largest cell, and smallest cell with a number [px].
 LARGEST_CELL, ROOM = 46.0, 30.0
 MOST_LETTERS = 12
 
 
 def correlation_map(names: Sequence[str], values: ArrayLike, *, title: str, caption: str = "") -> Figure:
-    """A correlation matrix as coloured cells.
+    """Return a correlation matrix as colored cells.
 
     Parameters
     ----------
     names
-        Of the rows and columns.
+        Names of the rows and columns.
     values
-        Shape (N, N), from -1 to 1; what is not a number has a grey cell.
+        Shape (N, N), from -1 to 1; NaN has a gray cell.
     title
-        What is shown.
+        Title.
     caption
         Sentence below.
 
     Raises
     ------
     DataError
-        A matrix that is not square or not of these names, or numbers beyond 1.
+        A matrix that is not square or does not fit the names, or values beyond 1.
     """
     matrix = np.asarray(values, dtype=np.float64)
     if matrix.shape != (len(names), len(names)) or not len(names):

@@ -1,4 +1,4 @@
-"""A table: plain data first, and the HTML that is made of it."""
+"""Table of plain data and its HTML."""
 
 from __future__ import annotations
 
@@ -21,13 +21,13 @@ from ftlm.svg.line_chart import chart_css
 from ftlm.utils.files import write_atomically
 from ftlm.utils.formatting import Cell, number
 
-#: Columns from which a table is set smaller, so that the paper's fifteen fit a laptop's screen.
+#: Columns from which a table has small type, so that the paper's fifteen columns fit a laptop screen.
 DENSE = 12
 NOT_IN_MODEL = "–"
 
 
 def cell_html(value: Cell) -> Markup:
-    """Return a cell's content; a number carries its full precision for whoever reads the page by program."""
+    """Return the content of a cell; a number carries its full precision in an attribute."""
     if value is None:
         return Markup(NOT_IN_MODEL)
     if isinstance(value, str):
@@ -37,7 +37,7 @@ def cell_html(value: Cell) -> Markup:
 
 @dataclass(frozen=True)
 class Table:
-    """A table of a report.
+    """Table of a report.
 
     Parameters
     ----------
@@ -46,18 +46,18 @@ class Table:
     columns
         Column heads. The first column names the row.
     rows
-        Cells: text (escaped, unless it is ``Markup``), numbers (shown with five significant digits, kept in full), or
-        None for what a model does not have.
+        Cells: text (escaped, unless it is ``Markup``), numbers (shown with five significant digits, stored in full), or
+        None for values that a model does not have.
     groups
-        Heads above the heads, as (text, number of columns) from left to right; an empty text heads nothing.
+        Heads above the column heads, as (text, number of columns) from left to right; an empty text has no head.
     headings
-        Lines across the table, by the index of the row that they stand above.
+        Headings across the table, by the index of the row below.
     note
         Sentence below the table.
     wrap
-        Whether text in cells breaks into lines; otherwise every row is one line.
+        Whether text in cells wraps; otherwise every row is one line.
     stacked
-        Whether the cells of a row, which wrap, stand below one another where the screen is narrow.
+        Whether the cells of a row stand below one another on narrow screens.
     """
 
     title: str
@@ -71,7 +71,7 @@ class Table:
 
     @property
     def is_numeric(self) -> list[bool]:
-        """Which columns hold numbers, and are set flush right."""
+        """Whether each column is numeric and right-aligned."""
         columns = [[row[k] for row in self.rows] for k in range(len(self.columns))]
         return [
             bool(cells)
@@ -82,7 +82,7 @@ class Table:
 
     @property
     def starts_group(self) -> list[bool]:
-        """Which columns begin a group, and are set apart."""
+        """Whether each column starts a group."""
         starts, at = [False] * len(self.columns), 0
         for text, width in self.groups:
             if text and at < len(starts):
@@ -95,9 +95,9 @@ class Table:
         return [" ".join(w for w, on in (("n", numeric), ("g", group)) if on) for numeric, group in pairs]
 
     def to_html(self) -> Markup:
-        """Return the table in a container that scrolls by itself on a narrow screen."""
+        """Return the table in a container that scrolls horizontally on narrow screens."""
         classes = [Markup(' class="{}"').format(c) if c else Markup("") for c in self._classes()]
-        # The title stands outside of what scrolls, so that it wraps; the label tells it to those who listen.
+        # The title is outside the scrolling container, so that it wraps; the label repeats it for screen readers.
         dense = " dense" if len(self.columns) >= DENSE else " wrap" if self.wrap else ""
         dense += " stacked" if self.stacked else ""
         out = [Markup('<div class="table{}"><p class="title">{}</p>').format(dense, self.title)]
@@ -136,7 +136,7 @@ class Table:
 
 @dataclass(frozen=True)
 class Section:
-    """One section of a report.
+    """Section of a report.
 
     Parameters
     ----------
@@ -145,17 +145,17 @@ class Section:
     paragraphs
         Text, escaped unless it is ``Markup``.
     warnings
-        Shown first, in a box.
+        Warnings in a box at the top.
     tables, figures
-        See :class:`ftlm.report.Table` and :func:`ftlm.report.line_chart`.
+        See :class:`ftlm.report.Table` and ``line_chart``.
     small
-        Whether two figures stand side by side where there is room.
+        Whether two figures stand side by side on wide screens.
     more
-        Further warnings, folded away below the first ones.
+        Further warnings in a collapsed list.
     fold
-        What is written on the fold behind which the rest stands; on paper it is open.
+        Title of the collapsed part; it is open in print.
     folded_paragraphs, folded
-        Text and tables behind it.
+        Text and tables of the collapsed part.
     """
 
     heading: str
@@ -170,7 +170,7 @@ class Section:
     folded: Sequence[Table] = ()
 
     def __post_init__(self) -> None:
-        # A text is a sequence of letters, too; nobody wants a paragraph for each.
+        # A str is a sequence of characters; treat it as one paragraph.
         for name in ("paragraphs", "warnings", "more", "folded_paragraphs"):
             if isinstance(getattr(self, name), str):
                 object.__setattr__(self, name, (getattr(self, name),))
@@ -184,19 +184,19 @@ def _template() -> Template:
 
 @cache
 def look() -> Markup:
-    """What all pages look alike in."""
+    """Common style sheet of all pages."""
     return Markup(resources.files("ftlm.svg").joinpath("style.css").read_text("utf-8"))  # our own file
 
 
 @cache
 def chart_script() -> str:
-    """What makes charts zoom, and sliders read them out."""
+    """Script for zooming charts and reading them out by sliders."""
     return resources.files("ftlm.svg").joinpath("charts.js").read_text("utf-8")
 
 
 @cache
 def _script() -> tuple[Markup, str]:
-    """The script of the charts, and the hash under which the page allows it and nothing else."""
+    """Return the script and its hash for the content security policy."""
     text = chart_script()
     digest = base64.b64encode(hashlib.sha256(text.encode()).digest()).decode()
     return Markup(text), f"sha256-{digest}"  # our own file
@@ -220,13 +220,13 @@ def write_page(
     title
         Title.
     sections
-        In their order on the page.
+        Sections in order.
     lead
-        What a hurried reader should know, below the title.
+        Summary below the title.
     force
         Overwrite an existing file.
     verdict
-        What stands before everything else, escaped unless it is ``Markup``.
+        Content above everything else, escaped unless it is ``Markup``.
 
     Returns
     -------
@@ -256,7 +256,7 @@ def write_page(
 
 @dataclass(frozen=True)
 class Page:
-    """What a page says: its title, its sections, and what a hurried reader should know."""
+    """Content of a page: title, sections and summary."""
 
     title: str
     sections: Sequence[Section]
@@ -264,11 +264,11 @@ class Page:
 
 
 class Reported(ABC):
-    """A result that is its own page."""
+    """Mixin of results with an HTML report of their own."""
 
     @abstractmethod
     def _page(self) -> Page:
-        """What its page says."""
+        """Content of the report."""
 
     def report(self, path: str | os.PathLike[str], *, force: bool = False) -> Path:
         """Write the result as one HTML file that opens offline.

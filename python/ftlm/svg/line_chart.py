@@ -1,4 +1,4 @@
-"""What the slider of a chart reads out: values of its lines at instants, short enough to lie in the page."""
+"""Readout data of a chart's slider: sampled line values in a compact form."""
 
 from __future__ import annotations
 
@@ -32,32 +32,33 @@ from ftlm.svg.figure import (
 from ftlm.utils.formatting import number, shortened
 from ftlm.utils.validation import Floats
 
-#: Places of a slider: more than its track has pixels.
+#: Positions of a slider, more than its track has pixels.
 PLACES = 750
-#: Parts into which the span of a line is divided: five digits of it.
+#: Quantization levels over the range of a line: five digits.
 PARTS = 1e5
 
 
 def readings(
     x: Floats, lines: Sequence[tuple[str, int, Floats]], x_label: str, y_label: str, places: int = PLACES
 ) -> str:
-    """Values of lines at the places of a slider, as JSON of whole numbers.
+    """Return line values at the slider positions as JSON of integers.
 
     Parameters
     ----------
     x
         Shape (N,), ascending.
     lines
-        (name, style, values of shape (N,)), not a number where there is none.
+        (name, style, values of shape (N,)); NaN marks a missing value.
     x_label, y_label
-        Text, a unit at its end in brackets.
+        Text with a unit in brackets at its end.
     places
-        About as many at most.
+        Approximate largest number of positions.
 
     Returns
     -------
     str
-        Every place is a sample. That at which the first two lines are farthest apart is among them, and is said.
+        Every position is a sample. The position of the largest difference between the first two lines is included and
+        marked.
     """
     there = np.flatnonzero(np.isfinite(x))
     if not there.size or not lines:
@@ -83,13 +84,13 @@ def readings(
 
 
 def _parted(label: str) -> tuple[str, str]:
-    """What an axis shows and in which unit."""
+    """Split an axis label into name and unit."""
     bare, bracket, unit = label.rpartition(" [")
     return (bare, unit[:-1]) if bracket and unit.endswith("]") else (label, "")
 
 
 def _whole(values: Floats) -> list[object]:
-    """A power of ten and whole numbers that times it are the values; null for none."""
+    """Return a power of ten and integers whose product is the values; null for missing ones."""
     finite = values[np.isfinite(values)]
     if not finite.size:
         return [0, [None] * values.size]
@@ -102,16 +103,16 @@ def _whole(values: Floats) -> list[object]:
     return [power, [None if math.isnan(v) else round(v) for v in scaled.tolist()]]
 
 
-#: Values beyond this are drawn as gaps: differences of two of them leave the range of double precision.
+#: Values beyond this are gaps, because their differences overflow.
 HUGE = 1e300
-#: Coordinates inside the plot are whole tenths of a pixel.
+#: Coordinates inside the plot are integer tenths of a pixel.
 SUB = 10
 #: Diameter of a dot [px].
 DOT = 4.6
-#: Letters of a label beside its line; the legend above the narrow chart has room for more.
+#: Longest label beside a line [characters]; the legend of the narrow chart allows twice as many.
 MOST_LETTERS = 22
 #: (light, dark, dashes). Vermilion, blue, green, purple after Okabe and Ito, darkened to a contrast of 3:1 on white and
-#: lightened for the dark; dashes tell lines apart without any colour. The first is the neutral line.
+#: lightened for dark mode; dashes distinguish lines without color. The first style is neutral.
 LINES = (
     ("#3d4650", "#7f8b97", ""),
     ("#d1480a", "#ff8f45", ""),
@@ -120,13 +121,13 @@ LINES = (
     ("#9b3f83", "#e99ac8", "9 3 2 3"),
     ("#7a6300", "#e6cb4f", "14 4"),
 )
-#: What a line begins with that others are compared with.
+#: Name prefixes of lines in the neutral style.
 NEUTRAL = ("measured", "simulated arm")
 
 
 @dataclass(frozen=True)
 class _Plot:
-    """Place of the plot in the drawing [px], and the data at its edges."""
+    """Plot area in the drawing [px] and its axis limits."""
 
     left: float
     top: float
@@ -143,7 +144,7 @@ class _Plot:
         return np.asarray(self.top + self.height * (high - np.asarray(y)) / (high - low))
 
     def tenths(self, x: Floats, y: Floats) -> tuple[list[int], list[int]]:
-        """Places in whole tenths of a pixel; far outside they no longer matter, and the bound keeps them short."""
+        """Coordinates in integer tenths of a pixel, clipped near the plot to keep them short."""
         down = np.clip(self.down(y) - self.top, -self.height, 2 * self.height)
         xs, ys = (np.rint(places * SUB).astype(np.int64).tolist() for places in (self.across(x) - self.left, down))
         return xs, ys
@@ -168,7 +169,7 @@ class _Shade:
 
 @dataclass(frozen=True)
 class _Chart:
-    """What both drawings show."""
+    """Content of the wide and the narrow drawing."""
 
     title: str
     described: str
@@ -186,7 +187,7 @@ class _Chart:
         return [line for line in self.lines if line.name]
 
     def ticks(self, *, narrow: bool) -> tuple[Ticks, Ticks]:
-        """Round numbers across and upward."""
+        """Ticks of the horizontal and the vertical axis."""
         x_low, x_high, y_low, y_high = self.frame
         across = (log_ticks if self.log_x else ticks)(x_low, x_high, 4 if narrow else 9)
         return across, log_ticks(y_low, y_high, 6) if self.log_y else ticks(y_low, y_high, 5)
@@ -210,34 +211,33 @@ def line_chart(
     dots: Collection[str] = (),
     slider: bool = False,
 ) -> Figure:
-    """Chart of one or several lines over a common axis.
+    """Return a chart of lines over a common axis.
 
     Parameters
     ----------
     x
         Shape (N,).
     lines
-        (name, values of shape (N,)); a lone line may do without a name. A line whose name begins with "measured" or
-        "simulated arm" is neutral and lies beneath; the others are coloured and dashed in the order given.
+        (name, values of shape (N,)); a single line may have an empty name. A line whose name begins with "measured" or
+        "simulated arm" has the neutral style; the others get colors and dashes in the given order.
     title, x_label, y_label
         Text, with units.
     width, height
-        Of the wide drawing, in pixels; it scales.
+        Size of the wide drawing [px]; it scales.
     log_x, log_y
         Logarithmic axes.
     caption
-        Sentence below; what could not be drawn is added to it.
+        Sentence below; omitted values are added to it.
     points
         Most points of a line.
     bands
-        (low, high) of a shade behind the first lines, in their order; each of shape (N,).
+        (low, high) of a shaded band behind each of the first lines; each of shape (N,).
     stems
         Draw every value as a stem from 0 instead of a line.
     dots
-        Names of lines that are dots where they have a value, and nothing elsewhere.
+        Names of lines that are drawn as dots.
     slider
-        Give a page's script what it needs for a slider that reads the lines out, sample by sample; on axes that are
-        not logarithmic.
+        Include data for a slider that reads out the lines sample by sample; only on linear axes.
 
     Returns
     -------
@@ -247,7 +247,7 @@ def line_chart(
     Raises
     ------
     DataError
-        No line, or a line whose length is not that of x.
+        No line, or a line whose length differs from that of x.
     """
     drawn, notes = _checked(x, lines, x_label, log_x, log_y, dots)
     x_low, x_high = limits([drawn[0].x[np.isfinite(drawn[0].x)]], 0.02 if stems else 0.0)
@@ -278,13 +278,13 @@ def line_chart(
 
 
 def _logarithms(values: Floats) -> Floats:
-    """Places on a logarithmic axis; not a number where there is none."""
+    """Coordinates on a logarithmic axis; NaN for values that are not positive."""
     with np.errstate(divide="ignore", invalid="ignore"):
         return np.log10(np.where(values > 0, values, np.nan))
 
 
 def _shade(line: _Line, low: ArrayLike, high: ArrayLike, log_y: bool) -> _Shade:
-    """Edges of a band behind a line; where an edge is not finite there is none."""
+    """Edges of a band behind a line, with gaps at non-finite values."""
     edges = []
     for edge in (low, high):
         values = np.array(edge, dtype=np.float64)
@@ -298,7 +298,7 @@ def _shade(line: _Line, low: ArrayLike, high: ArrayLike, log_y: bool) -> _Shade:
 def _checked(
     x: ArrayLike, lines: Sequence[tuple[str, ArrayLike]], x_label: str, log_x: bool, log_y: bool, dots: Collection[str]
 ) -> tuple[list[_Line], list[str]]:
-    """Lines ready to draw, and in words what of them cannot be drawn."""
+    """Return lines ready to draw, and notes about values that cannot be drawn."""
     if not lines:
         raise DataError("a chart needs at least one line; give (name, values) pairs")
     across = np.array(x, dtype=np.float64)
@@ -327,7 +327,7 @@ def _checked(
 
 
 def _y_limits(lines: list[_Line]) -> tuple[float, float, list[tuple[str, float]]]:
-    """Return ends of the vertical axis, and lines that leave it with their farthest values."""
+    """Return limits of the vertical axis, and lines that exceed them with their farthest values."""
     every = [line.y[np.isfinite(line.y)] for line in lines]
     low, high = limits(every, 0.05)
     neutral = [y for y, line in zip(every, lines, strict=True) if line.style == 0 and y.size]
@@ -378,7 +378,7 @@ def _drawing(chart: _Chart, width: int, height: int, points: int, *, narrow: boo
 
 
 def _grid(plot: _Plot, across: Ticks, upward: Ticks) -> list[Markup]:
-    """A line for every round number, and both axes."""
+    """Grid lines and both axes."""
     left, top, w, h = plot.left, plot.top, plot.width, plot.height
     along, up = Markup('<path d="M{:.1f} {:.1f}h{:.1f}"/>'), Markup('<path d="M{:.1f} {:.1f}v{:.1f}"/>')
     axes = Markup(
@@ -393,7 +393,7 @@ def _grid(plot: _Plot, across: Ticks, upward: Ticks) -> list[Markup]:
 
 
 def _curves(chart: _Chart, plot: _Plot, points: int) -> list[Markup]:
-    """Shades and lines in a drawing of their own, which cuts off what leaves the axes and has whole coordinates."""
+    """Bands and lines in a nested drawing, which clips them and has integer coordinates."""
     out = [
         Markup(
             '<svg class="plot" preserveAspectRatio="none" x="{:.1f}" y="{:.1f}" width="{:.1f}" height="{:.1f}" '
@@ -417,7 +417,7 @@ def _curves(chart: _Chart, plot: _Plot, points: int) -> list[Markup]:
 
 
 def _labels(chart: _Chart, plot: _Plot, across: Ticks, upward: Ticks, width: int) -> list[Markup]:
-    """Numbers and names of both axes."""
+    """Tick labels and names of both axes."""
     left, bottom, w = plot.left, plot.top + plot.height, plot.width
     out = [Markup('<g class="ticks">')]
     for v, label in zip(upward.values, upward.labels, strict=True):
@@ -436,7 +436,7 @@ def _labels(chart: _Chart, plot: _Plot, across: Ticks, upward: Ticks, width: int
 
 
 def _zoomable(plot: _Plot, across: Ticks, upward: Ticks) -> Markup:
-    """What the page's script needs to zoom: data at the edges, place of the plot, powers of ten left out of labels."""
+    """Attributes for the zoom script: axis limits, plot area, powers of ten of the labels."""
     frame = " ".join(repr(float(v)) for v in plot.frame)
     place = f"{plot.left:.1f} {plot.top:.1f} {plot.width:.1f} {plot.height:.1f}"
     return Markup(' data-frame="{}" data-plot="{}" data-powers="{} {}"').format(
@@ -445,7 +445,7 @@ def _zoomable(plot: _Plot, across: Ticks, upward: Ticks) -> Markup:
 
 
 def _outline(shade: _Shade, plot: _Plot, points: int) -> str:
-    """Closed path around a band where both its edges are finite."""
+    """Polygon of a band where both edges are finite."""
     good = np.flatnonzero(np.isfinite(shade.low) & np.isfinite(shade.high) & np.isfinite(shade.x))
     if good.size < 2:
         return ""
@@ -476,7 +476,7 @@ def _stroke(style: int, *, dots: bool = False) -> Markup:
 
 
 def _path(line: _Line, plot: _Plot, points: int) -> str:
-    """Path data in whole tenths of a pixel, each point relative to the one before, a new start after every gap."""
+    """Path data in integer tenths of a pixel, relative to the previous point, restarted after every gap."""
     kept = decimate(line.y, points)
     if kept.size == 0:
         return ""
@@ -491,13 +491,13 @@ def _path(line: _Line, plot: _Plot, points: int) -> str:
 
 
 def _swatch(line: _Line, x: float, y: float, length: int) -> Markup:
-    """What a line looks like, beside its name."""
+    """Sample of a line's style beside its name."""
     at, reach = (x + length / 2, 0) if line.dots else (x, length)
     return Markup('<path {} d="M{:.1f} {:.1f}h{}"/>').format(_stroke(line.style, dots=line.dots), at, y, reach)
 
 
 def _end_labels(lines: list[_Line], plot: _Plot) -> list[Markup]:
-    """Swatch and name beside the end of every line, moved apart where lines end together."""
+    """Swatch and name at the end of every line, moved apart where lines end together."""
     x, top, bottom = plot.left + plot.width, plot.top, plot.top + plot.height
     ends = []
     for line in lines:
@@ -520,7 +520,7 @@ def _end_labels(lines: list[_Line], plot: _Plot) -> list[Markup]:
 
 
 def _legend(lines: list[_Line], width: int) -> list[tuple[_Line, float, int]]:
-    """Place of every entry above a narrow chart: (line, x, row)."""
+    """Position of every legend entry above a narrow chart: (line, x, row)."""
     entries, x, row = [], 4.0, 0
     for line in lines:
         needed = 26 + text_width(shortened(line.name, 2 * MOST_LETTERS)) + 14
@@ -541,7 +541,7 @@ def _legend_marks(entries: list[tuple[_Line, float, int]]) -> list[Markup]:
 
 
 def chart_css() -> Markup:
-    """Return the rules that give the lines their colours by the page's variables, light and dark."""
+    """CSS rules of the line colors, light and dark."""
     light = "".join(f"--line{i}:{c};" for i, (c, _, _) in enumerate(LINES))
     dark = "".join(f"--line{i}:{c};" for i, (_, c, _) in enumerate(LINES))
     rules = "".join(f".line{i}{{stroke:var(--line{i})}}.shade{i}{{fill:var(--line{i})}}" for i in range(len(LINES)))

@@ -1,1 +1,1 @@
-"""Ground: errors, checks, arrays, statistics, files written, progress."""
+"""Helpers of all packages: argument checks, statistics, linear algebra, files, resources, formatting."""

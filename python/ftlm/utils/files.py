@@ -1,4 +1,4 @@
-"""What ftlm tells a program's log: the logger ``ftlm``, silent until the program listens."""
+"""Logger ``ftlm``, silent unless the program configures a handler."""
 
 from __future__ import annotations
 
@@ -19,29 +19,29 @@ from ftlm._core import __version__
 from ftlm.errors import DataError, ModelError
 from ftlm.utils.validation import shown, words_of
 
-#: Files read and written and fits begun and ended at INFO, what makes a result doubtful at WARNING.
+#: INFO: files read and written, start and end of fits. WARNING: findings that make a result doubtful.
 LOG = logging.getLogger("ftlm")
 LOG.addHandler(logging.NullHandler())
 
 
-#: Systems that tell text from bytes are to write bytes.
+#: Binary mode on systems that distinguish text from bytes.
 _NEW = os.O_WRONLY | os.O_CREAT | os.O_EXCL | getattr(os, "O_BINARY", 0)
 
 
 @dataclass(frozen=True)
 class Words:
-    """How errors speak of a file that cannot be written, which depends on who asked for it.
+    """Wording of errors about a file that cannot be written.
 
     Parameters
     ----------
     quoted
-        Whether its name stands in quotes.
+        Whether the path stands in quotes.
     folder
-        What to do where a folder has that name; nothing where that counts as a file that exists.
+        Remedy if a folder has that name; empty if a folder counts as an existing file.
     overwrite
-        How to overwrite a file that exists.
+        Remedy if the file exists.
     failed
-        What is said of a failure, with its reason.
+        Message of a failure, with a placeholder for its reason.
     """
 
     quoted: bool = False
@@ -50,11 +50,11 @@ class Words:
     failed: str = "cannot be written: {}; choose another folder"
 
     def shown(self, path: Path) -> str:
-        """Write a path."""
+        """Return a path as text."""
         return repr(str(path)) if self.quoted else str(path)
 
 
-#: Models, pages and tables; runs; what a command was told to write.
+#: Wording for models, pages and tables; for runs; for outputs of commands.
 PLAIN = Words()
 RUN = Words(
     quoted=True,
@@ -65,7 +65,7 @@ COMMAND = Words(folder="name a file in it", overwrite="--force")
 
 
 def check_new(path: str | os.PathLike[str], *, force: bool, words: Words = PLAIN) -> Path:
-    """Refuse the name of a folder, and that of a file that must not be overwritten."""
+    """Raise for the name of a folder, or of an existing file without ``force``."""
     file = Path(path)
     if words.folder and file.is_dir():
         raise DataError(f"{words.shown(file)} is a folder; {words.folder}")
@@ -81,7 +81,7 @@ def check_new(path: str | os.PathLike[str], *, force: bool, words: Words = PLAIN
 
 
 def _status(file: Path) -> os.stat_result | None:
-    """What has that name, itself and not what it leads to; None where nothing has."""
+    """Return the status of a path without following links; None if it does not exist."""
     try:
         return file.lstat()
     except (OSError, ValueError):
@@ -89,7 +89,7 @@ def _status(file: Path) -> os.stat_result | None:
 
 
 def check_free(*paths: str | os.PathLike[str] | None, force: bool, words: Words = PLAIN) -> None:
-    """Refuse before any work what could not be written after it; no path is no file to write."""
+    """Raise before the computation for paths that could not be written after it; None is skipped."""
     for path in paths:
         if path is None:
             continue
@@ -104,7 +104,7 @@ def check_free(*paths: str | os.PathLike[str] | None, force: bool, words: Words 
 
 
 def check_folder(folder: Path, names: Iterable[str], *, force: bool) -> None:
-    """Make a folder and refuse before any work those of its files that could not be written after it."""
+    """Create a folder, and raise before the computation for files in it that could not be written."""
     try:
         folder.mkdir(parents=True, exist_ok=True)
     except OSError as error:
@@ -115,7 +115,7 @@ def check_folder(folder: Path, names: Iterable[str], *, force: bool) -> None:
 
 
 def write_atomically(path: str | os.PathLike[str], content: bytes, *, force: bool, words: Words = PLAIN) -> Path:
-    """Write beside, flush to disk, rename: a reader sees the old file or the new one, whole.
+    """Write a temporary file, flush it to disk and rename it: readers see the old content or the new one.
 
     Raises
     ------
@@ -164,9 +164,9 @@ def write_atomically(path: str | os.PathLike[str], content: bytes, *, force: boo
 
 
 def _named(beside: Path, file: Path) -> bool:
-    """Give a file a second name that nobody has, and take the first away; refuse one that was taken meanwhile.
+    """Rename a file to a name that must not exist; raise if it was created meanwhile.
 
-    Where the file system has no links it is false, and an empty file of that name waits for the file's renaming.
+    On file systems without hard links return False and leave an empty file of that name as a placeholder.
     """
     try:
         os.link(beside, file, follow_symlinks=False)
@@ -179,12 +179,12 @@ def _named(beside: Path, file: Path) -> bool:
     return True
 
 
-#: Longest name of a file in a message.
+#: Longest name in a message.
 LONGEST = 300
 
 
 class Versioned(Protocol):
-    """What stands in such a file."""
+    """Content of a versioned document."""
 
     schema: int
 
@@ -193,7 +193,7 @@ T = TypeVar("T", bound=Versioned)
 
 
 class Head(msgspec.Struct):
-    """What every such file says of itself, whatever else a later version put into it."""
+    """Header of every document, readable in files of later versions, too."""
 
     format: str
     schema: int
@@ -202,20 +202,20 @@ class Head(msgspec.Struct):
 
 @dataclass(frozen=True)
 class Saved(Generic[T]):
-    """A kind of file.
+    """Format of a versioned JSON document.
 
     Parameters
     ----------
     what
-        Name of what is in it.
+        Name of the content.
     source
-        What to give instead of another file.
+        Remedy in error messages: the kind of file to pass.
     kind
-        Its record.
-    latest
-        The last schema that this version reads.
-    most
-        Largest size that is read [bytes].
+        Type of the content.
+    latest_schema
+        Latest schema that this version reads.
+    max_bytes
+        Largest file that is read.
     """
 
     what: str
@@ -225,12 +225,12 @@ class Saved(Generic[T]):
     most: int = 1 << 20
 
     def read(self, path: str | os.PathLike[str]) -> T:
-        """The record of a file.
+        """Read and decode a file.
 
         Raises
         ------
         DataError
-            A file that cannot be read, is too large, is none of this kind, or is of a later version.
+            A file that cannot be read, is too large, has another format, or is of a later version.
         """
         if not isinstance(path, (str, os.PathLike)):
             raise DataError(f"path = {shown(path)} is no path of a file; give {self.source}")
@@ -251,7 +251,7 @@ class Saved(Generic[T]):
             raise DataError(f"{file} is no ftlm {self.what}: {words_of(error, LONGEST)}; give {self.source}") from error
 
     def _content(self, file: Path) -> bytes:
-        """All of a file that may be one of this kind."""
+        """Return the bytes of a regular file within the size limit."""
         state = file.stat()
         if not stat.S_ISREG(state.st_mode):
             raise DataError(f"{file} is no regular file; give {self.source}")
@@ -262,7 +262,7 @@ class Saved(Generic[T]):
         return file.read_bytes()
 
     def _check_later(self, file: Path, content: bytes) -> None:
-        """Say of a file that cannot be read whether a later version can."""
+        """Raise if a file that cannot be decoded comes from a later version."""
         try:
             head = msgspec.json.decode(content, type=Head)
         except (msgspec.MsgspecError, ValueError, RecursionError):
@@ -278,12 +278,12 @@ class Saved(Generic[T]):
         )
 
     def check_schema(self, path: str | os.PathLike[str], read: Versioned, of: int) -> None:
-        """Refuse what a later version wrote, and what says so and has nothing of it.
+        """Raise if the schema is later than this version, or than the content needs.
 
         Raises
         ------
         DataError
-            A schema beyond the latest that this version reads, or beyond that of what is in the file.
+            A schema beyond the latest that this version reads, or beyond that of the content.
         """
         if read.schema > self.latest:
             raise self._later(path, read.schema, getattr(read, "written_by", ""))
@@ -294,7 +294,7 @@ class Saved(Generic[T]):
 
 
 def to_frame(rows: Sequence[Mapping[str, Any]], index: Sequence[str]) -> Any:
-    """Rows as a pandas frame.
+    """Return rows as a pandas DataFrame.
 
     Raises
     ------

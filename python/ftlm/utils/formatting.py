@@ -1,4 +1,4 @@
-"""Names and numbers as people write them: Greek letters, subscripts, significant digits."""
+"""Formatting: Greek symbols, subscripts, significant digits, word wrap."""
 
 from __future__ import annotations
 
@@ -10,10 +10,10 @@ from numbers import Integral
 
 from markupsafe import Markup
 
-#: Significant digits of every estimated number: more than any estimate here deserves, enough to compare with the paper.
+#: Significant digits of estimates: more than their accuracy, enough for comparison with the paper.
 DIGITS = 5
 DIVERGED = "diverged"
-#: Letters of a line, at most and at least: of a terminal that is narrower as many as it has.
+#: Line length [characters]: largest and smallest.
 WIDTH, NARROW = 110, 40
 _EQUATION = re.compile(r"D\^?\S* \S+ = ")
 GREEK = {
@@ -34,7 +34,7 @@ SYMBOL = re.compile(rf"({'|'.join(GREEK)}|[A-Za-z])_?(\d*)", re.ASCII)
 
 
 def symbol(name: str) -> str:
-    """Return a signal's or parameter's name as it is written by hand: ``theta12`` becomes θ₁₂; any other name stays."""
+    """Return a name as a symbol: ``theta12`` becomes θ₁₂; other names are unchanged."""
     found = SYMBOL.fullmatch(name)
     if not found:
         return name
@@ -42,7 +42,7 @@ def symbol(name: str) -> str:
 
 
 def symbol_html(name: str) -> Markup:
-    """Return the same as `symbol` with a real subscript, escaped."""
+    """Return the symbol with an HTML subscript, escaped."""
     found = SYMBOL.fullmatch(name)
     if not found:
         return Markup("<i>{}</i>").format(name)
@@ -51,14 +51,14 @@ def symbol_html(name: str) -> Markup:
 
 
 class Exact(float):
-    """A number that was chosen, not estimated, such as an order on a lattice: printed as it is."""
+    """Number that was chosen, not estimated, such as an order of the grid; it is printed in full."""
 
 
 Cell = str | float | None
 
 
 def number(value: float, digits: int = DIGITS) -> str:
-    """Return a number with this many significant digits; infinity is ∞ with the word "diverged"."""
+    """Return a number with this many significant digits; infinity is "∞ diverged"."""
     if isinstance(value, Integral):
         return f"{value:,}".replace(",", "\u202f")
     if math.isnan(value):
@@ -74,17 +74,17 @@ def number(value: float, digits: int = DIGITS) -> str:
 
 
 def unbounded(value: float, spec: str = ".3g") -> str:
-    """Return a standard error or an end of an interval in short, infinity as ∞: the runs do not see the number."""
+    """Format a standard error or an interval bound; infinity (not identifiable) is ∞."""
     return f"{'−' if value < 0 else ''}∞" if math.isinf(value) else f"{value:{spec}}"
 
 
 def shortened(text: str, most: int) -> str:
-    """A text of at most so many letters, with an ellipsis for the rest."""
+    """Truncate a text with an ellipsis."""
     return text if len(text) <= most else text[: most - 1] + "…"
 
 
 def with_error(value: float, error: float | None) -> str:
-    """Return a number with two digits of its standard error, and as many digits itself; five without one."""
+    """Format a number to two digits of its standard error; five digits without one."""
     if error is None or not math.isfinite(error) or error <= 0 or not math.isfinite(value):
         return f"{value:.5g}"
     decimals = 1 - math.floor(math.log10(error))
@@ -94,12 +94,12 @@ def with_error(value: float, error: float | None) -> str:
 
 
 def columns() -> int:
-    """Letters of a line: those of the terminal, or of ``COLUMNS``, within bounds; the most where there is none."""
+    """Line length [characters] of the terminal or of ``COLUMNS``, within bounds."""
     return min(max(shutil.get_terminal_size((WIDTH, 40)).columns, NARROW), WIDTH)
 
 
 def wrapped(text: str, lead: str = "", further: str | None = None) -> list[str]:
-    """Lines no longer than a terminal, those after the first set in, as far as `further` if that is given."""
+    """Wrap a text to the line length; continuation lines are indented, by `further` if given."""
     # Equations break between their terms; what is ± something, or so many per cent, stays together.
     bound = re.sub(" (?![+-] )" if _EQUATION.match(text) else " (?=[±%])|(?<=±) ", "\u00a0", text)
     lines = textwrap.wrap(

@@ -1,7 +1,7 @@
-"""Tall matrices and long rows, by the core and on one thread.
+"""Linear algebra of tall-skinny matrices by the core on one thread.
 
-A library that shares one factorisation, or one long sum, out among threads leaves these waiting for more with their
-processors busy, for a tenth of a second each time: more than most of what is computed here takes.
+Multithreaded libraries leave their threads spinning for a tenth of a second after each factorization, which is longer
+than most computations here.
 """
 
 from __future__ import annotations
@@ -13,35 +13,35 @@ import numpy as np
 from ftlm import _core
 from ftlm.utils.validation import Floats
 
-#: Rows of columns that are laid out at a time.
+#: Rows that are stacked at a time.
 ROWS = 1 << 12
 
 
 def dot(one: Floats, other: Floats) -> float:
-    """Sum of the products of two rows."""
+    """Dot product of two vectors."""
     return float(np.einsum("i,i->", one, other))
 
 
 def projections(columns: Floats, row: Floats) -> Floats:
-    """Sum of the products of each column with a row."""
+    """Dot product of each column with a vector."""
     return np.asarray(np.einsum("ij,i->j", columns, row))
 
 
 def length(row: Floats) -> float:
-    """Root of the sum of squares of a row."""
+    """Euclidean norm of a vector."""
     return float(np.sqrt(dot(row, row)))
 
 
 def triangle(tall: Floats) -> Floats:
-    """A matrix turned so that all rows but as many as it has columns hold 0; those that do are left out.
+    """Triangular factor R of the QR factorization of a tall matrix.
 
-    A rotation of the rows leaves every inner product as it is, and with it every least squares among the columns.
+    Orthogonal transformations preserve the inner products of the columns, and with them all least-squares problems.
     """
     return _core.triangle(np.ascontiguousarray(tall.T))
 
 
 def turned_rows(columns: Sequence[Floats]) -> Floats:
-    """The same of a matrix that is there by its columns, without laying it out as a whole."""
+    """Return the triangular factor of a matrix given by columns, without stacking all rows at once."""
     whole = np.zeros((0, len(columns)))
     for first in range(0, len(columns[0]), ROWS):
         part = np.stack([column[first : first + ROWS] for column in columns])
@@ -50,15 +50,15 @@ def turned_rows(columns: Sequence[Floats]) -> Floats:
 
 
 def singular(tall: Floats) -> tuple[Floats, Floats, Floats]:
-    """Singular values in the middle: the matrix is left * sizes @ right."""
+    """Thin singular value decomposition: the matrix is left * sizes @ right."""
     left, sizes, right = _core.singular(np.ascontiguousarray(tall.T))
     return left.reshape(sizes.size, len(tall)).T, sizes, right.reshape(sizes.size, tall.shape[1])
 
 
 def solved(tall: Floats, wanted: Floats, rcond: float | None) -> Floats:
-    """The shortest of the least squares; singular values below a share ``rcond`` of the largest are 0.
+    """Minimum-norm least-squares solution; singular values below a share ``rcond`` of the largest are zero.
 
-    None: those below rounding.
+    Without ``rcond`` the cutoff is the rounding level.
     """
     columns = tall.shape[1]
     both = triangle(np.column_stack([tall, wanted]))
@@ -68,7 +68,7 @@ def solved(tall: Floats, wanted: Floats, rcond: float | None) -> Floats:
 
 
 def orthonormal(columns: Floats, least: float) -> Floats:
-    """An orthonormal basis of columns of any size; what is left of one below a share ``least`` is rounding."""
+    """Orthonormal basis of columns of any scale; directions below a share ``least`` are dropped."""
     sizes = np.linalg.norm(columns, axis=0)
     directions, spread, _ = singular(columns / np.where(sizes > 0, sizes, 1.0))
     kept: Floats = directions[:, spread > least * spread.max(initial=0.0)]

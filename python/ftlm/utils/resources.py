@@ -1,4 +1,4 @@
-"""How much memory a search may take: what is given, or a share of what the machine has left."""
+"""Resources: memory limit of a search, machine speed for time estimates, interruptible worker threads."""
 
 from __future__ import annotations
 
@@ -16,22 +16,22 @@ import numpy as np
 from ftlm import _core
 from ftlm.errors import ModelError
 
-#: Environment variable that gives the limit: bytes, or a number with K, M, G or T (powers of 1024).
+#: Environment variable with the limit: bytes, or a number with K, M, G or T (powers of 1024).
 GIVEN = "FTLM_MEMORY"
-#: Share of the memory at hand that a search takes unasked: the rest is for records, threads and other programs.
+#: Default share of the available memory. The rest is for records, threads and other programs.
 SHARE = 0.8
-#: Bytes where the system tells nothing.
+#: Limit if the system reports no available memory.
 UNKNOWN = 2 << 30
 _SYSTEM = Path("/")
 
 
 def memory_limit(system: Path = _SYSTEM) -> int:
-    """Bytes that regressors, products, test vectors and layouts of a search may take together.
+    """Return the limit [bytes] of regressors, products, test vectors and layouts of a search together.
 
     Parameters
     ----------
     system
-        Where the system's files lie.
+        Root of the system's files.
 
     Raises
     ------
@@ -49,9 +49,9 @@ def memory_limit(system: Path = _SYSTEM) -> int:
 
 
 def available_memory(system: Path = _SYSTEM) -> int | None:
-    """Bytes that this process can still take before the system swaps or ends it; None where the system tells nothing.
+    """Return the memory [bytes] that this process can still take before swapping; None if the system reports none.
 
-    The least of what the kernel calls available and what every control group above this process has left.
+    Minimum of the kernel's available memory and of the remainder of every control group of this process.
     """
     left = [*_of_kernel(system), *_of_groups(system)]
     if not left:
@@ -75,7 +75,7 @@ def _of_kernel(system: Path) -> list[int]:
 
 
 def _of_groups(system: Path) -> list[int]:
-    """What each control group has left, its files in memory that can be dropped counted as left; both versions."""
+    """Remaining memory of each control group, v1 and v2; reclaimable page cache counts as free."""
     left = []
     for line in _text(system / "proc/self/cgroup").splitlines():
         number, controllers, name = (*line.split(":", 2), "", "")[:3]
@@ -101,20 +101,20 @@ def _of_groups(system: Path) -> list[int]:
     return left
 
 
-#: Length of the transform that is timed, for how long [s], and what one takes on the machine whose figures are known
-#: [s]: two cores of an x86-64 server, quiet.
+#: Length of the timed FFT, duration of the measurement [s], and time of one FFT on the reference machine [s], two
+#: cores of an idle x86-64 server.
 LENGTH, TIMED, KNOWN = 4096, 0.03, 1.5e-5
-#: Fits by output error took between these multiples of what their samples and numbers let expect: how many starts lead
-#: somewhere, and how far, is seen only then.
+#: Range of the actual duration of an output-error fit relative to its estimate. The number and length of useful starts
+#: is not known in advance.
 FITS = (0.4, 6.0)
-#: Samples beyond which a fit takes longer by fewer laps over all of them alone.
+#: Samples beyond which the duration grows more slowly: most evaluations use a part of the record.
 LONG = 10_000
-#: A second core takes this share of the work off the first.
+#: Speedup per additional core.
 PARALLEL = 0.7
 
 
 def pace() -> float:
-    """How many times as long as the known machine this one takes for a core's work now, others' work on it included."""
+    """Return the time per unit of work on one core relative to the reference machine, at the current load."""
     values, count = np.ones(LENGTH), 0
     begun = time.perf_counter()
     while time.perf_counter() - begun < TIMED:
@@ -124,20 +124,22 @@ def pace() -> float:
 
 
 def expected(seconds: float, threads: int) -> float:
-    """Seconds that work takes here, of which the known machine needs so many on one core."""
+    """Return the estimated duration [s] here of work that takes ``seconds`` on one core of the reference machine."""
     return seconds * pace() / (1.0 + PARALLEL * (max(threads, 1) - 1))
 
 
 def between(seconds: float, came_to: tuple[float, float] = FITS) -> tuple[float, float]:
-    """Between which times work ends that came to these multiples of what was expected."""
+    """Return the range of a duration from its estimate and a range of factors."""
     return came_to[0] * seconds, came_to[1] * seconds
 
 
 def by_output_error(samples: int, numbers: int) -> float:
-    """Seconds of one core that a fit by output error takes on the known machine, within :data:`FITS` of it.
+    """Return the time [s] of an output-error fit on one core of the reference machine.
 
-    The race of starts grows with the numbers squared, what follows with the samples of all runs and outputs, of long
-    records more slowly: most of their fit is on a part of them.
+    Actual times are within :data:`FIT_TIME_FACTORS` of it.
+
+    The multistart grows with the square of the number of parameters, the rest with the samples of all runs and outputs.
+    Long records grow more slowly because most of their fit uses a part of them.
     """
     return 0.04 * numbers**2 + 3.5e-4 * min(samples, LONG) + 2e-5 * samples
 
@@ -146,13 +148,13 @@ _STOP: ContextVar[_core.Stop | None] = ContextVar("stop", default=None)
 
 
 def stop() -> _core.Stop | None:
-    """The flag that ends what this thread computes; None for one that is interrupted itself."""
+    """Return the stop flag of this worker thread; None in the main thread."""
     return _STOP.get()
 
 
 @contextmanager
 def pool(threads: int) -> Iterator[ThreadPoolExecutor]:
-    """Threads that work for this one: where it is interrupted, they end what they compute and take up nothing more."""
+    """Thread pool that cancels running computations and queued tasks when the main thread is interrupted."""
     flag = stop() or _core.Stop()
     with ThreadPoolExecutor(threads, initializer=_STOP.set, initargs=(flag,)) as made:
         try:

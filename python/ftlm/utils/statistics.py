@@ -1,4 +1,4 @@
-"""Noise, rest and whiteness of a series, and the quantiles that judge them."""
+"""Statistics of residuals and signals: noise level, rest, whiteness, quantiles, prewhitening."""
 
 from __future__ import annotations
 
@@ -10,19 +10,19 @@ import numpy as np
 from ftlm import _core
 from ftlm.utils.validation import Floats
 
-#: A first value beyond this many noise standard deviations is not rest.
+#: First values beyond this many noise standard deviations are not rest.
 REST_SIGMAS = 5.0
-#: ... nor one beyond this share of the signal's deviation, where there is no noise.
+#: Nor are first values beyond this share of the signal's standard deviation, for signals without noise.
 REST_SHARE = 1e-3
-#: Median absolute deviation of a normal variable in units of its standard deviation.
+#: Median absolute deviation of a normal variable in standard deviations.
 MAD = 0.6744897501960817
-#: Residuals below this share of an output's deviation are rounding and discretisation, of which nothing follows.
+#: Residuals below this share of an output's standard deviation are rounding and discretization errors.
 ROUNDING = 3e-5
-#: Residuals beyond so many deviations count by their size: 95 % of the precision of squares under normal noise.
+#: Huber threshold in standard deviations: 95 % efficiency under normal noise.
 BEND = 1.345
-#: Share of true models that a test is allowed to refuse.
+#: Significance level of tests.
 LEVEL = 0.01
-#: Half-widths of a 95 % and of a 99 % interval in standard deviations.
+#: Half-widths of 95 % and 99 % intervals in standard deviations.
 NORMAL_95 = 1.959963984540054
 NORMAL_99 = NormalDist().inv_cdf(1 - LEVEL / 2)
 
@@ -30,7 +30,7 @@ NORMAL_99 = NormalDist().inv_cdf(1 - LEVEL / 2)
 def is_rest(samples: Floats) -> bool:
     """Whether a signal starts at zero within its noise.
 
-    Only the first sample is judged: a machine at rest may answer within a few samples.
+    Only the first sample is tested, because a machine at rest may respond within a few samples.
     """
     there = samples[~np.isnan(samples)]
     noise = noise_of(samples)
@@ -38,7 +38,7 @@ def is_rest(samples: Floats) -> bool:
 
 
 def noise_of(samples: Floats) -> float:
-    """Estimate the deviation of white noise on a smooth signal, from the median of its second differences."""
+    """Standard deviation of white noise on a smooth signal, from the median of second differences."""
     bends = np.diff(samples, 2)
     bends = bends[~np.isnan(bends)]
     if bends.size == 0:
@@ -48,15 +48,15 @@ def noise_of(samples: Floats) -> float:
 
 
 def robust_deviation(values: Floats) -> float:
-    """Deviation of normal values from the median of their sizes, which a few that are far off do not move."""
+    """Standard deviation of normal values from the median of their absolute values."""
     return float(np.median(np.abs(values))) / MAD if values.size else 0.0
 
 
 def huber_excess(few: Floats, many: Floats) -> float:
-    """By how much Huber's loss of residuals exceeds that of residuals of a larger model, in units of their noise.
+    """Excess of Huber's loss of a smaller model over that of a larger one, in units of the noise.
 
-    Where the smaller model is enough this is distributed as chi-squared, with as many degrees as the larger one has
-    numbers more, however far a few residuals lie (doi:10.1214/aoms/1177703732).
+    If the smaller model suffices, the excess is chi-squared distributed. Its degrees of freedom are the additional
+    parameters of the larger model, even with outliers (doi:10.1214/aoms/1177703732).
     """
     scale = robust_deviation(many) or float(np.sqrt(np.mean(many**2)))
     if not np.all(np.isfinite(few)) or (scale == 0.0 and np.any(few)):
@@ -69,32 +69,32 @@ def huber_excess(few: Floats, many: Floats) -> float:
 
 
 def autocovariances(series: Sequence[Floats], most: int) -> tuple[Floats, Floats]:
-    """Autocovariances of series at lags from 0, and how many pairs each is the mean of; NaN is not there.
+    """Autocovariances of series at lags from 0, and the number of pairs of each; NaN marks missing samples.
 
-    Each series is taken about its own mean; they are pooled.
+    Each series is centered about its own mean. The series are pooled.
     """
     return _core.autocovariances(series, most)
 
 
 def autocorrelations(series: Sequence[Floats], most: int) -> tuple[Floats, Floats]:
-    """Autocorrelations of series at lags from 0, sums over all of the power, and their pairs; NaN is not there."""
+    """Autocorrelations of series at lags from 0, and the number of pairs of each; NaN marks missing samples."""
     covariances, pairs = autocovariances(series, most)
     power = covariances[0] * pairs[0]
     return covariances * pairs / (power if power > 0 else 1.0), pairs
 
 
 def ljung_box(correlations: Floats, pairs: Floats) -> float:
-    """Ljung and Box's sum over autocorrelations at lags from 0, which stand for so many pairs each.
+    """Ljung-Box statistic of autocorrelations at lags from 0 with their numbers of pairs.
 
-    Where some values are not there, each correlation has the variance of its own pairs.
+    With missing samples each correlation has the variance of its own pairs.
     """
     return float((pairs[0] + 2.0) * pairs[0] * np.sum(correlations[1:] ** 2 / np.maximum(pairs[1:], 1.0)))
 
 
 def chi_squared(degrees: int, level: float) -> float:
-    """Value that chi-squared exceeds with the probability ``level``, by Wilson and Hilferty.
+    """Value that a chi-squared variable exceeds with the probability ``level``, by Wilson and Hilferty.
 
-    Good to 0.3 % from five degrees of freedom, to 1 % from one.
+    The relative error is 0.3 % from five degrees of freedom and 1 % from one.
     """
     return _core.chi_squared(degrees, NormalDist().inv_cdf(1 - level))
 
@@ -105,7 +105,7 @@ def chi_squared_99(degrees: int) -> float:
 
 
 def colour(series: Floats) -> float:
-    """How much more a sum of the series scatters than one of white noise of its variance: 1 or above (Bartlett)."""
+    """Variance of the series' sum relative to white noise of the same variance, at least 1 (Bartlett)."""
     lags = min(int(4 * series.size ** (1.0 / 3.0)), series.size - 1)
     if lags < 2:
         return 1.0
@@ -114,24 +114,24 @@ def colour(series: Floats) -> float:
 
 
 def is_white(series: Floats, lags: int = 25) -> bool:
-    """Ljung-Box test at 1 %: whether autocorrelations up to ``lags`` could be those of white noise."""
+    """Whether the Ljung-Box test up to ``lags`` accepts white noise at the 1 % level."""
     return _core.is_white(series, lags)
 
 
-#: A signal whose deviation is below this share of its size is constant but for rounding.
+#: Relative range below which a signal is constant up to rounding.
 CONSTANT = 1e-12
 
 
 def autoregression(series: Sequence[Floats], most: int) -> Floats:
-    """Return the whitening filter 1, a₁, …, aₙ of series that share one colour.
+    """Return the common whitening filter 1, a₁, …, aₙ of several series.
 
-    Yule-Walker's equations by Levinson and Durbin (doi:10.1093/biomet/47.3-4.233), covariances pooled over the runs and
-    each about its own mean; the order is that of the least Bayesian information criterion.
+    Solution of the Yule-Walker equations by Levinson and Durbin (doi:10.1093/biomet/47.3-4.233). The autocovariances
+    are pooled over the series, each about its own mean. The order minimizes the Bayesian information criterion.
 
     Parameters
     ----------
     series
-        One array a run; NaN is not there.
+        One array per run; NaN marks a missing sample.
     most
         Largest order.
     """
@@ -139,19 +139,19 @@ def autoregression(series: Sequence[Floats], most: int) -> Floats:
 
 
 def coloured(series: Sequence[Floats], most: int) -> tuple[Floats, float]:
-    """Return the whitening filter of series as :func:`autoregression` does, and the power that it leaves."""
+    """Return the whitening filter of :func:`autoregression` and the variance of the whitened series."""
     return _core.coloured(series, most)
 
 
 def colour_covariances(through: Floats, power: float, count: int) -> Floats:
-    """Return autocovariances at lags 0 to ``count`` - 1 of noise that a filter makes white, of this power then."""
+    """Autocovariances at lags 0 to ``count`` - 1 of noise that a filter turns into white noise of this power."""
     return _core.colour_covariances(through, power, count)
 
 
 def whitened(series: Sequence[Floats], through: Floats) -> list[Floats]:
-    """Return series about their means through a whitening filter, without the samples in which it fills.
+    """Return mean-free series after a whitening filter, without the samples of its start-up.
 
-    What is not there is left out, and so is what the filter makes of it.
+    Output samples that depend on a missing sample are zero.
     """
     out = []
     for x in series:
@@ -161,5 +161,5 @@ def whitened(series: Sequence[Floats], through: Floats) -> list[Floats]:
 
 
 def is_constant(series: Sequence[Floats]) -> bool:
-    """Whether no run of a signal moves by more than rounding."""
+    """Whether no series varies by more than rounding."""
     return all(float(np.ptp(x)) <= CONSTANT * float(np.max(np.abs(x))) for x in series)

@@ -1,4 +1,4 @@
-"""Refuses arguments that are not what they should be, and finds the words for it."""
+"""Argument checks: numbers, choices, names, arrays, and the nearest valid spelling."""
 
 from __future__ import annotations
 
@@ -14,14 +14,14 @@ from numpy.typing import ArrayLike, NDArray
 
 from ftlm.errors import DataError, ModelError
 
-#: Environment variable that gives the threads of what does not say its own.
+#: Environment variable with the default number of threads.
 THREADS = "FTLM_THREADS"
-#: Kinds of NumPy's numbers that a real number may be; `float` of others drops their imaginary part, or counts days.
+#: NumPy dtype kinds of real numbers. `float` drops the imaginary part of a complex number and counts days of a date.
 _REAL = frozenset("fiuO")
 
 
 def shown(value: object, most: int = 60) -> str:
-    """Return a value as an error message shows it, whatever it is: cut off, and long integers by their length."""
+    """Return a value's representation for an error message, truncated; a long integer by its number of bits."""
     if type(value) is int and value.bit_length() > 3 * most:
         # A long integer has no decimal form in Python.
         return f"an integer of {value.bit_length()} bits"
@@ -33,7 +33,7 @@ def shown(value: object, most: int = 60) -> str:
 
 
 def words_of(error: BaseException, most: int = 500) -> str:
-    """Return what an error of somebody else's says: cut off, in characters that a file can hold."""
+    """Return the message of a foreign exception, truncated and reduced to encodable characters."""
     try:
         text = str(error)
     except Exception:
@@ -42,21 +42,21 @@ def words_of(error: BaseException, most: int = 500) -> str:
 
 
 def check_choice(name: str, value: object, known: Iterable[str]) -> None:
-    """Refuse anything but one of some words."""
+    """Raise unless a value is one of some strings."""
     words = list(known)
     if not isinstance(value, str) or value not in words:
         raise ModelError(f"{name} = {shown(value)} is not known; use {' or '.join(map(repr, words))}")
 
 
 def _is_number(value: object) -> bool:
-    """Whether a value may be a real number; a complex one is none, whatever its imaginary part."""
+    """Whether a value may be a real number; complex values are excluded."""
     if isinstance(value, (str, bytes, bytearray, bool, complex)):
         return False
     return getattr(getattr(value, "dtype", None), "kind", "f") in _REAL
 
 
 def whole_number(value: object) -> int | None:
-    """Return a value that is a whole number as an int, anything else as None; the message is the caller's."""
+    """Return an integral value as an int, anything else as None; the caller raises."""
     if not _is_number(value):
         return None
     try:
@@ -67,7 +67,7 @@ def whole_number(value: object) -> int | None:
 
 
 def check_seed(seed: object) -> int:
-    """Return the seed of random numbers as an int: any integer, NumPy's too, and neither a truth value nor 3.0."""
+    """Return a random seed as an int; floats and booleans are refused."""
     try:
         number = -1 if isinstance(seed, bool) else operator.index(seed)  # type: ignore[arg-type]
     except TypeError:
@@ -78,7 +78,7 @@ def check_seed(seed: object) -> int:
 
 
 def check_pulses(m: object, below: float = 1 << 62) -> int:
-    """Return a number of block pulses, of which the core counts fewer than 2^62."""
+    """Return the number of block pulses as an int below 2^62, the limit of the core."""
     pulses = whole_number(m)
     if pulses is None or not 1 <= pulses < below:
         raise ModelError(f"m = {m!r} is no number of pulses; give a whole number, at least 1")
@@ -86,12 +86,12 @@ def check_pulses(m: object, below: float = 1 << 62) -> int:
 
 
 def real_number(name: str, value: object) -> float:
-    """Return a real number as a float; it may be infinite or not a number, which is for the caller to judge.
+    """Return a real number as a float, which may be infinite or NaN.
 
     Raises
     ------
     ModelError
-        Text, nothing, a truth value, a complex number, or an integer beyond the range of floating point.
+        Text, None, a boolean, a complex number, or an integer beyond the range of floating point.
     """
     try:
         if not _is_number(value):
@@ -102,7 +102,7 @@ def real_number(name: str, value: object) -> float:
 
 
 def listed(names: Iterable[object], most: int = 40) -> str:
-    """Return names for an error message: quoted, joined, and cut off after `most` of them."""
+    """Return quoted names joined by commas, at most ``most`` of them, for an error message."""
     every = [repr(name) for name in names]
     if not every:
         return "none"
@@ -118,12 +118,12 @@ def nearest(word: object, names: Iterable[object]) -> str:
 
 
 def bad_rows(thing: str, what: str, first: int, count: int, way_out: str) -> DataError:
-    """Return the error for bad rows: the thing, the first 0-based row, the count and the way out."""
+    """Return the error for invalid rows: object, first 0-based row, count and remedy."""
     return DataError(f"{thing}: {what}, first at row {first}, {count} in all; {way_out}")
 
 
 def names_to_columns(argument: str, given: object) -> dict[str, Hashable]:
-    """Return {signal: column} for what a person gave: nothing, one name, a list of names or a mapping."""
+    """Return {signal: column} for None, one name, a list of names or a mapping."""
     if given is None:
         return {}
     if isinstance(given, str):
@@ -142,14 +142,14 @@ def names_to_columns(argument: str, given: object) -> dict[str, Hashable]:
 
 
 def as_mapping(argument: str, given: object, of: str = "array") -> Mapping[str, object]:
-    """Return a mapping by name as it is, and refuse anything else."""
+    """Return a mapping unchanged; raise for anything else."""
     if not isinstance(given, Mapping):
         raise DataError(f"{argument}= is a {type(given).__name__}; pass a dict of name: {of}")
     return given
 
 
 def check_known(what: str, given: Iterable[str], known: Sequence[str]) -> None:
-    """Refuse a name that does not occur in an equation."""
+    """Raise for a name that does not occur in the equation."""
     for name in given:
         if name not in known:
             near = difflib.get_close_matches(str(name), known, 1)
@@ -158,7 +158,7 @@ def check_known(what: str, given: Iterable[str], known: Sequence[str]) -> None:
 
 
 def available_threads() -> int:
-    """Cores that this process may use."""
+    """Number of cores that this process may use."""
     try:
         return len(os.sched_getaffinity(0))
     except AttributeError:  # not on macOS or Windows
@@ -166,12 +166,12 @@ def available_threads() -> int:
 
 
 def check_threads(threads: int | None) -> int:
-    """Threads to use: by default what ``FTLM_THREADS`` gives, else all cores.
+    """Return the number of threads to use: by default ``FTLM_THREADS``, else all cores.
 
     Raises
     ------
     ModelError
-        Fewer than one or more than 1 024, or ``FTLM_THREADS`` is no such number.
+        Fewer than one or more than 1024 threads, or an invalid ``FTLM_THREADS``.
     """
     if threads is None:
         given = os.environ.get(THREADS, "").strip()
@@ -190,12 +190,12 @@ Complex: TypeAlias = NDArray[np.complex128]
 
 
 def as_floats(name: str, values: object) -> NDArray[np.float64]:
-    """Return a float64 array of real numbers; never a view that is written to.
+    """Return a float64 array of real numbers, possibly a view of the argument.
 
     Raises
     ------
     DataError
-        Text, objects or complex numbers, rows of different lengths.
+        Text, objects, complex numbers, or rows of different lengths.
     """
     try:
         array = np.asarray(values)
@@ -209,7 +209,7 @@ def as_floats(name: str, values: object) -> NDArray[np.float64]:
 def along(
     name: str, values: ArrayLike, axis: int, work: Callable[[NDArray[np.float64]], NDArray[np.float64]]
 ) -> NDArray[np.float64]:
-    """Apply ``work``, which takes and returns rows, along one axis of an array."""
+    """Apply ``work``, which maps rows to rows, along one axis of an array."""
     array = as_floats(name, values)
     if array.ndim == 0 or not -array.ndim <= axis < array.ndim:
         raise DataError(f"{name} has {array.ndim} dimensions and no axis {axis}; give an array and one of its axes")

@@ -1,4 +1,4 @@
-"""Figures of an error: (45), RMSE, NR, fit."""
+"""Error metrics: error (45), RMSE, NR and fit."""
 
 from __future__ import annotations
 
@@ -28,13 +28,13 @@ from ftlm.utils.validation import Floats, as_floats
 
 
 def finite(value: float) -> float | None:
-    """For JSON, which has no infinity: None stands for a figure that is not finite."""
+    """Return a float for JSON, or None if it is not finite."""
     return float(value) if math.isfinite(value) else None
 
 
 @dataclass(frozen=True)
 class Metrics:
-    """The four figures of one output.
+    """Error metrics of one output.
 
     Parameters
     ----------
@@ -43,7 +43,7 @@ class Metrics:
     rmse
         Root mean square error (paper (46)).
     nr
-        Normalised residual RMSE / sigma(y) (paper (47)).
+        Normalized residual RMSE / sigma(y) (paper (47)).
     fit
         100 (1 - ‖y - ŷ‖ / ‖y - mean‖) in percent.
     """
@@ -58,12 +58,12 @@ class Metrics:
         return {name: finite(getattr(self, name)) for name in ("error", "rmse", "nr", "fit")}
 
 
-#: Figures that nothing is known of.
+#: Metrics of an unknown error.
 UNKNOWN = Metrics(math.nan, math.nan, math.nan, math.nan)
 
 
 def metrics(measured: ArrayLike, predicted: ArrayLike) -> Metrics:
-    """Error (45), RMSE (46), NR (47) and fit of a prediction.
+    """Return error (45), RMSE (46), NR (47) and fit of a prediction.
 
     Parameters
     ----------
@@ -73,7 +73,7 @@ def metrics(measured: ArrayLike, predicted: ArrayLike) -> Metrics:
     Returns
     -------
     Metrics
-        Not finite where the prediction is not; NR and fit of a constant measurement mean nothing.
+        Not finite if the prediction is not; NR and fit of a constant measurement are meaningless.
 
     Raises
     ------
@@ -89,7 +89,7 @@ def metrics(measured: ArrayLike, predicted: ArrayLike) -> Metrics:
 
 
 def pooled(measured: list[Floats], residuals: list[Floats]) -> Metrics:
-    """Figures over several runs, of what was read; each run's mean is its own."""
+    """Return metrics over several runs without missing samples; the fit uses each run's own mean."""
     known = [~np.isnan(y) for y in measured]
     if not all(k.all() for k in known):
         measured = [y[k] for y, k in zip(measured, known, strict=True)]
@@ -99,54 +99,55 @@ def pooled(measured: list[Floats], residuals: list[Floats]) -> Metrics:
     return Metrics(*_core.metrics(np.concatenate([y - np.mean(y) for y in measured]), np.concatenate(residuals)))
 
 
-#: Own-output orders closer to alpha than this make I^(alpha - nu) nearly the identity on smooth signals.
+#: Orders of an output's own terms closer to alpha than this make I^(alpha - nu) nearly the identity on smooth signals.
 NEAR_IDENTITY = 0.25
-#: A free run this many times worse than the equation error says that the equation error flatters.
+#: Ratio of output error to equation error (NR) above which the equation error is misleading.
 FLATTERED = 5.0
-#: Points of fit lost from estimation to validation beyond which the model describes its own data, not the machine.
+#: Drop of the fit from estimation to validation data, in percentage points, that indicates overfitting.
 LOST = 20.0
-#: A free run with a normalised residual above this explains nothing.
+#: Normalized residual (NR) of a simulation above which the model explains little of the output.
 USELESS = 0.5
-#: Free runs are refined until halving the step moves them by less than this share of their largest value,
+#: Change of a simulation on halving the step, relative to its largest value, at which refinement terminates.
 STILL = 1e-6
-#: or to so many pulses, four an interval at least; what still moves by more than VISIBLE then is said.
+#: Maximum number of pulses of a refined simulation (at least four per sampling interval), and the change on halving the
+#: step above which a warning reports that it has not converged.
 LARGEST_M = 1 << 20
 VISIBLE = 1e-3
 
 
 @dataclass(frozen=True)
 class Comparison:
-    """A model beside measured runs.
+    """Output error and equation error of a model on measured runs.
 
     Parameters
     ----------
     output_error, equation_error
-        Figures by output, over all runs: of the free run, and of the equation with measured signals on its right-hand
-        side.
+        Metrics by output, over all runs: of the simulation, and of the equation with measured signals on its
+        right-hand side.
     per_run
         The same for each run by name: (equation error, output error).
     simulated, measured
-        By output, one array a run: samples when they were read, or pulse means (see ``sampled``). What was not read is
-        NaN in ``measured``, and no figure of the output error counts it; that of the equation error is not known then.
+        By output, one array per run: samples at the sample times, or pulse means (see ``output_samples``). Missing
+        samples are NaN in ``measured`` and excluded from the output error; the equation error is unknown then.
     step
         Pulse width of each run [s], of the equation error.
     m
         Number of block pulses of the equation error.
     initial
-        Coefficients of the initial terms of the free run, one mapping a run: output -> exponent -> value. They belong
-        to that run alone.
+        Coefficients of the initial terms of the simulation, one mapping per run: output -> exponent -> value. They
+        apply to that run only.
     warnings
-        What makes these figures doubtful, in words.
+        Reasons to doubt these metrics.
     times
-        When each value of ``simulated`` and ``measured`` holds [s since the first row], one array a run.
-    sampled
-        Whether the output error is that of samples at the run's instants; False for pulse means, as the paper has them.
+        Time of each value of ``simulated`` and ``measured`` [s since the first sample], one array per run.
+    output_samples
+        Whether the output error compares samples at the sample times; False for pulse means, as in the paper.
     offsets
-        Unknown constants of the equations, one mapping a run: output -> ``"constant"`` [unit of D^alpha y] (and
-        ``"ramp"``, that a second) -> value. Estimated anew on each run; empty for a model without an offset, and for
-        an output whose run has a history beside it, which hides it.
-    unequated
-        Outputs without an equation error, by name, and why: it is not known where friction acts or samples are missing.
+        Unknown constants of the equations, one mapping per run: output -> ``"constant"`` [unit of D^alpha y] (and
+        ``"ramp"`` [that unit/s]) -> value. Estimated on each run separately; empty for a model without an offset, and
+        for an output whose initial history makes the offset unidentifiable.
+    without_equation_error
+        Outputs without an equation error, with the reason: friction acts on them, or samples are missing.
     """
 
     output_error: dict[str, Metrics]
@@ -165,11 +166,11 @@ class Comparison:
 
     @property
     def fit_percent(self) -> dict[str, float]:
-        """Fit of the free run in percent, by output."""
+        """Fit of the simulation in percent, by output."""
         return {name: figures.fit for name, figures in self.output_error.items()}
 
     def to_frame(self) -> Any:
-        """Both errors of every run as a pandas frame, by run, output and kind of error."""
+        """Return both errors of every run as a pandas frame, by run, output and kind of error."""
         rows = [
             {"run": run, "output": name, "of": kind, "error": f.error, "rmse": f.rmse, "nr": f.nr, "fit": f.fit}
             for run, equation, output in self.per_run
@@ -222,19 +223,19 @@ class Comparison:
         return comparison_html(self)
 
 
-#: Why an output has no equation error.
+#: Reasons for a missing equation error.
 RUBBED = "friction acts on it, and the sign of a measured velocity is that of its noise, most of all at rest"
 UNREAD = "not every sample of it was read, and the straight lines between the others are no measurement"
-#: Of an offset beside a history.
+#: Note on an offset that the initial history makes unidentifiable.
 HIDDEN = "not told apart from what the run did before its start; begin the run at rest to learn it"
 
 
 def compare(model: Solved, runs: Run | Sequence[Run], *, m: int | None = None) -> Comparison:
-    """Equation error and output error of a model on measured runs.
+    """Return equation error and output error of a model on measured runs.
 
-    The output error compares sample by sample: y[k], after the input of its row has acted, with the free run at that
-    instant on a grid refined until it stands still (as :func:`ftlm.simulate` has it), initial terms fitted to the run's
-    samples. Its fit is 100 (1 - ‖y - ŷ‖ / ‖y - mean y‖), in percent.
+    The output error compares each sample y[k] with the simulation (free run: only inputs and initial conditions are
+    used) at the same time, on a grid refined until converged as in :func:`ftlm.simulate`. Initial terms are fitted to
+    the samples of the run. The fit is 100 (1 - ‖y - ŷ‖ / ‖y - mean y‖), in percent.
 
     Parameters
     ----------
@@ -248,8 +249,8 @@ def compare(model: Solved, runs: Run | Sequence[Run], *, m: int | None = None) -
     Returns
     -------
     Comparison
-        On the data that a model was identified from, its figures are those printed with it. Initial terms, and offsets
-        where the structure has them, are estimated anew on each of these runs.
+        On the estimation data the metrics equal those of the identification. Initial terms, and offsets if the
+        structure has any, are estimated on each of these runs separately.
 
     Raises
     ------
@@ -263,12 +264,12 @@ def compare(model: Solved, runs: Run | Sequence[Run], *, m: int | None = None) -
 
 
 def free_runs(model: Solved, runs: Sequence[Run]) -> list[Sampled]:
-    """The free run on each run, with initial terms fitted to it, on a grid fine enough not to matter."""
+    """Simulate each run, with initial terms fitted to it, on a grid refined until converged."""
     return [refined(model, run, None, tolerance=STILL, largest_m=max(LARGEST_M, 4 * run.length)) for run in runs]
 
 
 def compared_samples(model: Solved, runs: Runs, free: Sequence[Sampled], *, m: int) -> Comparison:
-    """Compare free runs, sample by sample, and the equation error on m pulses, with these runs."""
+    """Compare simulations sample by sample, and the equation error on m pulses, with these runs."""
     full = records(runs, model.structure, m)
     parts = []
     for run, sampled, rec in zip(runs, free, full, strict=True):
@@ -292,14 +293,14 @@ def compared_samples(model: Solved, runs: Runs, free: Sequence[Sampled], *, m: i
 
 
 def _moves(sampled: Sampled) -> bool:
-    """Whether halving the step still moves a finite run visibly."""
+    """Whether halving the step still changes a finite simulation visibly."""
     return bool(np.all(np.isfinite(sampled.outputs)) and np.any(sampled.change > VISIBLE))
 
 
 def compare_means(model: Solved, runs: Run | Sequence[Run], *, m: int | None = None) -> Comparison:
-    """Both errors on the pulse means of m block pulses, as the paper's tables have them.
+    """Return both errors on the pulse means of m block pulses, as in the paper's tables.
 
-    Means average neighbours: with noise they flatter, and where few pulses carry a period they condemn.
+    Means average neighboring samples. They understate noise, and overstate errors if a period has few pulses.
     """
     several, m = _checked(model, runs, m)
     whole(several, "figures of pulse means")
@@ -313,7 +314,7 @@ def compare_means(model: Solved, runs: Run | Sequence[Run], *, m: int | None = N
 
 
 def _checked(model: Solved, runs: Run | Sequence[Run], m: int | None) -> tuple[Runs, int]:
-    """Runs that hold what the model needs, and the number of pulses."""
+    """Return runs that have all signals of the model, and the number of pulses."""
     check_solved(model)
     several = as_runs(runs)
     carried = min(run.length for run in several) - 1
@@ -325,14 +326,14 @@ def _checked(model: Solved, runs: Run | Sequence[Run], m: int | None) -> tuple[R
 
 
 def without_equation_error(why: Mapping[str, str]) -> list[str]:
-    """Outputs that have no equation error, in words."""
+    """Describe which outputs have no equation error, and why."""
     return [f"{name} has no equation error: {reason}" for name, reason in why.items()]
 
 
 def offsets_of(model: Solved, initial: Mapping[str, Mapping[float, float]]) -> dict[str, dict[str, float]]:
-    """Constants of the equations from the powers of t that they integrate to: c t^alpha / Gamma(alpha + 1).
+    """Return offsets of the equations from the powers of t that they integrate to: c t^alpha / Gamma(alpha + 1).
 
-    None of an equation whose run has a history beside them: its powers of t hide a constant.
+    Empty for an equation whose run has an initial history: its powers of t make a constant unidentifiable.
     """
     out: dict[str, dict[str, float]] = {}
     for item in model.equations:
@@ -350,7 +351,7 @@ def offsets_of(model: Solved, initial: Mapping[str, Mapping[float, float]]) -> d
 
 
 def offsets_in_words(comparison: Comparison) -> list[str]:
-    """Offsets of every run that has some, a line an output."""
+    """Describe the offsets of every run that has some, one line per output."""
     lines = []
     for (run, _, _), offsets in zip(comparison.per_run, comparison.offsets, strict=False):
         for output, values in offsets.items():
@@ -367,7 +368,7 @@ def offsets_in_words(comparison: Comparison) -> list[str]:
 
 @dataclass(frozen=True)
 class _Beside:
-    """A model beside one run, by output: the free run and what was measured, the equation's signal and its error."""
+    """Errors of a model on one run, by output: simulation, measurement, equation signal and equation error."""
 
     step: float
     initial: dict[str, dict[float, float]]
@@ -386,9 +387,9 @@ def _beside(
     *,
     gaps: Container[str] = (),
 ) -> _Beside:
-    """A free run with what it is compared with, and the equation error, with all signals behind the sensor filter.
+    """Return the errors of one run, with all signals filtered by the sensor filter.
 
-    The equation of an output with gaps has no error: it would be that of the straight lines over them.
+    An output with missing samples has no equation error: it would be that of the interpolated samples.
     """
     core, inputs, powers = full.core(), list(full.inputs), full.start
     missed = {
@@ -403,7 +404,7 @@ def _beside(
 def _comparison(
     model: Solved, runs: Sequence[Run], parts: Sequence[_Beside], m: int, times: list[Floats], *, sampled: bool
 ) -> Comparison:
-    """All runs together."""
+    """Pool the errors of all runs into a comparison."""
     equation_error, output_error = _figures(parts)
     # The runs' own figures may be known where those of all of them are not.
     rubbed = {e.output for e in model.equations if e.friction is not None}
@@ -426,7 +427,7 @@ def _comparison(
 
 
 def _figures(parts: Sequence[_Beside]) -> tuple[dict[str, Metrics], dict[str, Metrics]]:
-    """Figures of the equation error and of the free run, over these runs together."""
+    """Return metrics of the equation error and of the simulation, pooled over these runs."""
     outputs = parts[0].measured
     equation = {
         o: pooled([p.equated[o] for p in parts], [p.missed[o] for p in parts])
@@ -441,9 +442,10 @@ def _figures(parts: Sequence[_Beside]) -> tuple[dict[str, Metrics], dict[str, Me
 def near_identity(
     structure: Structure, equation_error: Mapping[str, Metrics], output_error: Mapping[str, Metrics]
 ) -> list[str]:
-    """Warnings in words where the equation error flatters a model.
+    """Warn where the equation error is misleading.
 
-    Own-output orders close to alpha reproduce any smooth output from itself; only the free run shows it.
+    Orders of an output's own terms close to alpha reproduce any smooth output from itself; only the simulation reveals
+    it.
     """
     warnings = []
     for item in structure.equations:
@@ -473,7 +475,7 @@ def near_identity(
 
 
 def validation_warnings(own: Comparison, validation: Comparison) -> list[str]:
-    """Validation runs that are those a model was identified from, and outputs whose fit is lost on the others."""
+    """Warn of validation runs that are estimation runs, and of outputs whose fit drops on the others."""
     warnings = []
     for k, (name, _, _) in enumerate(own.per_run):
         for j, (other, _, _) in enumerate(validation.per_run):
@@ -486,7 +488,7 @@ def validation_warnings(own: Comparison, validation: Comparison) -> list[str]:
 
 
 def lost_fits(before: Mapping[str, float], validation: Comparison) -> list[str]:
-    """Name outputs whose fit on other runs is far below that on the estimation data."""
+    """Warn of outputs whose fit on validation runs is far below that on the estimation data."""
     warnings = []
     for other, _, figures in validation.per_run:
         for output, f in figures.items():
@@ -510,8 +512,8 @@ def errors_table(
     Parameters
     ----------
     compared
-        (what the data were to the model, comparison), such as ``("estimation", result.comparison)``. Where a comparison
-        holds several runs, each follows with its own rows.
+        (role of the data, comparison), such as ``("estimation", result.comparison)``. Runs of a comparison with
+        several runs follow with their own rows.
     units
         Units of the outputs.
     title
@@ -558,7 +560,7 @@ def errors_table(
 
 
 def filter_state(exponent: float) -> str:
-    """What the exponent of an impulse, -1, or of a derivative of one stands for."""
+    """Label of a negative exponent: -1 is an impulse, lower ones are its derivatives."""
     return f"filter's state {round(-exponent)}"
 
 
@@ -588,7 +590,7 @@ def initial_terms_table(comparison: Comparison, *, title: str = "Initial terms o
 
 
 def warned(warnings: Sequence[str]) -> Markup:
-    """Return warnings as a list, or nothing."""
+    """Return warnings as an HTML list, or empty markup."""
     if not warnings:
         return Markup("")
     items = Markup("").join(Markup("<li>{}</li>").format(w) for w in warnings)

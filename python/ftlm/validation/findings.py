@@ -1,32 +1,32 @@
-"""Warnings in groups: what they are about, the most serious first, and what to do about each."""
+"""Findings on an estimate: groups of warnings by kind, most serious first, each with a remedy."""
 
 from __future__ import annotations
 
 from collections.abc import Iterable, Sequence
 from dataclasses import dataclass
 
-#: Warnings that a first screen shows; the others are behind "more".
+#: Maximum number of warning groups in a summary.
 SHOWN = 3
-#: A model with one of the first may not be used at all, with one of the second with care; the third are facts.
+#: Severity levels: the model must not be used, must be used with care, or has a note.
 BAD, CARE, FACT = "do not use", "with care", "fact"
 
 
 @dataclass(frozen=True)
 class Kind:
-    """One kind of concern.
+    """Kind of warning.
 
     Parameters
     ----------
     name
-        In one word.
+        Identifier of one word.
     level
         ``"do not use"``, ``"with care"`` or ``"fact"``.
     what
-        What such warnings say, in a few words.
+        Summary of such warnings.
     remedy
-        What to do.
+        Recommended action.
     marks
-        Words by which its warnings are known, in those of saved models too.
+        Phrases by which its warnings are recognized, those of saved models included.
     """
 
     name: str
@@ -36,7 +36,7 @@ class Kind:
     marks: tuple[str, ...] = ()
 
 
-#: From the most serious on. The first whose mark is in a warning has it.
+#: Kinds, most serious first. A warning has the first kind of which it contains a mark.
 KINDS = (
     Kind(
         "unstable",
@@ -210,7 +210,7 @@ OTHER = Kind("other", FACT, "to know", "see the warning")
 
 
 def kind_of(warning: str) -> Kind:
-    """Kind of a warning, by its words."""
+    """Return the kind of a warning by the phrases in it."""
     return next((kind for kind in KINDS if any(mark in warning for mark in kind.marks)), OTHER)
 
 
@@ -221,9 +221,9 @@ class Concern:
     Parameters
     ----------
     kind
-        What they are about, and what to do.
+        Kind, with its remedy.
     warnings
-        In full.
+        Full texts.
     """
 
     kind: Kind
@@ -231,18 +231,18 @@ class Concern:
 
     @property
     def count(self) -> str:
-        """How many more there are than the first; nothing for one alone."""
+        """Number of warnings beyond the first, as text; empty for a single warning."""
         more = len(self.warnings) - 1
         return f" (and {more} more alike)" if more else ""
 
     @property
     def remedy(self) -> str:
-        """What to do; nothing where the first warning says so itself."""
+        """Remedy; empty if the warning itself states it."""
         return "" if self.kind.remedy == OTHER.remedy else self.kind.remedy
 
 
 def concerns(warnings: Iterable[str]) -> tuple[Concern, ...]:
-    """Warnings grouped by kind, the most serious kind first; those of no kind stand alone."""
+    """Group warnings by kind, most serious first; a warning of no kind is a group of its own."""
     by: dict[str, list[str]] = {}
     for warning in dict.fromkeys(warnings):
         by.setdefault(kind_of(warning).name, []).append(warning)
@@ -251,6 +251,6 @@ def concerns(warnings: Iterable[str]) -> tuple[Concern, ...]:
 
 
 def left_over(found: Sequence[Concern]) -> str:
-    """How many warnings a first screen does not show, in words; nothing where it shows all."""
+    """Text on the number of warnings that a summary omits; empty if it omits none."""
     count = sum(len(c.warnings) for c in found) - len(found[:SHOWN])
     return f"{count} more warning{'' if count == 1 else 's'}" if count else ""

@@ -1,4 +1,4 @@
-"""Information criteria: how much a model explains, less a price for every number in it."""
+"""Information criteria of a model: AIC, AICc and BIC."""
 
 from __future__ import annotations
 
@@ -16,12 +16,12 @@ from ftlm.validation.residual_tests import Residuals
 
 @dataclass(frozen=True)
 class InformationCriteria:
-    """How much a model explains, less a price for every number in it; lower is better on the same runs.
+    """Information criteria of a model: fit minus a penalty per parameter; lower is better on the same runs.
 
     Parameters
     ----------
     parameters
-        Numbers estimated: orders, coefficients, initial terms, one noise level an output.
+        Number of estimated parameters: orders, coefficients, initial terms, and one noise level per output.
     samples
         Residuals in all outputs and runs.
     log_likelihood
@@ -50,7 +50,7 @@ class InformationCriteria:
 
 
 def information_criteria(tests: Residuals, parameters: int) -> InformationCriteria:
-    """AIC, AICc and BIC of a model from its residuals; orders count as parameters like coefficients.
+    """Return AIC, AICc and BIC of a model from its residuals; orders count like coefficients.
 
     Parameters
     ----------
@@ -62,8 +62,8 @@ def information_criteria(tests: Residuals, parameters: int) -> InformationCriter
     Returns
     -------
     InformationCriteria
-        Comparable between models of the same outputs on the same runs. Coloured residuals make every difference look
-        surer than it is.
+        Comparable between models of the same outputs on the same runs. Correlated residuals exaggerate the
+        significance of differences.
 
     Raises
     ------

@@ -1,4 +1,4 @@
-"""Whether an input answers an output: what Sims's regression on past and future inputs finds in the residuals."""
+"""Sims's test of feedback from an output to an input, by regression of residuals on past and future inputs."""
 
 from __future__ import annotations
 
@@ -36,32 +36,32 @@ from ftlm.utils.statistics import (
 from ftlm.utils.validation import Floats, whole_number
 from ftlm.validation.comparison import finite, free_runs
 
-#: Future samples of the input that are looked at: an answer within a few samples hides among many.
+#: Horizons of future input samples. Fast feedback is diluted in a long horizon, so both are tested.
 AHEAD = (5, 25)
-#: Share of open loops that one of the two regressions is allowed to call closed.
+#: Significance level: probability that a test reports feedback in an open loop.
 LEVEL_FEEDBACK = 0.01
-#: Past samples that stand by themselves; those before are averaged over ever longer blocks, each wider by this factor.
+#: Number of single past samples among the regressors. Older samples are averaged over blocks that grow by this factor.
 DENSE = 25
 WIDER = 1.5
-#: Rows that are looked at: more of them tell the same.
+#: Maximum number of samples in the regression.
 MOST_ROWS = 50_000
-#: Share of a column that the columns before it must leave.
+#: Relative norm of the residual of a column on the columns before it, below which it is collinear.
 SPANNED = 1e-6
 
 
 @dataclass(frozen=True)
 class FeedbackTest:
-    """Whether later inputs tell something of a residual that earlier inputs do not.
+    """Test whether later inputs explain a part of a residual that earlier inputs do not.
 
     Parameters
     ----------
     statistic, limit
-        Sum of squares that later inputs explain in units of the residual's variance, and the value that one open loop
-        in a hundred exceeds.
+        Sum of squares explained by later inputs, in units of the residual's variance, and its 99 % quantile in an
+        open loop.
     instant
-        Whether only the input of the same sample does: a controller that answers at once, or direct feed-through.
-    decided
-        Whether there were samples enough, and an input that moves.
+        Whether only the input of the same sample does: feedback without delay, or direct feedthrough.
+    conclusive
+        Whether there were enough samples and a varying input.
     """
 
     statistic: float
@@ -71,7 +71,7 @@ class FeedbackTest:
 
     @property
     def found(self) -> bool:
-        """Whether the input answers the output."""
+        """Whether the input depends on the output."""
         return self.decided and self.statistic > self.limit
 
     def to_dict(self) -> dict[str, Any]:
@@ -81,9 +81,9 @@ class FeedbackTest:
 
 
 def past_columns(signal: Floats, first: int, reach: int, *, dense: int = DENSE, wider: float = WIDER) -> list[Floats]:
-    """Samples of a signal from ``first`` to ``dense`` rows back, then means of ever longer blocks up to ``reach``.
+    """Return samples of a signal ``first`` to ``dense`` samples back, then means of growing blocks up to ``reach``.
 
-    What is before the first row counts as the first value, so a reach may be as long as the signal and no longer.
+    Samples before the first one are taken as equal to it, so ``reach`` may be at most the length of the signal.
     """
     count = signal.size
     padded = np.concatenate([np.full(count, signal[0]), signal])
@@ -103,20 +103,20 @@ def feedback_test(
 ) -> FeedbackTest:
     """Regress residuals on past and future of an input: without feedback the future adds nothing (Sims, 1972).
 
-    An input that is made beforehand cannot know the noise, however wrong the model is: what a model leaves out follows
-    the past of the input, of which long memory is taken in.
+    An input designed in advance is independent of the noise, however wrong the model is. Unmodeled dynamics depend on
+    the past of the input, of which a long history is included.
 
     Parameters
     ----------
     white
-        Residuals, a run each, through the filter that makes them white.
+        Residuals through the whitening filter, one array per run.
     signal
         The input, through the same filter.
     others
-        Other inputs, whose past may explain the residuals. Their values of the same sample stay out: where one answers
-        at once, it makes whatever drives it look like an answer.
+        Other inputs, whose past may explain the residuals. Their values of the same sample are excluded: with feedback
+        without delay in one of them, its own inputs would look like feedback.
     direct
-        Whether the model has direct feed-through from this input, so that its value of the same sample is no answer.
+        Whether the model has direct feedthrough from this input, so that its value of the same sample is no feedback.
     """
     table = Regressors.of(white, signal, others)
     at_once = None if table is None else table.statistic(1 if direct else 0)
@@ -130,22 +130,22 @@ def feedback_test(
 
 @dataclass(frozen=True)
 class Regressors:
-    """Residuals beside what may explain them, turned so that all rows but as many as there are columns are 0.
+    """Residuals and their regressors after an orthogonal transformation to as many rows as columns.
 
-    A rotation of the rows leaves every inner product as it is, and with it every least squares.
+    The transformation preserves inner products, and with them every least-squares fit.
 
     Parameters
     ----------
     past
-        Earlier samples of the input and of the others, and a constant.
+        Earlier samples of the input and of the other inputs, and a constant.
     now
-        The input's sample of the same row, less its first of that run, as those of the past are.
+        Input at the same sample, minus its first value in the run.
     future
-        The input's sample of the same row, then those after it.
+        Input at the same sample and at later samples.
     residuals
-        What is to be explained.
+        Residuals, the dependent variable.
     rows
-        How many rows there were.
+        Number of samples before the transformation.
     """
 
     past: Floats
@@ -158,7 +158,7 @@ class Regressors:
     def of(
         cls, white: Sequence[Floats], signal: Sequence[Floats], others: Sequence[Sequence[Floats]]
     ) -> Regressors | None:
-        """Of residuals and inputs, a run each; None where every run is too short."""
+        """Build from residuals and inputs, one array per run; None if every run is too short."""
         parts, rows, width = [], 0, 0
         sizes = [e.size for e in white if e.size > DENSE + AHEAD[-1]]
         reach = min(sizes, default=0) // 2
@@ -184,7 +184,7 @@ class Regressors:
         return cls(turned[:, :width], turned[:, width], turned[:, width + 1 : -1], turned[:, -1], count)
 
     def statistic(self, first: int) -> tuple[float, float] | None:
-        """What the input from ``first`` samples ahead on, 0 or 1, explains, and its limit, of the better horizon."""
+        """Statistic and limit of the inputs from ``first`` (0 or 1) samples ahead, at the more significant horizon."""
         past = np.column_stack([self.past, self.now]) if first else self.past
         future = self.future[:, first:]
         if self.rows < 2 * (past.shape[1] + future.shape[1]):
@@ -211,34 +211,34 @@ class Regressors:
         return worst
 
 
-#: Orders closer than this are one order.
+#: Difference below which two orders count as equal.
 GRAIN = 1e-9
-#: Residuals below this share of the output's deviation are discretisation or quantisation, not a missing term.
+#: Ratio of residual RMS to the output's standard deviation below which discretization or quantization explains it.
 NEGLIGIBLE = 1e-3
 
 
 @dataclass(frozen=True)
 class CorrelationTest:
-    """Correlations of residuals and whether they could be chance.
+    """Correlations of residuals, and a test whether they could be chance.
 
     Parameters
     ----------
     lags
-        Lags in samples; at a lag k > 0 the residual comes k samples after the other signal.
+        Lags in samples; at a lag k > 0 the residual is k samples later than the other signal.
     values
         Correlation at each lag.
     band
         Half-width of the 99 % band of one correlation.
     statistic, limit
-        What is judged, and the value that one true model in a hundred exceeds: for whiteness the Ljung-Box sum over
-        all positive lags, for independence the largest correlation at lags >= 0 against a band for all of them.
+        Test statistic and its 99 % limit for a true model. Whiteness: the Ljung-Box sum over all positive lags.
+        Independence: the largest correlation at lags >= 0, against a simultaneous band for all of them.
     passed
-        Whether the statistic is within a limit that it could have exceeded; False where the residuals are not finite.
-    decided
-        Whether the test could fail at all. A correlation never exceeds 1: where its limit does, or where the input does
-        not move, nothing is shown, and the test has neither passed nor failed.
+        Whether the test is conclusive and the statistic within its limit; False if the residuals are not finite.
+    conclusive
+        Whether the test could fail at all. It cannot if the limit of a correlation exceeds 1 or the input is constant;
+        then the test has neither passed nor failed.
     first
-        Least lag that is judged: 1 where an input answers the output within the sample, 0 else.
+        Smallest lag tested: 1 for an input with feedback within the sample, otherwise 0.
     """
 
     lags: NDArray[np.int64]
@@ -252,12 +252,12 @@ class CorrelationTest:
 
     @property
     def failed(self) -> bool:
-        """Whether the test was decided, and not passed."""
+        """Whether the test is conclusive and not passed."""
         return self.decided and not self.passed
 
     @property
     def verdict(self) -> str:
-        """``"passed"``, ``"failed"`` or ``"undecided"``."""
+        """Result as text: ``"passed"``, ``"failed"`` or ``"undecided"``."""
         return "undecided" if not self.decided else "passed" if self.passed else "failed"
 
     @property
@@ -267,7 +267,7 @@ class CorrelationTest:
 
     @property
     def largest(self) -> tuple[int, float]:
-        """Lag and value of the largest correlation that the statistic judges."""
+        """Lag and value of the largest correlation among the tested lags."""
         judged = np.where((self.lags >= self.first) & (self.values != 1.0), np.abs(self.values), -1.0)
         at = int(np.argmax(judged))
         return int(self.lags[at]), float(self.values[at])
@@ -290,8 +290,8 @@ class OutputResiduals:
     Parameters
     ----------
     residuals
-        Measured minus simulated samples, one array a run, without its first and last sample; SI units. NaN where the
-        output was not read.
+        Measured minus simulated samples, one array per run, without its first and last sample; SI units. NaN at
+        missing samples.
     rms
         Their root mean square over all runs.
     nr
@@ -299,10 +299,10 @@ class OutputResiduals:
     whiteness
         Autocorrelations.
     inputs
-        Cross-correlations with each input, both through the filter that makes the residuals white.
-    loops
-        By input that its equation reads, whether LATER inputs tell something of a residual that earlier ones do not: a
-        closed loop, not a missing term.
+        Cross-correlations with each input, both signals through the whitening filter of the residuals.
+    feedback_tests
+        By input of its equation, whether LATER inputs explain a part of a residual that earlier ones do not: a closed
+        loop, not a missing term.
     """
 
     residuals: list[Floats]
@@ -314,12 +314,12 @@ class OutputResiduals:
 
     @property
     def feedback(self) -> tuple[str, ...]:
-        """Inputs that answer this output: the runs were made in a closed loop."""
+        """Inputs with feedback from this output: the runs were recorded in a closed loop."""
         return tuple(name for name, test in self.loops.items() if test.found)
 
     @property
     def judged(self) -> dict[str, CorrelationTest]:
-        """Tests of the inputs that move, since one that does not can do nothing; of all where none does."""
+        """Tests of the inputs that vary, or of all inputs if none does."""
         return {n: t for n, t in self.inputs.items() if t.decided or not math.isnan(t.limit)} or self.inputs
 
     def to_dict(self) -> dict[str, Any]:
@@ -347,7 +347,7 @@ class Residuals:
     step
         Sampling step of each run [s].
     refinement
-        Pulses a sample interval at which the free run was computed.
+        Pulses per sampling interval of the simulation.
     initial_terms
         Number of initial terms that were fitted to these runs.
     """
@@ -365,7 +365,7 @@ class Residuals:
 
     @property
     def independent(self) -> dict[str, bool]:
-        """Whether the residuals of each output were found independent of all earlier inputs; not if it is undecided."""
+        """Whether the residuals of each output are independent of all earlier inputs; False if inconclusive."""
         return {name: all(t.passed for t in output.judged.values()) for name, output in self.outputs.items()}
 
     @property
@@ -379,7 +379,7 @@ class Residuals:
 
     @property
     def independence(self) -> dict[str, str]:
-        """``"yes"``, ``"no"`` or ``"undecided"`` for each output: whether its residuals are independent."""
+        """Independence of the residuals of each output: ``"yes"``, ``"no"`` or ``"undecided"``."""
         return {
             name: "no" if any(t.failed for t in output.inputs.values()) else "yes" if free else "undecided"
             for (name, output), free in zip(self.outputs.items(), self.independent.values(), strict=True)
@@ -391,17 +391,17 @@ class Residuals:
 
     @property
     def passed(self) -> bool:
-        """Whether all residuals pass both tests; False where one is undecided, inputs that do not move apart."""
+        """Whether all residuals pass both tests; False if one is inconclusive, constant inputs excepted."""
         return all(test.passed for test in self._judged)
 
     @property
     def decided(self) -> bool:
-        """Whether every test could fail, inputs that do not move apart, or one has failed."""
+        """Whether every test is conclusive, constant inputs excepted, or one has failed."""
         return any(test.failed for test in self._judged) or all(test.decided for test in self._judged)
 
     @property
     def verdict(self) -> str:
-        """``"passed"``, ``"FAILED"`` where one test has, or ``"undecided"``."""
+        """Result as text: ``"passed"``, ``"FAILED"`` if one test has failed, or ``"undecided"``."""
         return "passed" if self.passed else "FAILED" if self.decided else "undecided"
 
     def to_dict(self) -> dict[str, Any]:
@@ -434,15 +434,15 @@ class Residuals:
         return residuals_html(self)
 
 
-#: Lags of the tests that every identification makes; the convention of the field.
+#: Number of lags of the residual tests of every identification; the usual convention.
 LAGS = 25
 
 
 def resid(model: Solved, runs: Run | Sequence[Run], *, lags: int = LAGS) -> Residuals:
-    """Test whether the residuals of a model's free run are white, and independent of the inputs.
+    """Test whether the residuals of a simulation are white, and independent of the inputs.
 
-    Residuals are measured samples minus the free run at the same instants, with initial terms and offsets fitted to
-    each run, on a grid fine enough not to matter. Each run is taken about its own mean; runs are pooled.
+    Residuals are measured minus simulated samples, with initial terms and offsets fitted to each run, on a grid refined
+    until converged. Each run is centered about its own mean; runs are pooled.
 
     Parameters
     ----------
@@ -456,7 +456,7 @@ def resid(model: Solved, runs: Run | Sequence[Run], *, lags: int = LAGS) -> Resi
     Returns
     -------
     Residuals
-        ``.passed`` says both; prints as a table.
+        ``.all_passed`` covers both tests; prints as a table.
 
     Raises
     ------
@@ -477,8 +477,8 @@ def resid(model: Solved, runs: Run | Sequence[Run], *, lags: int = LAGS) -> Resi
     together with 99 % (Šidák). Loops: residuals regressed on past and future of each input, both through the
     same filter; an input that was made beforehand cannot know the noise, however wrong the model (Sims, Money, income,
     and causality, American Economic Review 62, 1972, 540-552). Where an input answers within a sample, lag 0 is not
-    judged. A limit above 1 decides nothing, nor does an input that does not move. Both tests are of
-    the free run: an equation error that passes proves nothing.
+    judged. A test with a limit above 1, or with a constant input, is inconclusive. Both tests use the
+    simulation: white equation errors prove nothing.
     """
     check_solved(model)
     several = as_runs(runs)
@@ -492,7 +492,7 @@ def resid(model: Solved, runs: Run | Sequence[Run], *, lags: int = LAGS) -> Resi
 
 
 def check_length(runs: Runs, lags: int) -> None:
-    """Refuse runs that are too short for these lags."""
+    """Raise DataError if a run is too short for these lags."""
     for run in runs:
         if run.length < 2 * lags + 3:
             raise DataError(
@@ -502,7 +502,7 @@ def check_length(runs: Runs, lags: int) -> None:
 
 
 def tested_residuals(model: Solved, runs: Runs, free: Sequence[Sampled], *, lags: int) -> Residuals:
-    """Both tests of the residuals of free runs at the inner samples of these runs; refuse runs that are too short."""
+    """Run both tests on the residuals of simulations at the inner samples of these runs."""
     check_length(runs, lags)
     residuals: dict[str, list[Floats]] = {o: [] for o in model.outputs}
     for run, sampled in zip(runs, free, strict=True):
@@ -537,9 +537,9 @@ def _tested(
     deviation: float,
     commands: Mapping[str, bool],
 ) -> OutputResiduals:
-    """Both tests of one output's residuals, and signs of a loop, of those that are there; all fail where not finite.
+    """Run all tests of one output without its missing samples; they fail if residuals are not finite.
 
-    Commands are the inputs of the runs, each with whether the model has direct feed-through from it.
+    ``commands`` maps each input of the runs to whether the model has direct feedthrough from it.
     """
     everything = np.concatenate([e[~gone] for e, gone in zip(series, gaps, strict=True)])
     with np.errstate(over="ignore", invalid="ignore"):
@@ -568,12 +568,12 @@ def _tested(
 
 
 def _lost(lags: NDArray[np.int64]) -> CorrelationTest:
-    """Return a test that nothing passes: there are no correlations."""
+    """Return a failed test without correlations, for residuals that are not finite."""
     return CorrelationTest(lags, np.full(lags.size, math.nan), math.nan, math.inf, math.nan, passed=False)
 
 
 def _whiteness(series: list[Floats], count: int, lags: int) -> CorrelationTest:
-    """Ljung and Box's sum against its limit."""
+    """Ljung-Box test of whiteness."""
     limit = chi_squared_99(lags)
     own, pairs = autocorrelations(series, lags)
     statistic = ljung_box(own, pairs)
@@ -584,7 +584,7 @@ def _whiteness(series: list[Floats], count: int, lags: int) -> CorrelationTest:
 def _independence(
     white: list[Floats], signal: list[Floats], colour: Floats, lags: int, *, first: int
 ) -> CorrelationTest:
-    """Largest correlation at lags from ``first`` on against the band that holds for all of them together."""
+    """Largest correlation at lags from ``first`` on, against a simultaneous band for all of them."""
     around = np.arange(-lags, lags + 1)
     if is_constant(signal):
         return CorrelationTest(around, np.zeros(around.size), math.nan, 0.0, math.nan, passed=False, decided=False)
@@ -597,7 +597,7 @@ def _independence(
 
 
 def residual_sentences(tests: Residuals) -> list[str]:
-    """Every failed test in words, and signs of feedback."""
+    """Describe every failed test, and detected feedback."""
     words = []
     for name, output in tests.outputs.items():
         if not math.isfinite(output.rms):
@@ -626,7 +626,7 @@ def residual_sentences(tests: Residuals) -> list[str]:
 
 
 def loop_sentence(name: str, signal: str, output: OutputResiduals) -> str:
-    """What a closed loop found in residuals means for what was estimated."""
+    """Describe feedback found in residuals and its consequence for the estimates."""
     test = output.loops[signal]
     how = f"{signal} answers what {name} did before" if not test.instant else f"{signal} answers {name} within a sample"
     or_else = "" if not test.instant else f" (or {signal} feeds through to {name} directly: then add that term)"
@@ -640,9 +640,9 @@ def loop_sentence(name: str, signal: str, output: OutputResiduals) -> str:
 
 
 def residual_warnings(tests: Residuals, *, floor: float = NEGLIGIBLE) -> list[str]:
-    """Failed residual tests in words, without those of outputs that are explained to within ``floor`` of their size.
+    """Describe failed residual tests, except for outputs with a normalized residual of at most ``floor``.
 
-    A closed loop counts where residuals are not white: only then does it bias the output error.
+    Feedback is reported only if residuals are not white: only then does it bias the output-error estimate.
     """
     kept = {name: output for name, output in tests.outputs.items() if not output.nr <= floor}
     harmless = {n: replace(output, loops={}) if output.whiteness.passed else output for n, output in kept.items()}
