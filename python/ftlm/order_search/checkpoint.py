@@ -646,7 +646,7 @@ class Store:
             self.flush()
 
     def flush(self) -> None:
-        """Write all pending"""
+        """Write all pending frames."""
         due = []
         for key, frame in self._waiting.items():
             same = not frame.anew and self._failures.get(key) == frame.failures

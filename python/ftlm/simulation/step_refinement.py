@@ -1,4 +1,4 @@
-"""Refinement of the step of a simulation until converged: Richardson extrapolation, and superposition for long records."""
+"""Step refinement of a simulation: Richardson extrapolation, and superposition for long records."""
 
 from __future__ import annotations
 
@@ -333,7 +333,7 @@ class Answers:
 
 
 def long_run(model: Solved, run: Run, initial: Terms | None, *, tolerance: float, largest_m: int) -> Sampled | None:
-    """Samples of a long run, as :func:`ftlm.simulation.step_refinement.refined` has them; None for one that whole grids must tell.
+    """Simulate a long run as :func:`refined` does; None if superposition does not apply.
 
     The initial conditions of the model are resolved. The refinement is that of the whole record.
     """
