@@ -130,8 +130,13 @@ def measure(plant: Plant, seeds: int) -> list[str]:
         ways.setdefault("ftlm, no start", []).append(
             (seconds, found.model.compare(unseen).output_error["y"].fit, held, off)
         )
-        spread = [{n: v * float(np.exp(rng.normal(0, 1.0 if n in ("a0", "a1", "b0") else 0.2)))
-                   for n, v in plant.first.items()} for _ in range(5)]  # fmt: skip
+        spread = [
+            {
+                n: v * float(np.exp(rng.normal(0, 1.0 if n in ("a0", "a1", "b0") else 0.2)))
+                for n, v in plant.first.items()
+            }
+            for _ in range(5)
+        ]
         for name, starts in (("SciPy, one start", [plant.first]), ("SciPy, best of six", [plant.first, *spread])):
             seconds, (values, errors) = spent(lambda s=starts, y=y, p=plant: by_scipy(p, square, y, s))
             held = sum(abs(values[n] - plant.truth[n]) <= 1.96 * errors[n] for n in plant.truth)
@@ -153,10 +158,12 @@ def main() -> None:
     """Measure, print and keep."""
     seeds = next((int(word) for word in sys.argv[1:] if word.isdigit()), 5)
     lines = [
-        f"{SAMPLES} samples, noise {NOISE:.0%}, seeds 0 to {seeds - 1}.", "",
+        f"{SAMPLES} samples, noise {NOISE:.0%}, seeds 0 to {seeds - 1}.",
+        "",
         "| machine | way | fit on unseen data, median [%] | least | error of alpha, median | intervals that hold the "
-        "truth [%] | processor time over ftlm's |", "| --- | --- | --- | --- | --- | --- | --- |",
-    ]  # fmt: skip
+        "truth [%] | processor time over ftlm's |",
+        "| --- | --- | --- | --- | --- | --- | --- |",
+    ]
     for plant in PLANTS:
         lines += measure(plant, seeds)
         print("\n".join(lines[-3:]), flush=True)

@@ -38,7 +38,7 @@ def recovery(seeds: range, levels: list[float]) -> None:
             run = with_noise(clean_run(stage, shape), level, [seed, round(level), stage])
             start = time.process_time()
             try:
-                fit = ftlm.identify(run, structure(stage), method="output-error", threads=1).joint
+                fit = ftlm.identify(run, structure(stage), method="output-error", threads=1).fit
             except ftlm.FtlmError as error:
                 lost[key] = lost.get(key, 0) + 1
                 print(*key, seed, error, flush=True)
@@ -53,9 +53,13 @@ def recovery(seeds: range, levels: list[float]) -> None:
                 f"{n} {values[n]:.5g} for {v:.5g}" for (n, v), i in zip(known.items(), inside, strict=True) if not i
             )
             print(
-                *key, seed, f"largest |z| {np.abs(z).max():.2f}", f"{time.process_time() - start:.1f} s",
-                f"outside: {outside or 'none'}", flush=True,
-            )  # fmt: skip
+                *key,
+                seed,
+                f"largest |z| {np.abs(z).max():.2f}",
+                f"{time.process_time() - start:.1f} s",
+                f"outside: {outside or 'none'}",
+                flush=True,
+            )
         print("| stage | input | dB | largest |z| < 5 | in 95 % intervals | within 1.96 errors | largest |z| |")
         print("| --- | --- | --- | --- | --- | --- | --- |")
         for key, scores in found.items():
@@ -65,13 +69,18 @@ def recovery(seeds: range, levels: list[float]) -> None:
                 f"| {key[0]} | {key[1]} | {key[2]:g} | {near} of {len(z) + lost.get(key, 0)} | "
                 f"{100.0 * np.mean(held[key]):.1f} | {100.0 * np.mean(z < NORMAL_95):.1f} | {z.max():.1f} |",
                 flush=True,
-            )  # fmt: skip
+            )
 
 
 SECTIONS: dict[str, Callable[[], Iterator[str]]] = {
-    "measured": measured, "orders": orders, "gains": gains, "hubs": hubs, "steps": steps,
-    "left-out": left_out, "rival": rival,
-}  # fmt: skip
+    "measured": measured,
+    "orders": orders,
+    "gains": gains,
+    "hubs": hubs,
+    "steps": steps,
+    "left-out": left_out,
+    "rival": rival,
+}
 
 
 def main() -> None:

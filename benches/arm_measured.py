@@ -32,16 +32,24 @@ ANGLES = {"theta11": "th11_deg", "theta12": "th12_deg", "theta21": "th21_deg", "
 def arm_run(name: str, thin: int = 4) -> ftlm.Run:
     """One of the two laboratories' runs, thinned to 8 ms, in rad."""
     run = ftlm.load(
-        FOLDER / f"two_link_{name}" / f"{name}.csv", time="t_s", inputs={"I1": "Im1_meas_A", "I2": "Im2_meas_A"},
-        outputs=ANGLES, units=dict.fromkeys(ANGLES, "deg"), intersample={"I1": "foh", "I2": "foh"},
-    )  # fmt: skip
+        FOLDER / f"two_link_{name}" / f"{name}.csv",
+        time="t_s",
+        inputs={"I1": "Im1_meas_A", "I2": "Im2_meas_A"},
+        outputs=ANGLES,
+        units=dict.fromkeys(ANGLES, "deg"),
+        intersample={"I1": "foh", "I2": "foh"},
+    )
     if name == "psf":
-        run = run.slice(1.1, 19.5)
+        run = run.window(1.1, 19.5)
     signals = {n: run[n][::thin] for n in (*run.inputs, *run.outputs)}
     return ftlm.Run.from_arrays(
-        step=thin * run.step, inputs={n: signals[n] for n in run.inputs}, outputs={n: signals[n] for n in run.outputs},
-        units=run.units, intersample=run.intersample, name=name,
-    )  # fmt: skip
+        step=thin * run.step,
+        inputs={n: signals[n] for n in run.inputs},
+        outputs={n: signals[n] for n in run.outputs},
+        units=run.units,
+        intersample=run.intersample,
+        name=name,
+    )
 
 
 def step_run(path: Path, thin: int = 4) -> ftlm.Run:
@@ -62,8 +70,12 @@ STAGES: dict[str, list[tuple[str, str, tuple[str, ...], bool]]] = {
         ("stage coupling", "{a} + {d} - {h} + p D^2 theta21 + q D^2 theta22", ("theta12", "theta22"), False),
         ("offset", "{a} + {d} - {h} + p D^2 theta21 + q D^2 theta22", ("theta12", "theta22"), True),
         ("hub angle", "{a} + {d} - {h} + p D^2 theta21 + q D^2 theta22 + e theta11", ("theta12", "theta22"), True),
-        ("hub angle, rate of theta22", "{a} + {d} - {h} + p D^2 theta21 + q D^2 theta22 + e theta11 + w D theta22",
-         ("theta12", "theta22"), True),
+        (
+            "hub angle, rate of theta22",
+            "{a} + {d} - {h} + p D^2 theta21 + q D^2 theta22 + e theta11 + w D theta22",
+            ("theta12", "theta22"),
+            True,
+        ),
         ("gain", "{a} + {d} + b {h} + p D^2 theta21 + q D^2 theta22 + e theta11", ("theta12", "theta22"), True),
     ],
     "theta22": [
@@ -72,11 +84,15 @@ STAGES: dict[str, list[tuple[str, str, tuple[str, ...], bool]]] = {
         ("stage coupling", "{a} + {d} - {h} + p D^2 theta11 + q D^2 theta12", ("theta12", "theta22"), False),
         ("offset", "{a} + {d} - {h} + p D^2 theta11 + q D^2 theta12", ("theta12", "theta22"), True),
         ("hub angle", "{a} + {d} - {h} + p D^2 theta11 + q D^2 theta12 + e theta21", ("theta12", "theta22"), True),
-        ("offset, rate of theta12", "{a} + {d} - {h} + p D^2 theta11 + q D^2 theta12 + w D theta12",
-         ("theta12", "theta22"), True),
+        (
+            "offset, rate of theta12",
+            "{a} + {d} - {h} + p D^2 theta11 + q D^2 theta12 + w D theta12",
+            ("theta12", "theta22"),
+            True,
+        ),
         ("gain", "{a} + {d} + b {h} + p D^2 theta11 + q D^2 theta12 + e theta21", ("theta12", "theta22"), True),
     ],
-}  # fmt: skip
+}
 #: What may be fractional: the link's elasticity, its damping, the hub's motion.
 FREED = {
     "whole": {},
@@ -109,30 +125,68 @@ def structure(text: str, filtered: Sequence[str], offset: bool) -> ftlm.Structur
 #: Beyond the stages: the torque of link 2's spring in place of its acceleration, the -1 of a rigid gauge, what was best
 #: while a deflection that drives was filtered twice, and all of the hub's gain freed.
 OTHERS = [
-    ("spring torque of link 2, gauge, b = -1", "D^2 theta12 = a theta12 + d D theta12 - D^2 theta11 + p D^2 theta21"
-     " + q theta22 + s theta21 + r theta11", ("theta12", "theta22"), False),
-    ("the same, offset", "D^2 theta12 = a theta12 + d D theta12 - D^2 theta11 + p D^2 theta21"
-     " + q theta22 + s theta21 + r theta11", ("theta12", "theta22"), True),
-    ("the same, offset, b free", "D^2 theta12 = a theta12 + d D theta12 + b D^2 theta11 + p D^2 theta21"
-     " + q theta22 + s theta21 + r theta11", ("theta12", "theta22"), True),
-    ("theta22 filtered twice", "D^2 theta12 = a theta12 + d D theta12 + b D^2 theta11 + p D^2 theta21"
-     " + q theta22 + s theta21 + r theta11", ("theta12",), False),
-    ("theta22 filtered twice, a spring-pot", "D^2 theta12 = a D^beta theta12 + d D theta12 + b D^2 theta11"
-     " + p D^2 theta21 + q theta22 + s theta21 + r theta11", ("theta12",), False),
-    ("rate of theta22, b free", "D^2 theta12 = a theta12 + d D theta12 + b D^2 theta11 + p D^2 theta21"
-     " + q D^2 theta22 + e theta11 + w D theta22", ("theta12", "theta22"), True),
-    ("rate of theta12, b free", "D^2 theta22 = a theta22 + d D theta22 + b D^2 theta21 + p D^2 theta11"
-     " + q D^2 theta12 + w D theta12", ("theta12", "theta22"), True),
-    ("gain, no offset, no hub angle", "D^2 theta22 = a theta22 + d D theta22 + b D^2 theta21 + p D^2 theta11"
-     " + q D^2 theta12", ("theta12", "theta22"), False),
-    ("gain, no hub angle", "D^2 theta22 = a theta22 + d D theta22 + b D^2 theta21 + p D^2 theta11 + q D^2 theta12",
-     ("theta12", "theta22"), True),
-]  # fmt: skip
+    (
+        "spring torque of link 2, gauge, b = -1",
+        "D^2 theta12 = a theta12 + d D theta12 - D^2 theta11 + p D^2 theta21 + q theta22 + s theta21 + r theta11",
+        ("theta12", "theta22"),
+        False,
+    ),
+    (
+        "the same, offset",
+        "D^2 theta12 = a theta12 + d D theta12 - D^2 theta11 + p D^2 theta21 + q theta22 + s theta21 + r theta11",
+        ("theta12", "theta22"),
+        True,
+    ),
+    (
+        "the same, offset, b free",
+        "D^2 theta12 = a theta12 + d D theta12 + b D^2 theta11 + p D^2 theta21 + q theta22 + s theta21 + r theta11",
+        ("theta12", "theta22"),
+        True,
+    ),
+    (
+        "theta22 filtered twice",
+        "D^2 theta12 = a theta12 + d D theta12 + b D^2 theta11 + p D^2 theta21 + q theta22 + s theta21 + r theta11",
+        ("theta12",),
+        False,
+    ),
+    (
+        "theta22 filtered twice, a spring-pot",
+        "D^2 theta12 = a D^beta theta12 + d D theta12 + b D^2 theta11"
+        " + p D^2 theta21 + q theta22 + s theta21 + r theta11",
+        ("theta12",),
+        False,
+    ),
+    (
+        "rate of theta22, b free",
+        "D^2 theta12 = a theta12 + d D theta12 + b D^2 theta11 + p D^2 theta21"
+        " + q D^2 theta22 + e theta11 + w D theta22",
+        ("theta12", "theta22"),
+        True,
+    ),
+    (
+        "rate of theta12, b free",
+        "D^2 theta22 = a theta22 + d D theta22 + b D^2 theta21 + p D^2 theta11 + q D^2 theta12 + w D theta12",
+        ("theta12", "theta22"),
+        True,
+    ),
+    (
+        "gain, no offset, no hub angle",
+        "D^2 theta22 = a theta22 + d D theta22 + b D^2 theta21 + p D^2 theta11 + q D^2 theta12",
+        ("theta12", "theta22"),
+        False,
+    ),
+    (
+        "gain, no hub angle",
+        "D^2 theta22 = a theta22 + d D theta22 + b D^2 theta21 + p D^2 theta11 + q D^2 theta12",
+        ("theta12", "theta22"),
+        True,
+    ),
+]
 
 
 def numbers(found: ftlm.Identification, asked: Sequence[str] = ()) -> str:
     """Values with standard errors, orders with intervals."""
-    joint = found.joint
+    joint = found.fit
     assert joint is not None
     out = []
     for name, value in zip(joint.names, joint.values.tolist(), strict=True):
@@ -199,10 +253,11 @@ def orders(outputs: Sequence[str] = ("theta12", "theta22")) -> Iterator[str]:
 #: the other gauge read, in which the ratio of both stands. Signals, whole orders, coefficients; -1 where there is none.
 GAUGES = {
     "theta12": (
-        [("theta11", 2, ""), ("theta21", 2, "p"), ("theta21", 0, "s"), ("theta11", 0, "r")], [("theta22", 0, "q")],
+        [("theta11", 2, ""), ("theta21", 2, "p"), ("theta21", 0, "s"), ("theta11", 0, "r")],
+        [("theta22", 0, "q")],
     ),
     "theta22": ([("theta21", 2, ""), ("theta11", 2, "p")], [("theta12", 2, "q")]),
-}  # fmt: skip
+}
 
 
 def gains() -> Iterator[str]:
@@ -219,9 +274,14 @@ def gains() -> Iterator[str]:
             known, run = found.coefficients, runs[judge]
             # SciPy's responses of the fitted link: the two gains are linear in them.
             table = lsim_link.columns(
-                {n: np.asarray(run[n]) for n in ANGLES}, run.step, known["a"], known["d"],
-                [(n, m) for n, m, _ in (*hubs, *other)], seen, offset=True,
-            )  # fmt: skip
+                {n: np.asarray(run[n]) for n in ANGLES},
+                run.step,
+                known["a"],
+                known["d"],
+                [(n, m) for n, m, _ in (*hubs, *other)],
+                seen,
+                offset=True,
+            )
             parts = [known[c] if c else -1.0 for *_, c in (*hubs, *other)]
             shares = table[:, : len(hubs)] @ parts[: len(hubs)], table[:, len(hubs) : len(parts)] @ parts[len(hubs) :]
             columns = np.column_stack((*shares, table[:, len(parts) :]))
@@ -242,13 +302,20 @@ def gains() -> Iterator[str]:
 LINKS = (
     "D^2 theta12 = a2 theta12 + d2 D theta12 - D^2 theta11 + p2 D^2 theta21 + q2 D^2 theta22 + e2 theta11",
     "D^2 theta22 = a4 theta22 + d4 D theta22 - D^2 theta21 + p4 D^2 theta11 + q4 D^2 theta12",
-)  # fmt: skip
+)
 RATES = (" + w2 D theta22", " + w4 D theta12")
 #: About what either link has alone, driven by the other as it was measured: found from nowhere, psf's fit has -17 %.
 NEAR = {
-    "a2": -187.0, "d2": -0.6, "p2": -0.14, "q2": -0.33, "e2": -0.6,
-    "a4": -460.0, "d4": -2.0, "p4": -2.0, "q4": -2.5,
-}  # fmt: skip
+    "a2": -187.0,
+    "d2": -0.6,
+    "p2": -0.14,
+    "q2": -0.33,
+    "e2": -0.6,
+    "a4": -460.0,
+    "d4": -2.0,
+    "p4": -2.0,
+    "q4": -2.5,
+}
 
 
 def hubs() -> Iterator[str]:
@@ -257,10 +324,12 @@ def hubs() -> Iterator[str]:
     for name in ("psf", "lqr"):
         run = arm_run(name)
         runs[name] = ftlm.Run.from_arrays(
-            step=run.step, inputs={n: run[n] for n in ("theta11", "theta21")},
-            outputs={n: run[n] for n in ("theta12", "theta22")}, name=name,
+            step=run.step,
+            inputs={n: run[n] for n in ("theta11", "theta21")},
+            outputs={n: run[n] for n in ("theta12", "theta22")},
+            name=name,
             intersample=dict.fromkeys(("theta11", "theta21"), "foh"),
-        )  # fmt: skip
+        )
     yield "| both links from the hubs | fitted on | theta12: psf, lqr | theta22: psf, lqr | numbers |"
     yield "| --- | --- | --- | --- | --- |"
     sensor = ftlm.SensorFilter.low_pass(["theta12", "theta22"])

@@ -54,7 +54,7 @@ def main() -> None:
     for name, run in runs.items():
         before: tuple[int, float] | None = None
         for step in arguments.steps:
-            lattice = ftlm.lattice(step=step, alpha=tuple(arguments.alpha))
+            lattice = ftlm.order_grid(step=step, alpha=tuple(arguments.alpha))
             wall, cpu = time.perf_counter(), time.process_time()
             found = ftlm.search_orders(run, equation, lattice, **options)
             wall, cpu = time.perf_counter() - wall, time.process_time() - cpu
@@ -67,9 +67,10 @@ def main() -> None:
             best = ", ".join(f"{n} {v:g}" for n, v in found.table[0].orders.items())
             lines.append(
                 f"{name}, step {step:g}: {found.candidates} candidates, {cpu:.1f} s of processors, {wall:.1f} s, "
-                f"{cpu / found.candidates * 1e9:.1f} ns each{grown}; bound {found.pruned['bound']} "
-                f"({found.boxed} in boxes), stopped early "
-                f"{found.pruned['stopped early']}, beaten {found.pruned['beaten']}; best {found.table[0].score:.6g} "
+                f"{cpu / found.candidates * 1e9:.1f} ns each{grown}; bound {found.exclusion_counts['bound']} "
+                f"({found.excluded_by_box} in boxes), stopped early "
+                f"{found.exclusion_counts['stopped early']}, beaten {found.exclusion_counts['beaten']}; best "
+                f"{found.table[0].score:.6g} "
                 f"({best}), last kept {found.table[-1].score:.6g}"
             )
             print(lines[-1], flush=True)
@@ -78,7 +79,7 @@ def main() -> None:
                 brute = ftlm.search_orders(run, equation, lattice, early_stopping=False, **options)
                 cpu = time.process_time() - cpu
                 # Every candidate was run: what is not kept was beaten, or has no score.
-                followed = len(brute.table) + sum(brute.pruned[k] for k in ("beaten", "singular", "diverged"))
+                followed = len(brute.table) + sum(brute.exclusion_counts[k] for k in ("beaten", "singular", "diverged"))
                 same = found.table == brute.table and followed == brute.candidates == found.candidates
                 lines.append(
                     f"{name}, step {step:g}: all {followed} candidates run to their end in {cpu:.0f} s of processors, "

@@ -37,14 +37,15 @@ def main() -> None:
         for within in arguments.within:
             wall, cpu = time.perf_counter(), time.process_time()
             proved = ftlm.certify_orders(
-                run, equation, ftlm.lattice(alpha=tuple(arguments.alpha)), within=within, apart=arguments.apart, m=M
+                run, equation, ftlm.order_grid(alpha=tuple(arguments.alpha)), within=within, apart=arguments.apart, m=M
             )
             wall, cpu = time.perf_counter() - wall, time.process_time() - cpu
             best = ", ".join(f"{n} {v:.5g}" for n, v in proved.orders.items())
             lines.append(
                 f"{name}, alpha {arguments.alpha[0]:g} to {arguments.alpha[1]:g}, orders {arguments.apart:g} apart, "
-                f"{within:g} asked: proved {proved.within:.4g} (at least {proved.at_least:.5g}, best {proved.best:.5g} "
-                f"at {best}), {proved.cells} boxes, {proved.open} left, {cpu:.1f} s of processors, {wall:.1f} s"
+                f"{within:g} asked: proved {proved.proved_tolerance:.4g} (at least {proved.lower_bound:.5g}, best "
+                f"{proved.best:.5g} "
+                f"at {best}), {proved.cells} boxes, {proved.open_cells} left, {cpu:.1f} s of processors, {wall:.1f} s"
             )
             print(lines[-1], flush=True)
     if arguments.write:

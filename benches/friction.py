@@ -94,8 +94,9 @@ def sledge(seed: int, noise: float, rows: int = 601) -> ftlm.Run:
 
     y, _ = friction.between_events(lambda t: 4.0 * pulled(t), times, 0.5, 0.5, more=0.5, speed=0.2, spring=4.0)
     y += noise * np.std(y) * rng.standard_normal(rows)
-    return ftlm.Run.from_arrays(step=0.02, inputs={"u": pulled(times)}, outputs={"y": y}, intersample={"u": "foh"},
-                                name=f"sledge {seed}")  # fmt: skip
+    return ftlm.Run.from_arrays(
+        step=0.02, inputs={"u": pulled(times)}, outputs={"y": y}, intersample={"u": "foh"}, name=f"sledge {seed}"
+    )
 
 
 def covered(
@@ -119,8 +120,10 @@ def stribeck(seeds: int) -> None:
     for noise in (0.002, 0.005, 0.02):
         z, counts, taken = covered(structure, ([sledge(seed, noise)] for seed in range(seeds)), STICKS)
         mean = ", ".join(f"{v:+.2f}" for v in z.mean(axis=0))
-        print(f"| {noise:g} | {counts} of {seeds} | {mean} | {np.abs(z).max():.2f} | {statistics.median(taken):.2g} |",
-              flush=True)  # fmt: skip
+        print(
+            f"| {noise:g} | {counts} of {seeds} | {mean} | {np.abs(z).max():.2f} | {statistics.median(taken):.2g} |",
+            flush=True,
+        )
 
 
 def arm(seed: int, noise: float, *, offset: float = 0.0, start: tuple[float, ...] = (0.0, 0.0, 0.0, 0.0)) -> ftlm.Run:
@@ -135,8 +138,13 @@ def arm(seed: int, noise: float, *, offset: float = 0.0, start: tuple[float, ...
         lambda t: pulled(t) + offset, times, (30.0, 0.4, -1.5), (90.0, 1.2), 4.0, start=start
     )
     angles += noise * np.std(angles, axis=1)[:, None] * rng.standard_normal(angles.shape)
-    return ftlm.Run.from_arrays(step=0.01, inputs={"u": pulled(times)}, outputs={"x": angles[0], "q": angles[1]},
-                                intersample={"u": "foh"}, name=f"arm {seed}")  # fmt: skip
+    return ftlm.Run.from_arrays(
+        step=0.01,
+        inputs={"u": pulled(times)},
+        outputs={"x": angles[0], "q": angles[1]},
+        intersample={"u": "foh"},
+        name=f"arm {seed}",
+    )
 
 
 def coupled(seeds: int) -> None:
@@ -144,13 +152,16 @@ def coupled(seeds: int) -> None:
     for noise, moving in ((0.003, False), (0.02, False), (0.003, True)):
         more = {"initial": "caputo", "offset": "constant"} if moving else {"initial": "rest"}
         pairs = ((0.5, (0.2, 0.8, 0.02, -0.1)), (-0.3, (0.0, 0.0, 0.03, 0.0)))
-        moved = ([arm(2 * seed + k, noise, offset=o, start=s) for k, (o, s) in enumerate(pairs)]
-                 for seed in range(seeds))  # fmt: skip
+        moved = (
+            [arm(2 * seed + k, noise, offset=o, start=s) for k, (o, s) in enumerate(pairs)] for seed in range(seeds)
+        )
         still = ([arm(seed, noise)] for seed in range(seeds))
         z, counts, taken = covered(ftlm.equation(ARM, **more), moved if moving else still, ARM_TRUTH)
         kind = "two runs in motion, offsets" if moving else "one run from rest"
-        print(f"| {noise:g} | {kind} | {counts} of {seeds} | "
-              f"{np.abs(z).max():.2f} | {statistics.median(taken):.2g} |", flush=True)  # fmt: skip
+        print(
+            f"| {noise:g} | {kind} | {counts} of {seeds} | {np.abs(z).max():.2f} | {statistics.median(taken):.2g} |",
+            flush=True,
+        )
 
 
 def two(seeds: int) -> None:
@@ -160,8 +171,7 @@ def two(seeds: int) -> None:
         structure = ftlm.equation(two_frictions.WORDS, initial="caputo" if any(start) else "rest")
         z, counts, taken = covered(structure, ([two_frictions.noisy(seed, start)] for seed in range(seeds)), truth)
         kind = "in motion" if any(start) else "from rest"
-        print(f"| {kind} | {counts} of {seeds} | {np.abs(z).max():.2f} | {statistics.median(taken):.2g} |",
-              flush=True)  # fmt: skip
+        print(f"| {kind} | {counts} of {seeds} | {np.abs(z).max():.2f} | {statistics.median(taken):.2g} |", flush=True)
 
 
 def coupled_measured() -> None:
@@ -200,12 +210,20 @@ def timed(work: Any) -> float:
 
 def run_of(path: Path, current: str, *, name: str, **options: Any) -> ftlm.Run:
     """A run of the arm at 8 ms, angles in rad."""
-    run = ftlm.load(path, time="t_s", inputs={"I1": current}, outputs={"theta11": "th11_deg", "theta12": "th12_deg"},
-                    units={"theta11": "deg", "theta12": "deg"}, **options)  # fmt: skip
+    run = ftlm.load(
+        path,
+        time="t_s",
+        inputs={"I1": current},
+        outputs={"theta11": "th11_deg", "theta12": "th12_deg"},
+        units={"theta11": "deg", "theta12": "deg"},
+        **options,
+    )
     return ftlm.Run.from_arrays(
-        step=4 * run.step, inputs={"I1": run["I1"][::4]}, outputs={n: run[n][::4] for n in ("theta11", "theta12")},
+        step=4 * run.step,
+        inputs={"I1": run["I1"][::4]},
+        outputs={n: run[n][::4] for n in ("theta11", "theta12")},
         name=name,
-    )  # fmt: skip
+    )
 
 
 def measured() -> None:
@@ -222,8 +240,11 @@ def measured() -> None:
     # In the first four the command stays below what the amplifier gives; the limit is seen in the step of -30 degrees.
     for fitted, current in ((FITTED, "I1"), (SEEN, "I1"), (SEEN, SATURATES)):
         for words in ("", RUBS):
-            told(ftlm.equation(HUB.format(current=current, rubs=words), initial="caputo"), [steps[n] for n in fitted],
-                 steps)  # fmt: skip
+            told(
+                ftlm.equation(HUB.format(current=current, rubs=words), initial="caputo"),
+                [steps[n] for n in fitted],
+                steps,
+            )
 
 
 def measured_stribeck() -> None:
@@ -256,8 +277,11 @@ def told(structure: ftlm.Structure, fitted: list[ftlm.Run], runs: dict[str, ftlm
     for name, run in runs.items():
         there = found.model.compare(run)
         fits = ", ".join(f"{n} {v:.2f}" for n, v in there.fit_percent.items())
-        print(f"    {name} {'fitted' if name in names else 'judged'}: {fits}, "
-              f"offset {there.offsets[0]['theta11']['constant']:+.3f}", flush=True)  # fmt: skip
+        print(
+            f"    {name} {'fitted' if name in names else 'judged'}: {fits}, "
+            f"offset {there.offsets[0]['theta11']['constant']:+.3f}",
+            flush=True,
+        )
 
 
 WHAT = ("recovery", "stribeck", "speed", "measured", "measured-stribeck", "coupled", "coupled-measured", "two")
@@ -270,10 +294,15 @@ def main() -> None:
     parser.add_argument("--seeds", type=int, default=20)
     asked = parser.parse_args()
     {
-        "recovery": lambda: recovery(asked.seeds), "stribeck": lambda: stribeck(asked.seeds), "speed": speed,
-        "measured": measured, "measured-stribeck": measured_stribeck, "coupled": lambda: coupled(asked.seeds),
-        "coupled-measured": coupled_measured, "two": lambda: two(asked.seeds),
-    }[asked.what]()  # fmt: skip
+        "recovery": lambda: recovery(asked.seeds),
+        "stribeck": lambda: stribeck(asked.seeds),
+        "speed": speed,
+        "measured": measured,
+        "measured-stribeck": measured_stribeck,
+        "coupled": lambda: coupled(asked.seeds),
+        "coupled-measured": coupled_measured,
+        "two": lambda: two(asked.seeds),
+    }[asked.what]()
 
 
 if __name__ == "__main__":

@@ -192,8 +192,9 @@ def left(plant: motion.Plant, seed: int, noise: float) -> dict[str, tuple[float,
     rows, over, step = 500, 4, 0.05
     m, fine = rows * over, step / over
     u = np.repeat(motion.held_command(2 * rows, seed, 20), over)
-    truth = np.array([plant.alpha, *(c for c, _ in plant.own), *(b for b, _ in plant.inputs), *(
-        nu for _, nu in plant.own if nu)])  # fmt: skip
+    truth = np.array(
+        [plant.alpha, *(c for c, _ in plant.own), *(b for b, _ in plant.inputs), *(nu for _, nu in plant.own if nu)]
+    )
 
     def system(numbers: np.ndarray, length: int) -> tuple[np.ndarray, np.ndarray]:
         orders = iter(numbers[1 + len(plant.own) + len(plant.inputs) :])

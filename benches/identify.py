@@ -101,8 +101,10 @@ def state_space(python: str) -> None:
         for name, run in runs.items():
             signals = [np.asarray(run[n]) for n, _ in TERMS]
             if way != "as measured":
-                signals = [s if n in FILTERED else s[0] + response(STOCK[-1:], STOCK, s - s[0], run.step)
-                           for s, (n, _) in zip(signals, TERMS, strict=True)]  # fmt: skip
+                signals = [
+                    s if n in FILTERED else s[0] + response(STOCK[-1:], STOCK, s - s[0], run.step)
+                    for s, (n, _) in zip(signals, TERMS, strict=True)
+                ]
             kept |= {f"{name}.y": run["theta22"][:, None], f"{name}.u": np.stack(signals, axis=1)}
         with tempfile.TemporaryDirectory() as folder:
             file = Path(folder) / "runs.npz"
@@ -175,10 +177,13 @@ def main() -> None:
     if asked.alone:
         for case in asked.cases:
             cases = {
-                "long": lambda: long(asked.samples), "longest": lambda: long(LONGEST), "rival": rival,
-                "jax": lambda: state_space(asked.jax), "psf": lambda: arm("five", ["psf"]),
+                "long": lambda: long(asked.samples),
+                "longest": lambda: long(LONGEST),
+                "rival": rival,
+                "jax": lambda: state_space(asked.jax),
+                "psf": lambda: arm("five", ["psf"]),
                 "lqr": lambda: arm("five", ["lqr"]),
-            }  # fmt: skip
+            }
             cases.get(case, lambda case=case: arm(case))()
         return
     lines = [heading(), "", "| case | processor s | thousand FFTs | peak MB | before | found |", "| --- " * 6 + "|"]

@@ -22,7 +22,7 @@ import numpy as np
 from scipy.signal import lfilter, lsim
 
 import ftlm
-from ftlm.estimation.confidence_intervals import bent_numbers, valley_of
+from ftlm.estimation.confidence_intervals import likelihood_of, nonlinear_parameters
 from ftlm.utils.statistics import NORMAL_95
 from results import append, heading
 
@@ -53,9 +53,12 @@ DRIVEN = {"mu": 0.2, "d": -40.0, "a": -80.0, "b": -0.8}
 def driven() -> tuple[Floats, Floats, float, str]:
     """D^2 y = d D^mu y + a y + b D^2 u from rest; u: the measured hub angle from 1.1 s to 10.3 s, linear in between."""
     run = ftlm.load(
-        DATA / "two_link_psf" / "psf.csv", time="t_s", inputs={"u": "th11_deg"}, outputs={"y": "th12_deg"},
+        DATA / "two_link_psf" / "psf.csv",
+        time="t_s",
+        inputs={"u": "th11_deg"},
+        outputs={"y": "th12_deg"},
         units={"u": "deg", "y": "deg"},
-    ).slice(1.1, 10.3)  # fmt: skip
+    ).window(1.1, 10.3)
     u, step = run["u"][::THIN] - run["u"][0], THIN * run.step
     places = np.arange(2 * FINE * (u.size - 1) + 1) / (2 * FINE)
     fine = np.interp(places, np.arange(u.size), u)
@@ -116,11 +119,11 @@ def fitted(job: tuple[str, int]) -> dict[str, Any]:
     e = lfilter([np.sqrt(1.0 - case.colour**2)], [1.0, -case.colour], white)[200:]
     run = ftlm.Run.from_arrays(
         inputs={"u": u}, outputs={"y": y + case.noise * np.std(y) * e}, step=step, intersample={"u": between}
-    )  # fmt: skip
+    )
     begin = time.perf_counter()
     found = ftlm.identify(run, ftlm.equation(case.words, initial="rest"), threads=1, intervals="quadratic")
     fit = time.perf_counter()
-    bent = bent_numbers(valley_of(found), 0.95)
+    bent = nonlinear_parameters(likelihood_of(found), 0.95)
     test = time.perf_counter()
     try:
         profiles = found.profile(threads=1)
@@ -129,17 +132,21 @@ def fitted(job: tuple[str, int]) -> dict[str, Any]:
         found = ftlm.identify(run, ftlm.equation(case.words, initial="rest"), threads=1, intervals="profile")
         profiles = found.profiles
     end = time.perf_counter()
-    values, errors = found.joint_values, found.standard_errors
+    values, errors = found.parameter_values, found.standard_errors
     numbers = {}
     for n, truth in case.truth.items():
         half = NORMAL_95 * errors[n]
         own = profiles[n]
         off = max(abs(own.low - values[n] + half), abs(own.high - values[n] - half)) / half
         numbers[n] = {
-            "quadratic": abs(truth - values[n]) <= half, "profile": truth in own, "open": own.is_open,
-            "bent": n in bent, "off": off > OFF, "runs": own.evaluations,
-        }  # fmt: skip
-    correlation = np.abs(found.joint.correlation) if found.joint is not None else np.zeros((1, 1))
+            "quadratic": abs(truth - values[n]) <= half,
+            "profile": truth in own,
+            "open": own.is_open,
+            "bent": n in bent,
+            "off": off > OFF,
+            "runs": own.evaluations,
+        }
+    correlation = np.abs(found.fit.correlation) if found.fit is not None else np.zeros((1, 1))
     np.fill_diagonal(correlation, 0.0)
     times = (fit - begin, test - fit, end - test)
     return {"numbers": numbers, "correlation": float(np.nanmax(correlation)), "times": times}
@@ -154,11 +161,12 @@ def main() -> None:
     parser.add_argument("--write", action="store_true", help="append to benches/RESULTS.md")
     arguments = parser.parse_args()
     lines = [
-        f"{heading()}: {arguments.seeds} seeds, 95 % intervals", "",
+        f"{heading()}: {arguments.seeds} seeds, 95 % intervals",
+        "",
         "| record | largest correlation | number | covered, quadratic | covered, profile | open ends | told to bend "
         "| off by a tenth | of these told | free runs | fit, test, profile of all, s |",
         "| --- | --- | --- | --- | --- | --- | --- | --- | --- | --- | --- |",
-    ]  # fmt: skip
+    ]
     print("\n".join(lines))
     with ProcessPoolExecutor(arguments.workers) as pool:
         for name in arguments.cases:

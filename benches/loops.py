@@ -92,7 +92,7 @@ def one_offset(task: tuple[str, float, int, str]) -> tuple[bool, bool, list[floa
     start = time.process_time()
     found = ftlm.identify(run, structure, offset=offset, threads=1)
     taken = time.process_time() - start
-    values = {**found.joint_values, **found.coefficients}
+    values = {**found.parameter_values, **found.coefficients}
     errors = [values[n] - v for n, v in truth.items()]
     told = any("unknown constant" in w for w in found.warnings)
     return bool(found.comparison.offsets), told, errors, float(np.mean(covered(found, truth))), taken
@@ -126,7 +126,7 @@ def cell(seeds: int) -> Iterator[str]:
             run = loops.cell_run(50_000, 0.01, hold, seed, noise=0.01)
             start = time.process_time()
             found = ftlm.identify(run, loops.CELL_STRUCTURE, threads=1)
-            z = [(found.joint_values[n] - v) / found.standard_errors[n] for n, v in truth.items()]
+            z = [(found.parameter_values[n] - v) / found.standard_errors[n] for n, v in truth.items()]
             ended.append((z, time.process_time() - start, found))
         z = np.array([e[0] for e in ended])
         last = ended[-1][2]

@@ -46,8 +46,15 @@ def own_run(seed):
     """Ten seconds of the arm, motor 1 driven at random; with less where chance led to a limit switch or a trip."""
     for amplitude in (0.4, 0.3, 0.2):
         try:
-            return rig.record(input="prbs", period=0.1, amplitude=(amplitude, 0.0), duration=10.0, seed=seed,
-                              offset=OFFSET, sensor_filter="stock")  # fmt: skip
+            return rig.record(
+                input="prbs",
+                period=0.1,
+                amplitude=(amplitude, 0.0),
+                duration=10.0,
+                seed=seed,
+                offset=OFFSET,
+                sensor_filter="stock",
+            )
         except ftlm.RigFault as fault:
             print(f"seed {seed}, {amplitude} A: {fault}", file=sys.stderr)
     raise SystemExit(f"seed {seed} has no run of ten seconds")
@@ -62,8 +69,8 @@ def fitted(run, text):
 
 def loops(pid, delay=0.0):
     """Both hubs; hub 2 is held by a plain one. Angles reach the controllers so much later."""
-    hold = control.Realised(control.FractionalPid(20.0, 50.0, 0.5, 1.0, 1.0), RATE, limit=1.19)
-    return Late(control.HubLoops(control.Realised(pid, RATE, limit=0.93), hold), delay)
+    hold = control.DiscretePid(control.FractionalPid(20.0, 50.0, 0.5, 1.0, 1.0), RATE, limit=1.19)
+    return Late(control.JointControllers(control.DiscretePid(pid, RATE, limit=0.93), hold), delay)
 
 
 class Late:
@@ -94,7 +101,7 @@ class Lqr:
         b = np.array([[0.0], [0.0], [arm.g], [-arm.g]])
         weights = np.diag([1 / 0.02**2, 1 / 0.05**2, 0.0, 0.0])
         self.gain = (b.T @ solve_continuous_are(a, b, weights, np.eye(1)))[0]
-        self.hold = control.Realised(control.FractionalPid(20.0, 50.0, 0.5, 1.0, 1.0), RATE, limit=1.19)
+        self.hold = control.DiscretePid(control.FractionalPid(20.0, 50.0, 0.5, 1.0, 1.0), RATE, limit=1.19)
         self.reset()
 
     def reset(self):
@@ -152,8 +159,13 @@ def of_seed(seed):
         design, shapers, took = designed(run, kind)
         mode = shapers["zv"].modes[0]
         loop = loops(design.pid)
-        told = {"frequency": mode.frequency, "damping": mode.damping, "pid": design.pid.to_dict(), "seconds": took,
-                "phase": design.within("phase")}  # fmt: skip
+        told = {
+            "frequency": mode.frequency,
+            "damping": mode.damping,
+            "pid": design.pid.to_dict(),
+            "seconds": took,
+            "phase": design.margin_interval("phase"),
+        }
         told["unshaped"] = moved(loop, ramp(), seed=1000 + seed)
         for name, shaper in shapers.items():
             told[name] = moved(loop, shaper.filter(ramp(), RATE), seed=1000 + seed)
@@ -177,13 +189,17 @@ def table(kept):
         for name in ("zv", "zvd"):
             left = np.array([r[kind][name] or np.nan for r in rows])
             times = plain / left
-            print(f"{kind} {name}: {1e3 * np.nanmedian(plain):.2f} -> {1e3 * np.nanmedian(left):.3f} mrad, "
-                  f"median {np.nanmedian(times):.1f} times less, least {np.nanmin(times):.1f}, "
-                  f"at least 10 in {np.sum(times >= 10)} of {np.sum(np.isfinite(times))}")  # fmt: skip
+            print(
+                f"{kind} {name}: {1e3 * np.nanmedian(plain):.2f} -> {1e3 * np.nanmedian(left):.3f} mrad, "
+                f"median {np.nanmedian(times):.1f} times less, least {np.nanmin(times):.1f}, "
+                f"at least 10 in {np.sum(times >= 10)} of {np.sum(np.isfinite(times))}"
+            )
     for name in ("zv", "zvd"):
         times = np.array([(r["integer"][name] or np.nan) / (r["fractional"][name] or np.nan) for r in rows])
-        print(f"integer over fractional, {name}: median {np.nanmedian(times):.2f}, {np.nanmin(times):.2f} to "
-              f"{np.nanmax(times):.2f}, at least 2 in {np.sum(times >= 2)}")  # fmt: skip
+        print(
+            f"integer over fractional, {name}: median {np.nanmedian(times):.2f}, {np.nanmin(times):.2f} to "
+            f"{np.nanmax(times):.2f}, at least 2 in {np.sum(times >= 2)}"
+        )
     return rows
 
 

@@ -48,18 +48,23 @@ def one(seed: int, criterion: str) -> dict[str, Any]:
     run = ftlm.Run.from_arrays(step=truth.step, inputs={"I1": truth["I1"]}, outputs=noisy, name=f"designed {seed}")
     second = ftlm.identify(run, structure, threads=1)
     return {
-        "seed": seed, "criterion": criterion, "seconds": spent, "gain": designed.gain, "shape": designed.shape,
-        "efficiency": designed.efficiency, "binding": list(designed.binding),
+        "seed": seed,
+        "criterion": criterion,
+        "seconds": spent,
+        "gain": designed.gain,
+        "shape": designed.shape,
+        "efficiency": designed.efficiency,
+        "binding": list(designed.active_constraints),
         "predicted": {k: dict(designed.errors[k]) for k in ("now", "square", "designed", "both")},
         "found": {n: v for n, v in second.standard_errors.items() if n in designed.values},
-        "estimates": {n: v for n, v in second.joint_values.items()},
-        "correlated": np.asarray(second.joint.covariance).tolist() if second.joint is not None else [],
-        "names": second.joint.names if second.joint is not None else [],
+        "estimates": {n: v for n, v in second.parameter_values.items()},
+        "correlated": np.asarray(second.fit.covariance).tolist() if second.fit is not None else [],
+        "names": second.fit.names if second.fit is not None else [],
         "largest": {o: float(np.max(np.abs(truth[o]))) for o in truth.outputs},
-        "allowed": {r.name: r.limit for r in designed.reached},
+        "allowed": {r.name: r.limit for r in designed.predicted_extremes},
         **({"input": [float(v) for v in designed.run["I1"]]} if seed == 0 else {}),
         **({"angles": {o: [round(float(v), 6) for v in truth[o][::10]] for o in truth.outputs}} if seed == 0 else {}),
-    }  # fmt: skip
+    }
 
 
 def lines_of(rows: list[dict[str, Any]]) -> list[str]:

@@ -22,7 +22,7 @@ sys.path.insert(0, str(Path(__file__).resolve().parents[1] / "tests" / "python")
 
 import plants
 from ftlm.estimation.free_parameters import FreeProblem
-from ftlm.estimation.objective import Attempt, descend, experiment
+from ftlm.estimation.objective import Iterate, minimize_cost, sample_run
 from ftlm.estimation.output_error import fit_output_error
 from ftlm.simulation.discretization import record
 from laws import laws
@@ -78,7 +78,7 @@ def main() -> None:
     run, structure = plants.noisy_run("A", 40.0, 0), plants.structure("A")
     problem, truth = FreeProblem.of(structure), plants.truth("A")
     weights = [1.0 / (0.01 * float(np.std(plants.clean_run("A")[o]))) for o in structure.outputs]
-    prepared = [experiment(run, problem, weights)]
+    prepared = [sample_run(run, problem, weights)]
     rec = record(run, structure, run.length - 1, filtered=False)
     signals = structure.signals
     orders = [
@@ -91,7 +91,7 @@ def main() -> None:
     start = time.perf_counter()
     rounds = 5
     for _ in range(rounds):
-        ours = descend(problem, prepared, Attempt(orders, coefficients, "given", {}), evaluations=200)
+        ours = minimize_cost(problem, prepared, Iterate(orders, coefficients, "given", {}), evaluations=200)
     own = (time.perf_counter() - start) / rounds
 
     signs = np.sign(coefficients[:4])
@@ -118,7 +118,7 @@ def main() -> None:
     # By processor time on one core, which other work on the machine does not stretch.
     start = time.process_time()
     for _ in range(rounds):
-        descend(problem, prepared, Attempt(orders, coefficients, "given", {}), evaluations=200)
+        minimize_cost(problem, prepared, Iterate(orders, coefficients, "given", {}), evaluations=200)
     one = (time.process_time() - start) / rounds
     start = time.process_time()
     fit_output_error([run], structure, threads=1, refine=False)

@@ -24,7 +24,7 @@ import numpy as np
 
 import ftlm
 from ftlm import _core
-from ftlm.order_search.options import REFINEMENTS
+from ftlm.order_search.options import MAX_IV_ITERATIONS
 from ftlm.simulation.discretization import record
 from ftlm.utils.validation import available_threads
 from results import append, commit, heading
@@ -63,38 +63,60 @@ def searches(quick: bool) -> None:
     """P1 and P2."""
     threads = available_threads()
     equation = replace(ftlm.flexible_link(form="published", stage=1).equation("theta12"), initial="rest")
-    lattice = ftlm.lattice(alpha=(1.05, 2.0))
+    lattice = ftlm.order_grid(alpha=(1.05, 2.0))
     options = {"coefficients": "least-squares", "m": M}
-    clean, coarse = plant_a_run(), ftlm.lattice(step=0.1, alpha=(1.1, 2.0))
+    clean, coarse = plant_a_run(), ftlm.order_grid(step=0.1, alpha=(1.1, 2.0))
     brute, _, cpu = clocked(lambda: ftlm.search_orders(clean, equation, coarse, early_stopping=False, **options))
     brute_each = cpu / brute.candidates
     for hub, deflection in ((1e-3, 1e-4), (1e-4, 1e-4), (1e-3, 1e-3)):
         run = plant_a_run(hub, deflection)
         fft = fft_time()
-        found, wall, cpu = min((clocked(lambda run=run: ftlm.search_orders(run, equation, lattice, **options))
-                               for _ in range(3)), key=lambda r: r[2])  # fmt: skip
+        found, wall, cpu = min(
+            (clocked(lambda run=run: ftlm.search_orders(run, equation, lattice, **options)) for _ in range(3)),
+            key=lambda r: r[2],
+        )
         each = cpu / found.candidates
-        shares = ", ".join(f"{100 * found.pruned[k] / found.candidates:.2f} % {k}" for k in ("bound", "stopped early"))
+        shares = ", ".join(
+            f"{100 * found.exclusion_counts[k] / found.candidates:.2f} % {k}" for k in ("bound", "stopped early")
+        )
         judge(
-            "P1", f"noise {hub:g} and {deflection:g} rad, core time a candidate over one real FFT of 4096", each / fft,
+            "P1",
+            f"noise {hub:g} and {deflection:g} rad, core time a candidate over one real FFT of 4096",
+            each / fft,
             1 / 8,
             f"{found.candidates} in {wall:.2f} s, {each * 1e6:.3f} us each, NumPy's FFT {fft * 1e6:.1f} us; {shares}; "
             f"brute force {brute_each * 1e6:.0f} us each, {brute_each / each:.0f} times ours",
-        )  # fmt: skip
+        )
     run = plant_a_run()
     step = 0.05 if quick else 0.015
-    found, wall, cpu = min((clocked(lambda: ftlm.search_orders(
-        run, equation, ftlm.lattice(step=step, alpha=(1.05, 2.0)), criterion="equation-error", norm="l2", m=M,
-    )) for _ in range(3)), key=lambda r: r[2])  # fmt: skip
+    found, wall, cpu = min(
+        (
+            clocked(
+                lambda: ftlm.search_orders(
+                    run,
+                    equation,
+                    ftlm.order_grid(step=step, alpha=(1.05, 2.0)),
+                    criterion="equation-error",
+                    norm="l2",
+                    m=M,
+                )
+            )
+            for _ in range(3)
+        ),
+        key=lambda r: r[2],
+    )
     numpy_each = numpy_solve(run, equation)
     rate = found.candidates / cpu * threads
     for name, promise in (("P2", 60), ("P2'", 120)):
         judge(
-            name, f"{promise} million a second over candidates a second on all cores", promise * 1e6 / rate, 1,
+            name,
+            f"{promise} million a second over candidates a second on all cores",
+            promise * 1e6 / rate,
+            1,
             f"{found.candidates} candidates by processor time {rate / 1e6:.1f} million/s on {threads} cores, by wall "
             f"time {found.candidates / wall / 1e6:.1f}; NumPy's batched solve {1 / numpy_each / 1e6:.2f} million/s on "
             f"one",
-        )  # fmt: skip
+        )
 
 
 def refined(quick: bool) -> None:
@@ -104,18 +126,29 @@ def refined(quick: bool) -> None:
     step = 0.1 if quick else 0.05
     for hub, deflection in ((1e-3, 1e-4), (1e-3, 1e-3)):
         run = plant_a_run(hub, deflection)
-        found, wall, cpu = clocked(lambda run=run: ftlm.search_orders(
-            run, equation, ftlm.lattice(step=step, alpha=(1.05, 2.0)), coefficients="instrumental-variables", m=M,
-        ))  # fmt: skip
+        found, wall, cpu = clocked(
+            lambda run=run: ftlm.search_orders(
+                run,
+                equation,
+                ftlm.order_grid(step=step, alpha=(1.05, 2.0)),
+                coefficients="instrumental-variables",
+                m=M,
+            )
+        )
         each, rival = cpu / found.candidates, numpy_refinement(run, equation)
-        shares = ", ".join(f"{100 * found.pruned[k] / found.candidates:.1f} % {k}" for k in ("bound", "stopped early"))
+        shares = ", ".join(
+            f"{100 * found.exclusion_counts[k] / found.candidates:.1f} % {k}" for k in ("bound", "stopped early")
+        )
         judge(
-            "P3", f"instrumental variables, noise {hub:g} and {deflection:g} rad, seconds by processor time on "
-            f"{threads} cores over 30{', an eighth of the lattice' if quick else ''}", cpu / threads / 30, 1,
+            "P3",
+            f"instrumental variables, noise {hub:g} and {deflection:g} rad, seconds by processor time on "
+            f"{threads} cores over 30{', an eighth of the lattice' if quick else ''}",
+            cpu / threads / 30,
+            1,
             f"{found.candidates} candidates, exact top 20, in {wall:.1f} s of wall time, {each * 1e6:.0f} us each, up "
-            f"to {REFINEMENTS} steps for all but what a bound over all coefficients excludes; {shares}; in NumPy "
+            f"to {MAX_IV_ITERATIONS} steps for all but what a bound over all coefficients excludes; {shares}; in NumPy "
             f"{rival * 1e3:.1f} ms each, {rival / each:.0f} times ours",
-        )  # fmt: skip
+        )
 
 
 def numpy_refinement(run: ftlm.Run, equation: ftlm.Structure) -> float:
@@ -134,7 +167,7 @@ def numpy_refinement(run: ftlm.Run, equation: ftlm.Structure) -> float:
     columns = [times(k, s) for k, s in zip(kernels, signals, strict=True)]
     c = np.linalg.lstsq(np.stack(columns, axis=1), y, rcond=None)[0]
     unit = np.eye(1, M)[0]
-    for _ in range(REFINEMENTS):
+    for _ in range(MAX_IV_ITERATIONS):
         divisor = unit - c[0] * kernels[0] - c[1] * kernels[1]
         inverse = lfilter([1.0], divisor, unit)
         response = times(inverse, c[2] * columns[2] + c[3] * columns[3])
@@ -153,19 +186,24 @@ def stage(quick: bool) -> None:
     options = {"coefficients": "least-squares", "m": M}
     # Both equations of a tuple, each fitted and run to its end.
     one = replace(structure.equation("theta12"), initial="rest")
-    brute, _, cpu = clocked(lambda: ftlm.search_orders(
-        run, one, ftlm.lattice(step=0.2, alpha=(1.2, 2.0)), early_stopping=False, **options
-    ))  # fmt: skip
+    brute, _, cpu = clocked(
+        lambda: ftlm.search_orders(
+            run, one, ftlm.order_grid(step=0.2, alpha=(1.2, 2.0)), early_stopping=False, **options
+        )
+    )
     each = 2 * cpu / brute.candidates
     step = 0.1 if quick else 0.05
     low = {"alpha1": (1.5, 2.0, step), "alpha2": (1.5, 2.0, step)}
-    found, wall, cpu = clocked(lambda: ftlm.search_orders(run, structure, ftlm.lattice(step=step, **low), **options))
+    found, wall, cpu = clocked(lambda: ftlm.search_orders(run, structure, ftlm.order_grid(step=step, **low), **options))
     judge(
-        "stage", "joined tables over evaluating every tuple, processor time", cpu / (each * found.candidates), 1,
+        "stage",
+        "joined tables over evaluating every tuple, processor time",
+        cpu / (each * found.candidates),
+        1,
         f"{found.candidates} tuples of five orders in {wall:.1f} s, {cpu / found.candidates * 1e9:.0f} ns each; every "
         f"tuple evaluated {each * 1e6:.0f} us each (from {brute.candidates} runs), "
         f"{each * found.candidates / cpu:.3g} times ours",
-    )  # fmt: skip
+    )
 
 
 def set_up(quick: bool) -> None:
@@ -175,16 +213,18 @@ def set_up(quick: bool) -> None:
     for threads in (1, 2) * (1 if quick else 2):
         out = subprocess.run(
             [binary, "setup", str(m), "0.2", str(threads)], capture_output=True, text=True, check=True
-        ).stdout  # fmt: skip
+        ).stdout
         found = tuple(float(x) for x in out.split())
         least[threads] = min(found, least.get(threads, found), key=lambda times: times[2])
     (one_wall, one, _, _), (two_wall, two, busiest, peak) = least[1], least[2]
     judge(
-        "P12", f"set-up of a search at {m} pulses on two threads over one, processor time of the busier thread",
-        busiest / one, 0.55,
+        "P12",
+        f"set-up of a search at {m} pulses on two threads over one, processor time of the busier thread",
+        busiest / one,
+        0.55,
         f"{busiest:.1f} of {one:.1f} s ({two:.1f} s by both threads); wall time {two_wall:.1f} of {one_wall:.1f} s, "
         f"load {os.getloadavg()[0]:.1f}; at most {peak / 1e6:.0f} MB",
-    )  # fmt: skip
+    )
 
 
 def growth(quick: bool, write: bool) -> None:
@@ -198,7 +238,7 @@ def growth(quick: bool, write: bool) -> None:
         for threads in (1, 2):
             out = subprocess.run(
                 [binary, "search", str(m), str(step), str(threads)], capture_output=True, text=True, check=True
-            ).stdout  # fmt: skip
+            ).stdout
             candidates, wall, cpu = (float(x) for x in out.split())
             searches.append({"m": m, "candidates": int(candidates), "threads": threads, "wall": wall, "processor": cpu})
             say(
@@ -254,34 +294,42 @@ def kernels() -> None:
     assert np.allclose(dense, ftlm.operational_matrix(0.85, M, 10.0), atol=1e-12)
     ours, write = found["operational matrix 2048"], found["write 2048"]
     judge(
-        "P4", "dense P of 2048 over writing such a matrix once", ours / write, 3,
+        "P4",
+        "dense P of 2048 over writing such a matrix once",
+        ours / write,
+        3,
         f"{ours * 1e3:.1f} ms, writing {write * 1e3:.1f} ms; F alone {found['block pulse matrix 2048'] * 1e3:.1f} ms, "
         f"by faer {found['operational matrix by faer 2048'] * 1e3:.0f} ms, by NumPy {numpy_time * 1e3:.0f} ms",
-    )  # fmt: skip
+    )
     lengths = [2**k for k in range(11, 21)]
     pairs = {m: found[f"rfft {m}"] + found[f"irfft {m}"] for m in lengths}
     worst = max(lengths, key=lambda m: found[f"apply {m}"] / pairs[m])
     signal, kernel = np.random.default_rng(0).standard_normal((2, M))
     rival = best(lambda: fftconvolve(kernel, signal)[:M])
     judge(
-        "P5", f"I^eta applied over a forward and an inverse FFT, worst of 2^11 to 2^20 (2^{worst.bit_length() - 1})",
-        found[f"apply {worst}"] / pairs[worst], 1.3,
-        "by length " + ", ".join(f"{found[f'apply {m}'] / pairs[m]:.2f}" for m in lengths)
+        "P5",
+        f"I^eta applied over a forward and an inverse FFT, worst of 2^11 to 2^20 (2^{worst.bit_length() - 1})",
+        found[f"apply {worst}"] / pairs[worst],
+        1.3,
+        "by length "
+        + ", ".join(f"{found[f'apply {m}'] / pairs[m]:.2f}" for m in lengths)
         + f"; at 2048 {found['apply 2048'] * 1e6:.1f} us, SciPy's fftconvolve {rival * 1e6:.1f} us",
-    )  # fmt: skip
+    )
     ratios = {m: found[f"simulate {m}"] / found[f"rfft {m}"] for m in lengths}
     worst = max(lengths, key=lambda m: ratios[m])
     kernel = np.abs(kernel) + np.eye(1, M)[0] * M
     matrix = toeplitz(kernel, np.zeros(M))
     rival = best(lambda: solve_triangular(matrix, signal, lower=True))
     judge(
-        "P6", "median free run of the lattice over one FFT of twice its length, worst of 2^11 to 2^20 "
+        "P6",
+        "median free run of the lattice over one FFT of twice its length, worst of 2^11 to 2^20 "
         f"(2^{worst.bit_length() - 1})",
-        ratios[worst], 15,
+        ratios[worst],
+        15,
         "exact division throughout, so no residual to check; by length "
         + ", ".join(f"{ratios[m]:.1f}" for m in lengths)
         + f"; at 2048 {found['simulate 2048'] * 1e6:.0f} us, SciPy's triangular solve {rival * 1e6:.0f} us",
-    )  # fmt: skip
+    )
 
 
 def best(work) -> float:
@@ -298,8 +346,11 @@ def bench_binary() -> str:
     """Path of the Rust side, built if need be."""
     out = subprocess.run(
         ["cargo", "bench", "--bench", "promises", "--no-run", "--message-format", "json"],
-        capture_output=True, text=True, check=True, cwd=HERE.parent,
-    ).stdout  # fmt: skip
+        capture_output=True,
+        text=True,
+        check=True,
+        cwd=HERE.parent,
+    ).stdout
     built = [json.loads(line) for line in out.splitlines() if line.startswith("{")]
     return next(b["executable"] for b in built if b.get("executable") and b["target"]["name"] == "promises")
 
@@ -315,8 +366,10 @@ def instructions(write: bool) -> None:
     def count(kernel: str) -> tuple[int, int]:
         ran = subprocess.run(
             ["valgrind", "--tool=callgrind", "--callgrind-out-file=/dev/null", binary, kernel],
-            capture_output=True, text=True, check=True,
-        )  # fmt: skip
+            capture_output=True,
+            text=True,
+            check=True,
+        )
         units = re.search(r"units (\d+)", ran.stdout)
         collected = re.search(r"Collected : (\d+)", ran.stderr)
         if units is None or collected is None:
@@ -384,18 +437,24 @@ def memory(quick: bool) -> None:
     everything = "import ftlm\nfor name in ftlm.__all__: getattr(ftlm, name)"
     all_names = (seconds(everything) - nothing) / (seconds("import numpy") - nothing)
     judge(
-        "P8", "import ftlm over import numpy, interpreter apart", ratio, 2,
+        "P8",
+        "import ftlm over import numpy, interpreter apart",
+        ratio,
+        2,
         f"processor time; with every public name asked for {all_names:.2f}; interpreter {nothing * 1e3:.0f} ms",
-    )  # fmt: skip
+    )
     for step in (0.05,) if quick else (0.05, 0.0118):
         ran = subprocess.run(
             [sys.executable, "-c", STREAM, str(step)], capture_output=True, text=True, check=True, cwd=HERE
         )
         candidates, wall, peak, pruned = (float(x) for x in ran.stdout.split())
         judge(
-            "P8", f"memory of a search over {candidates:.3g} candidates beyond the record, MB", peak, 200,
+            "P8",
+            f"memory of a search over {candidates:.3g} candidates beyond the record, MB",
+            peak,
+            200,
             f"{wall:.1f} s, {candidates / wall:.3g} candidates/s, {100 * pruned:.3f} % pruned",
-        )  # fmt: skip
+        )
     if not quick:
         start = time.perf_counter()
         used = resource.getrusage(resource.RUSAGE_CHILDREN)
@@ -408,9 +467,12 @@ def memory(quick: bool) -> None:
         used = resource.getrusage(resource.RUSAGE_CHILDREN)
         cpu = used.ru_utime + used.ru_stime - before
         judge(
-            "P8", "ftlm demo, seconds", wall, 20,
+            "P8",
+            "ftlm demo, seconds",
+            wall,
+            20,
             f"{cpu:.0f} s of processors, {cpu / available_threads():.0f} s on each core; load {os.getloadavg()[0]:.1f}",
-        )  # fmt: skip
+        )
 
 
 def main() -> None:

@@ -22,7 +22,7 @@ import ftlm
 from ftlm import rig
 from ftlm.reproduction.simulated_arm import demo_plant
 from ftlm.rig import watchdog
-from ftlm.rig.arm_parameters import SUBSTEP
+from ftlm.rig.arm_parameters import MAX_SUBSTEP_S
 from ftlm.rig.rig import Limits, Rig
 from ftlm.rig.virtual_board import VirtualBoard
 
@@ -74,11 +74,11 @@ def stopped(number: signal.Signals, times: int = 8) -> None:
             page = None
             while page is None or page.volts == (0.0, 0.0) or page.get("beat") < 300:
                 time.sleep(0.01)
-                if page is None and path.exists() and path.stat().st_size == watchdog.SIZE:
-                    page = watchdog.Page(path)
+                if page is None and path.exists() and path.stat().st_size == watchdog.PAGE_SIZE_BYTES:
+                    page = watchdog.RegisterPage(path)
             struck = time.monotonic()
             os.kill(process.pid, number)
-            while not page.expired:
+            while not page.has_expired:
                 time.sleep(0.001)
             found.append(page.get("tripped") - struck)
             if page.volts != (0.0, 0.0):
@@ -131,7 +131,8 @@ def truth() -> None:
     names = ("theta11", "theta12", "theta21", "theta22")
     words = ", ".join(f"{n} {np.abs(states[:, k] - clean[n]).max() / clean[n].std():.1e}" for k, n in enumerate(names))
     print(
-        f"largest error of the arm against the series solution, in its own deviations, substep {SUBSTEP:g} s: {words}"
+        f"largest error of the arm against the series solution, in its own deviations, substep {MAX_SUBSTEP_S:g} s: "
+        f"{words}"
     )
 
 

@@ -63,13 +63,20 @@ def grunwald(u: Floats, tick: float) -> Floats:
 
 PLANTS = {
     "whole": Plant(
-        0.1, "D^alpha y = c D^nu y + a y + b u", {"alpha": 2.0, "nu": 1.0, "c": -0.8, "a": -4.0, "b": 4.0}, resonance,
+        0.1,
+        "D^alpha y = c D^nu y + a y + b u",
+        {"alpha": 2.0, "nu": 1.0, "c": -0.8, "a": -4.0, "b": 4.0},
+        resonance,
         0.06,
     ),
     "fractional": Plant(
-        0.05, "D^alpha y = a y + b u", {"alpha": 0.8, "a": -1.5, "b": 1.5}, relaxation, 0.06,
+        0.05,
+        "D^alpha y = a y + b u",
+        {"alpha": 0.8, "a": -1.5, "b": 1.5},
+        relaxation,
+        0.06,
     ),
-}  # fmt: skip
+}
 
 
 @dataclass(frozen=True)
@@ -155,18 +162,22 @@ def lost(plant: Plant, rng: np.random.Generator) -> ftlm.Run:
     kept = rng.random(ROWS) >= 0.15
     kept[[0, -1]] = True
     return ftlm.Run.from_arrays(
-        inputs={"u": record.command[kept]}, outputs={"y": white(record, rng)[kept]},
-        time=np.arange(ROWS)[kept] * plant.step, missing="hold",
-    )  # fmt: skip
+        inputs={"u": record.command[kept]},
+        outputs={"y": white(record, rng)[kept]},
+        time=np.arange(ROWS)[kept] * plant.step,
+        missing="hold",
+    )
 
 
 def jittered(plant: Plant, rng: np.random.Generator) -> ftlm.Run:
     """1 % noise; times off by up to 30 % of a step, those of the command as well."""
     record = recorded(plant, rng, jitter=0.3)
     return ftlm.Run.from_arrays(
-        inputs={"u": record.command}, outputs={"y": white(record, rng)}, time=record.ticks * plant.step / FINE,
+        inputs={"u": record.command},
+        outputs={"y": white(record, rng)},
+        time=record.ticks * plant.step / FINE,
         resample=plant.step,
-    )  # fmt: skip
+    )
 
 
 @dataclass(frozen=True)
@@ -217,11 +228,12 @@ def main() -> None:
     parser.add_argument("--write", action="store_true", help="append to benches/RESULTS.md")
     arguments = parser.parse_args()
     lines = [
-        f"{heading()}: {ROWS} rows, {arguments.seeds} seeds, all "
-        "orders free", "",
+        f"{heading()}: {ROWS} rows, {arguments.seeds} seeds, all orders free",
+        "",
         "| record | plant | covered by 95 % intervals, each number | largest mean z | error / that of white noise "
-        "| cause named | s |", "| --- | --- | --- | --- | --- | --- | --- |",
-    ]  # fmt: skip
+        "| cause named | s |",
+        "| --- | --- | --- | --- | --- | --- | --- |",
+    ]
     print("\n".join(lines))
     with ProcessPoolExecutor(arguments.workers) as pool:
         for plant_name in arguments.plants.split(","):

@@ -77,10 +77,10 @@ def main() -> None:
     per_candidate: dict[str, float] = {}
     for coefficients in ("least-squares", "multi-innovation"):
         start = time.perf_counter()
-        found = ftlm.search_orders(run, equation, ftlm.lattice(alpha=(1.05, 2.0)), coefficients=coefficients, m=M)
+        found = ftlm.search_orders(run, equation, ftlm.order_grid(alpha=(1.05, 2.0)), coefficients=coefficients, m=M)
         wall = time.perf_counter() - start
         cost = per_candidate[coefficients] = wall * threads / found.candidates
-        bounded, stopped = (found.pruned[k] / found.candidates for k in ("bound", "stopped early"))
+        bounded, stopped = (found.exclusion_counts[k] / found.candidates for k in ("bound", "stopped early"))
         say(
             f"lattice, {coefficients}: {found.candidates} candidates in {wall:.2f} s, {cost * 1e6:.2f} us of core time "
             f"each ({cost / fft:.3f} FFTs), {100 * bounded:.2f} % excluded by their bound, "
@@ -88,18 +88,27 @@ def main() -> None:
         )
     start = time.perf_counter()
     brute = ftlm.search_orders(
-        run, equation, ftlm.lattice(step=BRUTE_STEP, alpha=(1.2, 2.0)), coefficients="least-squares", m=M,
+        run,
+        equation,
+        ftlm.order_grid(step=BRUTE_STEP, alpha=(1.2, 2.0)),
+        coefficients="least-squares",
+        m=M,
         early_stopping=False,
-    )  # fmt: skip
+    )
     cost = (time.perf_counter() - start) * threads / brute.candidates
     ours = per_candidate["least-squares"]
     say(f"brute force: {brute.candidates} candidates, {cost * 1e6:.1f} us each: {cost / ours:.1f} times ours")
 
     # The same candidates, evenly spread over the coarse lattice's ranked table.
     table = ftlm.search_orders(
-        run, equation, ftlm.lattice(step=BRUTE_STEP, alpha=(1.2, 2.0)), innovation_length=7, keep=100_000, m=M,
+        run,
+        equation,
+        ftlm.order_grid(step=BRUTE_STEP, alpha=(1.2, 2.0)),
+        innovation_length=7,
+        keep=100_000,
+        m=M,
         early_stopping=False,
-    ).table  # fmt: skip
+    ).table
     rec = record(run, equation, M)
     y, hub, current = (rec.of(n) for n in ("theta12", "theta11", "I1"))
     worst = spent = 0.0

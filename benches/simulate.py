@@ -19,7 +19,7 @@ import results
 from ftlm.estimation import estimators as estimate
 from ftlm.estimation import identify
 from ftlm.estimation import identify as offsets
-from ftlm.simulation.step_refinement import refined
+from ftlm.simulation.step_refinement import simulate_refined
 
 ROWS, STEP = 2300, 0.01
 #: Words, and state space of y from u where orders are whole.
@@ -63,7 +63,7 @@ def runs() -> list[str]:
         for name, made in INPUTS.items():
             u = made(np.random.default_rng(0), ROWS)
             run = ftlm.Run.from_arrays(step=STEP, inputs={"u": u}, outputs={"y": 0 * u})
-            free = refined(model, run, {}, tolerance=1e-6)
+            free = simulate_refined(model, run, {}, tolerance=1e-6)
             took = least(lambda model=model, run=run: model.simulate(run), 15)
             line = f"- {words}, {name}: {took / unit:.0f} FFTs ({took * 1e3:.1f} ms), {free.refinement} pulses a sample"
             if space is not None:
@@ -104,9 +104,13 @@ def outside(rows: int) -> list[str]:
         setattr(module, name, call)
 
     parts = [
-        (estimate, "fit_any_start"), (estimate, "with_intervals"), (offsets, "tested"), (identify, "free_runs"),
-        (identify, "compared_samples"), (identify, "tested_residuals"),
-    ]  # fmt: skip
+        (estimate, "fit_any_start"),
+        (estimate, "with_intervals"),
+        (offsets, "tested"),
+        (identify, "free_runs"),
+        (identify, "compared_samples"),
+        (identify, "tested_residuals"),
+    ]
     for module, name in parts:
         timed(module, name)
     unit, start = transform(), time.process_time()

@@ -105,9 +105,14 @@ def measured(runs: dict[str, Signals], used: Sequence[str], order: int, seeds: i
         told[name] = {} if model is None else {n: judged(model, scale, run) for n, run in runs.items()}
     inputs = seen[0][1].shape[1]
     return {
-        "used": list(used), "fits": told, "seconds": [s for s, _ in (first, *others)], "setting_up": setting_up,
-        "numbers": order * order + order * (inputs + 1) + inputs, "before": before, "peak": peak(),
-    }  # fmt: skip
+        "used": list(used),
+        "fits": told,
+        "seconds": [s for s, _ in (first, *others)],
+        "setting_up": setting_up,
+        "numbers": order * order + order * (inputs + 1) + inputs,
+        "before": before,
+        "peak": peak(),
+    }
 
 
 def peak() -> float:

@@ -59,9 +59,15 @@ def run(samples=2049):
 def search(path, progress=None):
     """Brute force: long enough to be killed several times."""
     return ftlm.search_orders(
-        run(), ftlm.equation(EQUATION, initial="rest"), ftlm.lattice(step=0.1), early_stopping=False, m=2048,
-        coefficients="least-squares", store=path, progress=progress,
-    )  # fmt: skip
+        run(),
+        ftlm.equation(EQUATION, initial="rest"),
+        ftlm.order_grid(step=0.1),
+        early_stopping=False,
+        m=2048,
+        coefficients="least-squares",
+        store=path,
+        progress=progress,
+    )
 
 
 def stage(path, progress=None):
@@ -74,11 +80,17 @@ def stage(path, progress=None):
     noise = np.random.default_rng(1)
     noisy = {n: clean[n] + 1e-4 * noise.standard_normal(rows) for n in outputs}
     given = ftlm.Run.from_arrays(step=0.004, inputs={"I1": current}, outputs=noisy, name="stage")
-    lattice = ftlm.lattice(step=0.025, alpha=(1.8, 2.0), gamma1=(0.8, 1.1), beta2=(0.0, 0.5), mu2=(0.7, 1.0))
+    lattice = ftlm.order_grid(step=0.025, alpha=(1.8, 2.0), gamma1=(0.8, 1.1), beta2=(0.0, 0.5), mu2=(0.7, 1.0))
     return ftlm.search_orders(
-        given, ftlm.flexible_link(form="published"), lattice, early_stopping=False, m=1024,
-        coefficients="least-squares", store=path, progress=progress,
-    )  # fmt: skip
+        given,
+        ftlm.flexible_link(form="published"),
+        lattice,
+        early_stopping=False,
+        m=1024,
+        coefficients="least-squares",
+        store=path,
+        progress=progress,
+    )
 
 
 def kills(count, seed=0, of=search):
@@ -125,8 +137,11 @@ def control_c(arguments, path, frames):
     terminal, other = pty.openpty()
     child = subprocess.Popen(
         [sys.executable, "-c", AT_A_TERMINAL, sys.executable, "-m", "ftlm", *arguments],
-        stdin=other, stdout=other, stderr=other, start_new_session=True,
-    )  # fmt: skip
+        stdin=other,
+        stdout=other,
+        stderr=other,
+        start_new_session=True,
+    )
     os.close(other)
     said, typed = b"", None
     while True:
@@ -168,7 +183,7 @@ def interruptions(count):
             call += ["--coefficients", "instrumental-variables", "--store", str(path)]
             code, waited, said = control_c(call, path, 1 + number % 3)
             status = ftlm.search_status(path)["y"]
-            if code != 130 or status.torn or status.damage:
+            if code != 130 or status.truncated or status.corruption:
                 sys.exit(f"exit code {code}, {status}\n{said}")
             waits.append(waited)
     return waits

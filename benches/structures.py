@@ -26,8 +26,8 @@ sys.path.insert(0, str(Path(__file__).resolve().parents[1] / "tests" / "python")
 
 import ftlm
 from arm_measured import arm_run
-from ftlm.structure_selection.candidates import Inside, Variant, signature, worded
-from ftlm.structure_selection.cross_validation import Folds, criterion, fit, judged, spread
+from ftlm.structure_selection.candidates import NestedStructures, Variant, describe_structure, signature
+from ftlm.structure_selection.cross_validation import Folds, fit, scatter_factor, schwarz_criterion, validate_fit
 from oracles import held_response
 from results import Kept, append, heading
 
@@ -125,10 +125,12 @@ def choice(name: str, seed: int, threads: int) -> dict[str, Any]:
     runs, rich, true = plant(name, seed)
     found = ftlm.select(runs, rich, threads=threads)
     row = {
-        "fitted": found.fitted, "spent": time.process_time() - begun, "wall": time.perf_counter() - wall,
+        "fitted": found.fitted,
+        "spent": time.process_time() - begun,
+        "wall": time.perf_counter() - wall,
         "chosen": found.winner.name,
-    }  # fmt: skip
-    structure = Inside(rich).build(true)
+    }
+    structure = NestedStructures(rich).build(true)
     asked = signature(structure)
     row["found"] = signature(found.winner.structure) == asked
     if row["found"]:
@@ -137,16 +139,16 @@ def choice(name: str, seed: int, threads: int) -> dict[str, Any]:
     row["why"] = "the choice" if there is not None else "the search: the truth was not judged"
     if there is None:
         folds = Folds.of(runs, "runs" if len(runs) > 1 else "blocks")
-        there = judged(worded(structure), structure, folds, fit(folds.runs, structure, []))
-        there = replace(there, bic=criterion(there.joint, there.numbers, scatter_of(found)))
+        there = validate_fit(describe_structure(structure), structure, folds, fit(folds.runs, structure, []))
+        there = replace(there, bic=schwarz_criterion(there.joint, there.parameters, scatter_of(found)))
     for word, trial in {"truth": there, "winner": found.winner, "best": found.trials[0]}.items():
-        row[word] = {"name": trial.name, "numbers": trial.numbers, "bic": trial.bic, "scores": trial.scores}
+        row[word] = {"name": trial.name, "numbers": trial.parameters, "bic": trial.bic, "scores": trial.scores}
     return row
 
 
 def scatter_of(found: ftlm.Selection) -> float:
     """How many samples told as much as one, when a choice compared criteria."""
-    return min(spread(t.joint) for t in found.trials if t.joint is not None)
+    return min(scatter_factor(t.joint) for t in found.trials if t.joint is not None)
 
 
 def failure(seed: int, row: dict[str, Any]) -> Iterator[str]:

@@ -32,9 +32,11 @@ TIP = "theta11 + theta12"
 WHOLE = {"alpha1": 2.0, "alpha2": 2.0, "beta2": 0.0, "mu2": 1.0, "gamma1": 1.0}
 #: Deviations as dear as 1 A, how fast what is not modelled may walk, and the noise of encoder and gauge [rad].
 WEIGHTS = {
-    "allowed": {"theta11": 0.02, "theta12": 0.02}, "effort": 1.0, "drift": 0.5,
+    "allowed": {"theta11": 0.02, "theta12": 0.02},
+    "effort": 1.0,
+    "drift": 0.5,
     "noise": {"theta11": 3e-4, "theta12": 2e-4},
-}  # fmt: skip
+}
 #: Of the model's numbers, over which designs are judged.
 SAMPLES = 20
 #: Plants on which stability is decided: stiffness of link 1 times, delay of the angles [s].
@@ -49,8 +51,10 @@ def structures():
     free = ftlm.equation(
         "D^2 theta11 = k theta12 + e D theta12 + b D theta11 + g I1; "
         "D^2 theta12 = a theta12 + d D theta12 + h D^2 theta11",
-        sensor_filter=ftlm.SensorFilter.low_pass(["theta12"]), offset="constant", coupling="simulated",
-    )  # fmt: skip
+        sensor_filter=ftlm.SensorFilter.low_pass(["theta12"]),
+        offset="constant",
+        coupling="simulated",
+    )
     return {
         "fractional": law.with_orders({"alpha1": 2.0}),
         "integer": law.with_orders({n: WHOLE[n] for n in law.order_names}),
@@ -67,20 +71,25 @@ def identified(run, structure):
 
 def both(first):
     """Hub 1 under a controller, hub 2 held by the plain one of benches/moves.py."""
-    hold = control.Realised(control.FractionalPid(20.0, 50.0, 0.5, 1.0, 1.0), RATE, limit=1.19)
-    return control.HubLoops(first, hold)
+    hold = control.DiscretePid(control.FractionalPid(20.0, 50.0, 0.5, 1.0, 1.0), RATE, limit=1.19)
+    return control.JointControllers(first, hold)
 
 
 def designed(name, model, samples):
     """A design of a model over so many samples of its numbers, and what runs of it."""
     if name == "lqg":
         made = control.lqg(model, input="I1", samples=samples, **WEIGHTS)
-        return made, made.controlled(0.93)
+        return made, made.with_limit(0.93)
     made = control.fractional_pid(
-        model, output="theta11", input="I1", crossover=moves.CROSSOVER, phase_margin=moves.PHASE, rate=RATE,
+        model,
+        output="theta11",
+        input="I1",
+        crossover=moves.CROSSOVER,
+        phase_margin=moves.PHASE,
+        rate=RATE,
         samples=samples,
-    )  # fmt: skip
-    return made, control.Realised(made.pid, RATE, limit=0.93)
+    )
+    return made, control.DiscretePid(made.pid, RATE, limit=0.93)
 
 
 def judged(controller, reference, ends, **options):
@@ -95,7 +104,7 @@ def judged(controller, reference, ends, **options):
 def of_seed(seed):
     """Everything of a seed: the move's noise is another's than the run's."""
     run = moves.own_run(seed)
-    path = control.smooth_move(ANGLE, SECONDS, RATE, before=BEFORE, after=AFTER)
+    path = control.point_to_point(ANGLE, SECONDS, RATE, before=BEFORE, after=AFTER)
     ends = round((BEFORE + SECONDS) * RATE)
     found = {"seed": seed}
     for kind, structure in structures().items():
@@ -106,13 +115,13 @@ def of_seed(seed):
             refused = None
             try:
                 design, controller = designed(name, model, SAMPLES)
-                planned = control.inverse(design, path, of=TIP, samples=0)
+                planned = control.inverse_dynamics(design, path, of=TIP, samples=0)
             except ftlm.ModelError as error:
                 # Its own intervals refuse it; what it would have done is told all the same.
                 refused = str(error)
                 try:
                     design, controller = designed(name, model, 0)
-                    planned = control.inverse(design, path, of=TIP, samples=0)
+                    planned = control.inverse_dynamics(design, path, of=TIP, samples=0)
                 except ftlm.ModelError as worse:
                     told[name] = {"refused": str(worse), "plain": None, "inverse": None, "none": True}
                     continue
@@ -186,22 +195,27 @@ def still(seed=0):
     """How still each design leaves the tip on other plants, moved on the arm as it is; moves to be seen."""
     model, loops = contenders(seed)
     pid, lqg, calm = (loops[n] for n in ("fractional PID, 40 rad/s", "LQG", "LQG, ten times the deviations"))
-    path = control.smooth_move(ANGLE, SECONDS, RATE, before=BEFORE, after=AFTER)
+    path = control.point_to_point(ANGLE, SECONDS, RATE, before=BEFORE, after=AFTER)
     ends = round((BEFORE + SECONDS) * RATE)
     shaper = control.input_shaper(model, "zvd", coupling="measured")
     runs = {
-        "fractional PID": (lambda: both(control.Realised(pid.pid, RATE, limit=0.93)), path, ends),
+        "fractional PID": (lambda: both(control.DiscretePid(pid.pid, RATE, limit=0.93)), path, ends),
         "fractional PID, ZVD": (
-            lambda: both(control.Realised(pid.pid, RATE, limit=0.93)), shaper.filter(path, RATE),
+            lambda: both(control.DiscretePid(pid.pid, RATE, limit=0.93)),
+            shaper.filter(path, RATE),
             ends + round(shaper.delay * RATE),
         ),
         "LQG, inverse": (
-            lambda: both(lqg.controlled(0.93)), control.inverse(lqg, path, of=TIP, samples=0).reference, ends,
+            lambda: both(lqg.controlled(0.93)),
+            control.inverse_dynamics(lqg, path, of=TIP, samples=0).reference,
+            ends,
         ),
         "LQG, ten times the deviations, inverse": (
-            lambda: both(calm.controlled(0.93)), control.inverse(calm, path, of=TIP, samples=0).reference, ends,
+            lambda: both(calm.controlled(0.93)),
+            control.inverse_dynamics(calm, path, of=TIP, samples=0).reference,
+            ends,
         ),
-    }  # fmt: skip
+    }
     arm = rig.ArmParameters.of("effective")
     found = {n: [] for n in runs}
     for times in moves.STIFFNESS:
@@ -248,10 +262,12 @@ def table():
             plain, inverse, goal = (left(kind, name, *w) for w in (("plain",), ("inverse",), ("inverse", 1)))
             none = sum("none" in r[kind][name] for r in rows)
             refused = sum(r[kind][name]["refused"] is not None for r in rows) - none
-            print(f"{name}, {kind}: no design {none}, refused by its intervals {refused}; mrad plain {shown(plain)}, "
-                  f"stopped {np.isnan(plain).sum() - none}; inverse {shown(inverse)}, stopped "
-                  f"{np.isnan(inverse).sum() - none}, about the goal {shown(goal)}; plain over inverse "
-                  f"{shown(plain / inverse)}; inverse over the fractional one {shown(inverse / own)}")  # fmt: skip
+            print(
+                f"{name}, {kind}: no design {none}, refused by its intervals {refused}; mrad plain {shown(plain)}, "
+                f"stopped {np.isnan(plain).sum() - none}; inverse {shown(inverse)}, stopped "
+                f"{np.isnan(inverse).sum() - none}, about the goal {shown(goal)}; plain over inverse "
+                f"{shown(plain / inverse)}; inverse over the fractional one {shown(inverse / own)}"
+            )
     return [
         {"seed": r["seed"]}
         | {k: {n: r[k][n] | {"refused": r[k][n]["refused"] is not None} for n in ("lqg", "pid")} for k in structures()}

@@ -27,7 +27,7 @@ import arm_measured
 import ftlm
 import plants
 from ftlm.estimation.free_parameters import FreeProblem
-from ftlm.estimation.objective import Attempt, descend, experiment
+from ftlm.estimation.objective import Iterate, minimize_cost, sample_run
 from ftlm.estimation.output_error import fit_output_error
 from ftlm.reproduction.simulated_arm import demo_plant
 from results import Kept, append, heading
@@ -107,18 +107,20 @@ def bias(names: Iterable[str]) -> Iterator[str]:
         split = len(problem.orders)
         before: np.ndarray | None = None
         for every in (1, 2, 4, 8, 16):
-            prepared = [experiment(run, problem, weights, every=every)]
-            start = Attempt(true[:split], true[split:], "truth", {})
-            end = descend(problem, prepared, start, evaluations=60, plain=True)
+            prepared = [sample_run(run, problem, weights, every=every)]
+            start = Iterate(true[:split], true[split:], "truth", {})
+            end = minimize_cost(problem, prepared, start, evaluations=60, plain=True)
             jacobian = np.asarray(end.outcome["jacobian"])
             size = np.linalg.norm(jacobian, axis=1)
             scaled = jacobian / size[:, None]
             errors = np.sqrt(np.diag(np.linalg.inv(scaled @ scaled.T))) / size
             values = np.array(end.orders + end.coefficients)
             plain = np.max(np.abs(values - true) / errors)
-            limit = "" if before is None else (
-                f"; extrapolated {np.max(np.abs((4 * values - before) / 3 - true) / errors):.2g}"
-            )  # fmt: skip
+            limit = (
+                ""
+                if before is None
+                else (f"; extrapolated {np.max(np.abs((4 * values - before) / 3 - true) / errors):.2g}")
+            )
             before = values
             yield f"{name}, {every} pulses a sample: largest bias {plain:.2g} standard errors{limit}"
 
@@ -188,8 +190,9 @@ def instruments(seeds: int) -> Iterator[str]:
     true = structure.with_orders({n: v for n, v in plants.truth("A").items() if n in structure.order_names})
     exact = demo_plant(1, form="published").coefficients
     for level in (60, 40, 20):
-        found = [ftlm.identify(plants.noisy_run("A", level, s), true, method="instrumental-variables")
-                 for s in range(seeds)]  # fmt: skip
+        found = [
+            ftlm.identify(plants.noisy_run("A", level, s), true, method="instrumental-variables") for s in range(seeds)
+        ]
         for name, value in exact.items():
             values = np.array([f.coefficients[name] for f in found])
             errors = np.array([f.standard_errors[name] for f in found])
@@ -200,8 +203,10 @@ def instruments(seeds: int) -> Iterator[str]:
                 f"{100 * np.mean(np.abs(z) < NORMAL_95):.0f} %"
             )
         fits = np.array([list(clean_fits(f.model, clean).values()) for f in found])
-        words = ", ".join(f"{o} {m:.3f} % (least {w:.3f})" for o, m, w in zip(
-            clean.outputs, np.median(fits, axis=0), fits.min(axis=0), strict=True))  # fmt: skip
+        words = ", ".join(
+            f"{o} {m:.3f} % (least {w:.3f})"
+            for o, m, w in zip(clean.outputs, np.median(fits, axis=0), fits.min(axis=0), strict=True)
+        )
         yield f"A {level} dB, {seeds} seeds: median fit of the coupled free run to the clean outputs {words}"
 
 
@@ -211,7 +216,7 @@ def clean_fits(model: ftlm.Model, clean: ftlm.Run) -> dict[str, float]:
     return {
         n: 100 * (1 - float(np.linalg.norm(simulated[n] - clean[n]) / np.linalg.norm(clean[n] - clean[n].mean())))
         for n in clean.outputs
-    }  # fmt: skip
+    }
 
 
 #: Values of the orders around the truth; every true order is one of them.
@@ -229,7 +234,7 @@ def orders_by_lattice(task: tuple[str, int]) -> tuple[dict[str, float], float]:
     best = ftlm.identify(run, true, method="instrumental-variables", threads=1)
     try:
         found = ftlm.identify(
-            run, structure, method="instrumental-variables", lattice=ftlm.lattice(**LATTICES[name]), threads=1
+            run, structure, method="instrumental-variables", lattice=ftlm.order_grid(**LATTICES[name]), threads=1
         )
         return found.orders, shortfall(found.model, best.model, clean)
     except ftlm.ConvergenceError:
@@ -268,15 +273,18 @@ def heating() -> Iterator[str]:
     folder = Path(os.environ.get("FTLM_DATA", Path(__file__).resolve().parents[2] / "shared" / "data"))
     table = np.loadtxt(folder / "heating" / "heating_system.dat")
     run = ftlm.Run.from_arrays(
-        step=2.0, inputs={"u": table[:, 1], "one": np.ones(len(table))}, outputs={"T": table[:, 2]},
-        units={"T": "degC", "u": "V"}, name="heating",
-    )  # fmt: skip
+        step=2.0,
+        inputs={"u": table[:, 1], "one": np.ones(len(table))},
+        outputs={"T": table[:, 2]},
+        units={"T": "degC", "u": "V"},
+        name="heating",
+    )
     for name, (words, initial) in HEATING.items():
         structure = replace(ftlm.equation(words), initial=initial)
         found = ftlm.identify(run, structure)
-        part = ftlm.identify(run.slice(0, 1000), structure)
+        part = ftlm.identify(run.window(0, 1000), structure)
         numbers = ", ".join(f"{n} {v:.3f} ± {found.standard_errors[n]:.2g}" for n, v in found.orders.items())
-        finer = found.joint.noise["T"] if found.joint is not None else np.nan
+        finer = found.fit.noise["T"] if found.fit is not None else np.nan
         yield (
             f"{name}: fit {found.fit_percent['T']:.2f} %, residuals {finer:.2f} degC, BIC {found.information.bic:.0f}"
             f"{'; ' + numbers if numbers else ''}; identified from the first 1000 of 1600 s: "

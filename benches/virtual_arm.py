@@ -17,7 +17,7 @@ import numpy as np
 from scipy import signal
 
 import ftlm
-from ftlm.arm.flexible_link import PARAMETERS
+from ftlm.arm.flexible_link import PARAMETER_SETS
 from ftlm.rig.recording import STOCK_FILTER
 
 sys.path.insert(0, str(Path(__file__).resolve().parents[1] / "tests" / "python"))
@@ -36,16 +36,20 @@ LINKS = {
     2: "D^2 theta22 = a theta22 + d D theta22 - D^2 theta21 + p D^2 tip",
 }
 #: (J_j1 + J_j2)/J_j2 of the maker's file: torque per ampere and the hub's inertia are seen only together.
-RATIOS = {j: link.inertia_ratio for j, link in PARAMETERS["effective"].items()}
+RATIOS = {j: link.inertia_ratio for j, link in PARAMETER_SETS["effective"].items()}
 HUB = "D^2 {hub} = - v D {hub} + g {current} + {k:.6g} {bend} - f*sign(D {hub}) + c"
 
 
 def laboratory(name: str) -> ftlm.Run:
     """A whole run, measured currents, angles in rad."""
     return ftlm.load(
-        DATA / f"two_link_{name}" / f"{name}.csv", time="t_s", inputs={"I1": "Im1_meas_A", "I2": "Im2_meas_A"},
-        outputs=ANGLES, units=dict.fromkeys(ANGLES, "deg"), name=name,
-    )  # fmt: skip
+        DATA / f"two_link_{name}" / f"{name}.csv",
+        time="t_s",
+        inputs={"I1": "Im1_meas_A", "I2": "Im2_meas_A"},
+        outputs=ANGLES,
+        units=dict.fromkeys(ANGLES, "deg"),
+        name=name,
+    )
 
 
 def behind_filter(values: np.ndarray, step: float) -> np.ndarray:
@@ -63,9 +67,12 @@ def cut(run: ftlm.Run, inputs: dict[str, np.ndarray], outputs: dict[str, np.ndar
         return values[skip::THIN]
 
     return ftlm.Run.from_arrays(
-        step=THIN * run.step, inputs={n: thin(v) for n, v in inputs.items()}, name=run.name,
-        outputs={n: thin(v) for n, v in outputs.items()}, intersample=dict.fromkeys(inputs, "foh"),
-    )  # fmt: skip
+        step=THIN * run.step,
+        inputs={n: thin(v) for n, v in inputs.items()},
+        name=run.name,
+        outputs={n: thin(v) for n, v in outputs.items()},
+        intersample=dict.fromkeys(inputs, "foh"),
+    )
 
 
 def for_links(run: ftlm.Run) -> ftlm.Run:
@@ -100,9 +107,12 @@ def bends(run: ftlm.Run, links: dict[int, dict[str, float]]) -> dict[str, np.nda
     equations = tuple(ftlm.equation(w.replace("+ -", "- ")).equations[0] for w in words)
     model = ftlm.Model(ftlm.Structure(equations, coupling="simulated", initial="rest"))
     driven = ftlm.Run.from_arrays(
-        step=run.step, inputs={n: run[n] - run[n][0] for n in HUBS}, outputs={n: run[n] for n in DEFLECTIONS},
-        intersample=dict.fromkeys(HUBS, "foh"), name=run.name,
-    )  # fmt: skip
+        step=run.step,
+        inputs={n: run[n] - run[n][0] for n in HUBS},
+        outputs={n: run[n] for n in DEFLECTIONS},
+        intersample=dict.fromkeys(HUBS, "foh"),
+        name=run.name,
+    )
     solved = model.simulate(driven, tolerance=1e-4)
     return {n: solved[n] for n in DEFLECTIONS}
 
@@ -119,16 +129,14 @@ def fit() -> None:
     bent = {n: bends(r, links) for n, r in whole.items()}
     for stage in (1, 2):
         hub, bend, current = f"theta{stage}1", f"theta{stage}2", f"I{stage}"
-        own = [
-            cut(r, {current: r[current], bend: bent[n][bend]}, {hub: r[hub]}) for n, r in whole.items()
-        ]  # fmt: skip
+        own = [cut(r, {current: r[current], bend: bent[n][bend]}, {hub: r[hub]}) for n, r in whole.items()]
         # The link is as stiff for its hub as for itself: K_s/J_j1 is K_s/J_j2 over J_j1/J_j2 of the maker's file.
         words = HUB.format(hub=hub, bend=bend, current=current, k=-links[stage]["a"] / (RATIOS[stage] - 1.0))
         for run in own:
             found = fitted(words, [run], [run])
             if found.standard_errors["g"] > 0.1 * found.coefficients["g"]:
                 # A hub that friction holds so well tells torque and friction apart only where one is known.
-                torque = PARAMETERS["effective"][stage].coefficients(stage)[f"g{2 * stage - 1}"]
+                torque = PARAMETER_SETS["effective"][stage].coefficients(stage)[f"g{2 * stage - 1}"]
                 fitted(words.replace("g I", f"{torque:.6g} I"), [run], [run])
 
 

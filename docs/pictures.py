@@ -71,9 +71,13 @@ def performance() -> dict[str, Figure]:
     smallest = min(s["candidates"] for s in searches if s["m"] != pulses)
     for name, x, label, chosen in (
         ("cost-by-candidates", "candidates", "candidates", [s for s in searches if s["m"] == pulses]),
-        ("cost-by-pulses", "m", f"pulses (searches over {smallest} candidates)",
-         [s for s in searches if s["m"] != pulses]),
-    ):  # fmt: skip
+        (
+            "cost-by-pulses",
+            "m",
+            f"pulses (searches over {smallest} candidates)",
+            [s for s in searches if s["m"] != pulses],
+        ),
+    ):
         figure, plot = axes(label, "seconds a candidate")
         for threads in sorted({s["threads"] for s in chosen}):
             rows = sorted((s[x], s["wall"] / s["candidates"]) for s in chosen if s["threads"] == threads)
@@ -209,11 +213,14 @@ def next_experiment(folder: Path) -> Figure:
         return found, told
 
     found, told = (np.array([ratios(n)[k] for n in orders]) for k in (0, 1))
-    rows = [[n, *(f"{np.median(v[i]):.2f}" for v in (told, found)), f"{found[i].min():.2f} to {found[i].max():.2f}"]
-            for i, n in enumerate(orders)]  # fmt: skip
+    rows = [
+        [n, *(f"{np.median(v[i]):.2f}" for v in (told, found)), f"{found[i].min():.2f} to {found[i].max():.2f}"]
+        for i, n in enumerate(orders)
+    ]
     both = [np.prod(v, axis=0) for v in (told, found)]
-    rows.append(["product of all five", *(f"{np.median(v):.1f}" for v in both),
-                 f"{both[1].min():.1f} to {both[1].max():.1f}"])  # fmt: skip
+    rows.append(
+        ["product of all five", *(f"{np.median(v):.1f}" for v in both), f"{both[1].min():.1f} to {both[1].max():.1f}"]
+    )
     head = ["", "predicted (median)", f"found (median of {len(seeds)} seeds)", "found, least to most"]
     lines = ["Intervals after the square over intervals after the designed run:", ""]
     lines += [f"| {' | '.join(row)} |" for row in (head, ["---"] * 4, *rows)]
@@ -248,7 +255,7 @@ def unseen() -> Figure:
     square, sine = (demo_run(kind, duration=6.0).select(["I1", "theta11", "theta12"]) for kind in ("square", "sine"))
     link = ftlm.flexible_link(stage=1, form="published", coupling="measured", laws=())
     published = ftlm.identify(
-        square, link, method="multi-innovation", lattice=ftlm.lattice(step=0.2, alpha=(1.4, 2.0))
+        square, link, method="multi-innovation", lattice=ftlm.order_grid(step=0.2, alpha=(1.4, 2.0))
     ).validate(sine)
     ours = ftlm.identify(square, ftlm.flexible_link(stage=1, coupling="simulated")).validate(sine)
     thin = slice(None, None, 4)

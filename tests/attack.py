@@ -31,8 +31,17 @@ MEMORY = 4 << 30
 
 CALLS = "calls of the extension"
 #: Refusals in words; whatever else is raised breaks the promise.
-WORDS = {"DataError", "ModelError", "ConvergenceError", "TypeError", "ValueError", "OverflowError", "MemoryError",
-         "KeyError", "UnicodeEncodeError"}  # fmt: skip
+WORDS = {
+    "DataError",
+    "ModelError",
+    "ConvergenceError",
+    "TypeError",
+    "ValueError",
+    "OverflowError",
+    "MemoryError",
+    "KeyError",
+    "UnicodeEncodeError",
+}
 #: What hostile callbacks raise, and what a flag that is set is for.
 ASKED_FOR = {"OursError", "KeyboardInterrupt"}
 
@@ -251,7 +260,7 @@ def files(table, folder, counts):
     r = random.Random(1)
     equation = ftlm.equation("D^alpha y = c y + b u", initial="rest")
     store = folder / "whole.ftlm"
-    found = ftlm.search_orders(run, equation, ftlm.lattice(step=0.1), store=store, m=32)
+    found = ftlm.search_orders(run, equation, ftlm.order_grid(step=0.1), store=store, m=32)
     run.to_csv(folder / "whole.csv")
     found.model.save(folder / "whole.json")
     kinds = {
@@ -410,8 +419,10 @@ def presses(table, folder):
             if cpu > STOP:
                 table.broken("Ctrl-C in long calls", f"{what} after {after} s took {cpu:.2f} s of its processor time")
     table.tried("Ctrl-C in long calls", 3 * len(LONG))
-    table.notes += [f"{what}: at most {cpu:.2f} s of processor time, {wall:.2f} s of the clock, from Ctrl-C to its end"
-                    for what, (cpu, wall) in worst.items()]  # fmt: skip
+    table.notes += [
+        f"{what}: at most {cpu:.2f} s of processor time, {wall:.2f} s of the clock, from Ctrl-C to its end"
+        for what, (cpu, wall) in worst.items()
+    ]
 
 
 # ----------------------------------------------------------------------------------------------------------------------

@@ -207,8 +207,12 @@ class Sound:
 
     def multi_innovation(self):
         return (
-            *self.least_squares(), self.one(1, 2, 7), self.one(1.0, 1e6), self.one(True, False), self.one(True, False)
-        )  # fmt: skip
+            *self.least_squares(),
+            self.one(1, 2, 7),
+            self.one(1.0, 1e6),
+            self.one(True, False),
+            self.one(True, False),
+        )
 
     def instrumental_variables(self):
         structures = [self.structure(0), self.structure(1)]
@@ -231,9 +235,15 @@ class Sound:
         instants = [(None, False), (self.samples(count), True)] if self.random.random() < 0.2 else []
         jumps = (self.places(m)[:3], self.samples(3))
         return (
-            (step, self.normal((2, m)), None), every, self.normal((1, count)), series, [1.0], instants, shares,
+            (step, self.normal((2, m)), None),
+            every,
+            self.normal((1, count)),
+            series,
+            [1.0],
+            instants,
+            shares,
             (places, [None, self.one(None, jumps)]) if own else None,
-        )  # fmt: skip
+        )
 
     def free_inputs(self, *laws):
         """What is free of the second signal."""
@@ -246,10 +256,20 @@ class Sound:
         bounds, start = [(0.5, 2.0)], [self.number(0.8, 1.8)]
         free = self.free_inputs("delay", "saturation", "dead_zone")
         return (
-            self.experiments(own=not free and self.one(True, False)), [law], bounds,
-            [self.one("plain", "logarithm"), self.one("plain", "held")], coupled, self.terms(), start, [1.5, 0.7],
-            free, self.one(1, 3, 20), 1e-6, self.one(True, False), self.one(None, _core.Stop()),
-        )  # fmt: skip
+            self.experiments(own=not free and self.one(True, False)),
+            [law],
+            bounds,
+            [self.one("plain", "logarithm"), self.one("plain", "held")],
+            coupled,
+            self.terms(),
+            start,
+            [1.5, 0.7],
+            free,
+            self.one(1, 3, 20),
+            1e-6,
+            self.one(True, False),
+            self.one(None, _core.Stop()),
+        )
 
     # ------------------------------------------------------------------------------------------------------ joint fits
 
@@ -261,10 +281,17 @@ class Sound:
         ]
         hints = {"highest": None, "natural": [("alpha", [1.0])], "exceeds": [], "positive": [], "known": [("b", 1.0)]}
         told = {
-            "signals": ["y", "u"], "equations": [(0, (0.0, [("alpha", 1.0)]), terms, None)],
-            "bounds": self.one([], [("alpha", (0.5, 2.0))]), "coupled": self.one(True, False), "delayed": False,
-            "initial": self.terms(), "history": False, "inputs": inputs, "laws": [], "hints": self.one(hints, hints),
-        }  # fmt: skip
+            "signals": ["y", "u"],
+            "equations": [(0, (0.0, [("alpha", 1.0)]), terms, None)],
+            "bounds": self.one([], [("alpha", (0.5, 2.0))]),
+            "coupled": self.one(True, False),
+            "delayed": False,
+            "initial": self.terms(),
+            "history": False,
+            "inputs": inputs,
+            "laws": [],
+            "hints": self.one(hints, hints),
+        }
         return (told,)
 
     def sampled(self):
@@ -321,9 +348,15 @@ class Sound:
         problem, (runs, *_), values = self.sampled()
         held = self.one((), (0,), (1, 2))
         return problem, (
-            runs.sampled(1, 1, None), (values, []), self.one(True, False), held, self.one(0, 1, 20), 1e-6,
-            self.one(True, False), self.one(None, _core.Stop()),
-        )  # fmt: skip
+            runs.sampled(1, 1, None),
+            (values, []),
+            self.one(True, False),
+            held,
+            self.one(0, 1, 20),
+            1e-6,
+            self.one(True, False),
+            self.one(None, _core.Stop()),
+        )
 
     def joint_race(self):
         problem, runs, _ = self.sampled()
@@ -338,9 +371,18 @@ class Sound:
         near, start = self.one((values, [1.0], 1), None), self.one(values, None)
         raced = self.one(None, _core.joint_grids(problem, runs, [1.0], 1, [(values, "here")], 1))
         return (
-            problem, runs, [(1.0, 0.1)], self.one([], [values]), start, near, raced, self.one(True, False),
-            self.one(True, False), (self.one(1, 2), 1 << 30), self.one(None, _core.Stop()),
-        )  # fmt: skip
+            problem,
+            runs,
+            [(1.0, 0.1)],
+            self.one([], [values]),
+            start,
+            near,
+            raced,
+            self.one(True, False),
+            self.one(True, False),
+            (self.one(1, 2), 1 << 30),
+            self.one(None, _core.Stop()),
+        )
 
     def joint_race_values(self):
         problem, runs, values = self.sampled()
@@ -403,12 +445,20 @@ class Sound:
         law = (0, (0.0, [1.0, 0.0]), [own, force])
         strength = [(1.0, [(2, 1)]), self.one((0.0, []), (0.3, [(2, 1)])), (1.0, [])]
         return (
-            self.experiments(), [law], [(0, strength)], [(1.05, 2.0), (0.0, 1.0)],
-            ["plain", "plain", self.one("plain", "logarithm")], self.one((True, []), (True, [], 1)),
-            [self.number(1.5, 2.0), self.number(0.3, 0.9)], [0.7, 1.1, 0.2],
-            self.free_inputs("saturation", "dead_zone"), [], self.one(1, 3, 10), 1e-6,
+            self.experiments(),
+            [law],
+            [(0, strength)],
+            [(1.05, 2.0), (0.0, 1.0)],
+            ["plain", "plain", self.one("plain", "logarithm")],
+            self.one((True, []), (True, [], 1)),
+            [self.number(1.5, 2.0), self.number(0.3, 0.9)],
+            [0.7, 1.1, 0.2],
+            self.free_inputs("saturation", "dead_zone"),
+            [],
+            self.one(1, 3, 10),
+            1e-6,
             self.one(None, _core.Stop()),
-        )  # fmt: skip
+        )
 
     def friction_respond(self):
         law = self.one((0.3, 0.0, 1.0), (0.3, 0.1, 0.5), (0.0, 0.0, 1.0))
@@ -501,9 +551,17 @@ class Sound:
     def settings(self):
         instruments = 3 if self.random.random() < 0.2 else 0
         return (
-            self.one("output-error", "equation-error"), self.one("l1", "l2"), self.one(0, 3), 1e4,
-            self.one(True, False), self.one(1, 5, 20), self.one(1, 2), self.one(True, False), instruments, 1 << 31,
-        )  # fmt: skip
+            self.one("output-error", "equation-error"),
+            self.one("l1", "l2"),
+            self.one(0, 3),
+            1e4,
+            self.one(True, False),
+            self.one(1, 5, 20),
+            self.one(1, 2),
+            self.one(True, False),
+            instruments,
+            1 << 31,
+        )
 
     def progress(self):
         return self.one(None, lambda *_: None)
@@ -556,13 +614,13 @@ class Sound:
     def stage(self):
         """What the search of a stage takes."""
         weights = [(1.0, 0.0), (0.0, 1.0)]
-        laws = [(output, (0.0, [1.0, 0.0]), [(output, (0.0, list(weights[1]))), (2, (0.0, [0.0, 0.0]))])
-                for output in (0, 1)]  # fmt: skip
+        laws = [
+            (output, (0.0, [1.0, 0.0]), [(output, (0.0, list(weights[1]))), (2, (0.0, [0.0, 0.0]))])
+            for output in (0, 1)
+        ]
         runs = [(*run[:2], None) for run in self.runs()]
         axes = [[1.05, 1.4, 1.8], [0.0, 0.4, 0.8]]
-        return (
-            runs, axes, laws, list(self.INPUTS), [[None, None]] * 2, [1.0, 2.0], self.terms(), self.settings()
-        )  # fmt: skip
+        return (runs, axes, laws, list(self.INPUTS), [[None, None]] * 2, [1.0, 2.0], self.terms(), self.settings())
 
     def search_stage(self):
         return *self.stage(), self.progress()
@@ -697,17 +755,58 @@ NAMED = {"block_pulse_kernel", "operational_matrix", "series_multiply", "series_
 
 
 NUMBERS = (
-    math.nan, math.inf, -math.inf, 0.0, -0.0, -1.0, 1.0, 2.0, 1e308, -1e308, 5e-324, 1e-300, -1e300, 1e16, 1e-9,
-)  # fmt: skip
+    math.nan,
+    math.inf,
+    -math.inf,
+    0.0,
+    -0.0,
+    -1.0,
+    1.0,
+    2.0,
+    1e308,
+    -1e308,
+    5e-324,
+    1e-300,
+    -1e300,
+    1e16,
+    1e-9,
+)
 FLOATS = (*NUMBERS, None, "x", 1j, 10**400)
 #: Sizes between a million and what is refused are work, not an attack.
 WHOLES = (
-    -1, 0, 1, 2, 3, 1 << 20, (1 << 31) - 1, 1 << 31, 1 << 40, 1 << 62, (1 << 63) - 1, 1 << 63, 1 << 64, -(1 << 63),
-    None, 0.5, "x",
-)  # fmt: skip
+    -1,
+    0,
+    1,
+    2,
+    3,
+    1 << 20,
+    (1 << 31) - 1,
+    1 << 31,
+    1 << 40,
+    1 << 62,
+    (1 << 63) - 1,
+    1 << 63,
+    1 << 64,
+    -(1 << 63),
+    None,
+    0.5,
+    "x",
+)
 WORDS = (
-    "", "\0", "x" * 9999, "\ud800", "linear", "held", "excess", "delay", "late", "grunwald-letnikov", None, 3, b"l1",
-)  # fmt: skip
+    "",
+    "\0",
+    "x" * 9999,
+    "\ud800",
+    "linear",
+    "held",
+    "excess",
+    "delay",
+    "late",
+    "grunwald-letnikov",
+    None,
+    3,
+    b"l1",
+)
 ODD = (None, 0, "x", {}, float)
 
 
@@ -738,11 +837,22 @@ def hostile_array(array, r, large):
             array.flat[r.randrange(array.size)] = r.choice(NUMBERS)
         return array
     ways = [
-        lambda: array.astype(np.float32), lambda: array.astype(">f8"), lambda: array.astype(np.int64),
-        lambda: array[..., ::2], lambda: array[..., ::-1], lambda: array.T, lambda: array[..., :0], lambda: array[:0],
-        lambda: array[..., :1], lambda: array[:1], lambda: array[..., None], lambda: np.asfortranarray(array),
-        lambda: np.concatenate([array, array]), array.tolist, lambda: None,
-    ]  # fmt: skip
+        lambda: array.astype(np.float32),
+        lambda: array.astype(">f8"),
+        lambda: array.astype(np.int64),
+        lambda: array[..., ::2],
+        lambda: array[..., ::-1],
+        lambda: array.T,
+        lambda: array[..., :0],
+        lambda: array[:0],
+        lambda: array[..., :1],
+        lambda: array[:1],
+        lambda: array[..., None],
+        lambda: np.asfortranarray(array),
+        lambda: np.concatenate([array, array]),
+        array.tolist,
+        lambda: None,
+    ]
     if large:
         ways += [
             lambda: np.broadcast_to(np.float64(1.0), (*array.shape[:-1], LARGE)),

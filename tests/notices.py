@@ -77,20 +77,27 @@ def bill(metadata, lock):
     def component(package):
         checksum = checksums[package["name"], package["version"]]
         return {
-            "type": "library", "bom-ref": reference(package), "name": package["name"], "version": package["version"],
+            "type": "library",
+            "bom-ref": reference(package),
+            "name": package["name"],
+            "version": package["version"],
             **({"hashes": [{"alg": "SHA-256", "content": checksum}]} if checksum else {}),
-            "licenses": [{"expression": package["license"].replace("/", " OR ")}], "purl": reference(package),
-        }  # fmt: skip
+            "licenses": [{"expression": package["license"].replace("/", " OR ")}],
+            "purl": reference(package),
+        }
 
     def needed(package):
         linked_in = [d["pkg"] for d in nodes[package["id"]]["deps"] if any(k["kind"] is None for k in d["dep_kinds"])]
         return sorted(reference(packages[i]) for i in linked_in if i in within)
 
     whole = {
-        "bomFormat": "CycloneDX", "specVersion": "1.5", "version": 1, "metadata": {"component": component(root)},
+        "bomFormat": "CycloneDX",
+        "specVersion": "1.5",
+        "version": 1,
+        "metadata": {"component": component(root)},
         "components": [component(package) for package in crates],
         "dependencies": [{"ref": reference(p), "dependsOn": needed(p)} for p in (root, *crates)],
-    }  # fmt: skip
+    }
     return json.dumps(whole, indent=1, ensure_ascii=False) + "\n"
 
 

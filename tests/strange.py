@@ -51,11 +51,37 @@ def fails(*_):
 
 #: What hostile values of the extension's arguments do not have.
 ODD = (
-    10**5000, -(10**5000), np.float32(1), np.array(1.0), np.array([1.0, 2.0]), np.array(["a"], dtype=object), b"x", [],
-    [[]], {"y": None}, {None: 1}, "\ud800", "theta", Unreadable(1.0), Longer(), object, np.bool_(True), 1 + 1j,
-    np.complex64(1), 1e-320, 1e-12, 1e12, 1e308, 1 << 30, range(3), {1, 2}, fails, np.datetime64("2020-01-01"),
-    memoryview(b"abcdefgh"), ftlm.ModelError,
-)  # fmt: skip
+    10**5000,
+    -(10**5000),
+    np.float32(1),
+    np.array(1.0),
+    np.array([1.0, 2.0]),
+    np.array(["a"], dtype=object),
+    b"x",
+    [],
+    [[]],
+    {"y": None},
+    {None: 1},
+    "\ud800",
+    "theta",
+    Unreadable(1.0),
+    Longer(),
+    object,
+    np.bool_(True),
+    1 + 1j,
+    np.complex64(1),
+    1e-320,
+    1e-12,
+    1e12,
+    1e308,
+    1 << 30,
+    range(3),
+    {1, 2},
+    fails,
+    np.datetime64("2020-01-01"),
+    memoryview(b"abcdefgh"),
+    ftlm.ModelError,
+)
 
 
 class Unwritable(ftlm.DataError):
@@ -80,7 +106,7 @@ def ran_from(content):
         path.write_bytes(text)
         made = control.load_controller(path)
     for _ in range(3):
-        put = made(0.1) if isinstance(made, control.Realised) else made([0.1] * len(made.observer.measured), 0.2)
+        put = made(0.1) if isinstance(made, control.DiscretePid) else made([0.1] * len(made.observer.measured), 0.2)
         if not abs(put) <= made.limit:
             raise AssertionError(f"{put!r} is over the limit of {made.limit!r}")
 
@@ -90,59 +116,101 @@ def recipes():
     hub = ftlm.Model(ftlm.equation("D^2 theta = -63 D^0.95 theta + 140 I"))
     link = ftlm.Model(ftlm.equation("D^2 y = -300 y - 4 D^0.9 y + 300 u"))
     shaper = control.input_shaper(POLE)
-    ran = {"reference": REST, "rig": "virtual", "limit": 30.0, "rate": 500.0, "seed": 0, "parameters": "effective",
-           "paced": False, "watchdog": 0.1, "arm": False, "name": "control"}  # fmt: skip
+    ran = {
+        "reference": REST,
+        "rig": "virtual",
+        "limit": 30.0,
+        "rate": 500.0,
+        "seed": 0,
+        "parameters": "effective",
+        "paced": False,
+        "watchdog": 0.1,
+        "arm": False,
+        "name": "control",
+    }
     turning = "D^2 hub = 160 bend - 30 D hub + 100 I; D^2 bend = -300 bend - 4 D bend - D^2 hub"
     watching = {
-        "model": ftlm.Model(ftlm.equation(turning, coupling="simulated")), "input": "I", "measured": ["hub", "bend"],
-        "noise": {"hub": 3e-4, "bend": 2e-4}, "rate": 500.0, "band": (0.5, 150.0), "poles": 4,
-        "coupling": "simulated", "sensor": False,
-    }  # fmt: skip
+        "model": ftlm.Model(ftlm.equation(turning, coupling="simulated")),
+        "input": "I",
+        "measured": ["hub", "bend"],
+        "noise": {"hub": 3e-4, "bend": 2e-4},
+        "rate": 500.0,
+        "band": (0.5, 150.0),
+        "poles": 4,
+        "coupling": "simulated",
+        "sensor": False,
+    }
     quick = watching | {"allowed": {"hub": 0.02}, "effort": 1.0}
     return {
         "input_shaper": (
-            control.input_shaper, {"model": link, "kind": "zv", "modes_shaped": 1, "coupling": "measured"}
+            control.input_shaper,
+            {"model": link, "kind": "zv", "modes_shaped": 1, "coupling": "measured"},
         ),
         "input_shaper of a pole": (control.input_shaper, {"model": POLE, "kind": "zvd"}),
         "Shaper.filter": (shaper.filter, {"reference": np.ones(50), "rate": 500.0}),
         "Shaper.impulses": (shaper.impulses, {"rate": 500.0}),
         "fractional_pid": (
             control.fractional_pid,
-            {"model": hub, "output": "theta", "input": "I", "crossover": 40.0, "phase_margin": 60.0, "rate": 500.0,
-             "samples": 2, "seed": 0, "coupling": "simulated"},
+            {
+                "model": hub,
+                "output": "theta",
+                "input": "I",
+                "crossover": 40.0,
+                "phase_margin": 60.0,
+                "rate": 500.0,
+                "samples": 2,
+                "seed": 0,
+                "coupling": "simulated",
+            },
         ),
         "observer": (control.observer, watching | {"drift": 0.2}),
         "lqg": (
             control.lqg,
-            watching | {"allowed": {"hub": 0.02, "hub + bend": 0.02}, "effort": 1.0, "output": "hub", "drift": None,
-                        "limit": 5.0, "samples": 2, "seed": 0},
+            watching
+            | {
+                "allowed": {"hub": 0.02, "hub + bend": 0.02},
+                "effort": 1.0,
+                "output": "hub",
+                "drift": None,
+                "limit": 5.0,
+                "samples": 2,
+                "seed": 0,
+            },
         ),
         "smooth_move": (
-            control.smooth_move, {"size": 0.3, "duration": 0.5, "rate": 500.0, "before": 0.3, "after": 1.2}
+            control.point_to_point,
+            {"size": 0.3, "duration": 0.5, "rate": 500.0, "before": 0.3, "after": 1.2},
         ),
         "inverse": (
-            control.inverse,
-            {"design": control.fractional_pid(hub, crossover=40.0), "path": control.smooth_move(0.3, 0.5),
-             "of": "theta", "limit": 30.0, "samples": 2, "seed": 0},
+            control.inverse_dynamics,
+            {
+                "design": control.fractional_pid(hub, crossover=40.0),
+                "path": control.point_to_point(0.3, 0.5),
+                "of": "theta",
+                "limit": 30.0,
+                "samples": 2,
+                "seed": 0,
+            },
         ),
         "load_controller": (control.load_controller, {"path": "none.json"}),
-        "load_controller of a PID": (lambda **content: ran_from(content), file_of(control.Realised(PID, 500.0))),
+        "load_controller of a PID": (lambda **content: ran_from(content), file_of(control.DiscretePid(PID, 500.0))),
         "load_controller of an LQG": (lambda **content: ran_from(content), file_of(control.lqg(**quick).controller)),
         "FractionalPid": (
-            lambda **numbers: control.Realised(control.FractionalPid(**numbers), 500.0)(0.1),
+            lambda **numbers: control.DiscretePid(control.FractionalPid(**numbers), 500.0)(0.1),
             {"kp": 1.0, "ki": 2.0, "kd": 0.1, "lam": 0.7, "mu": 0.8},
         ),
         "Realised": (
-            lambda pid, rate, **options: control.Realised(pid, rate, **options)(0.1),
+            lambda pid, rate, **options: control.DiscretePid(pid, rate, **options)(0.1),
             {"pid": PID, "rate": 500.0, "limit": 1.0, "band": (1.0, 50.0), "order": 3},
         ),
-        "HubLoops": (control.HubLoops, {"first": control.Realised(PID, 500.0), "second": None}),
+        "HubLoops": (control.JointControllers, {"first": control.DiscretePid(PID, 500.0), "second": None}),
         "rig.control": (lambda **asked: ftlm.rig.control(lambda *_: (0.1, 0.0), **asked), ran),
         "rig.control, answers": (lambda answer: ftlm.rig.control(lambda *_: answer, REST), {"answer": (0.1, 0.0)}),
         "rig.control, what is called": (
-            lambda controller: ftlm.rig.control(controller, REST), {"controller": lambda *_: (0.1, 0.0)}
+            lambda controller: ftlm.rig.control(controller, REST),
+            {"controller": lambda *_: (0.1, 0.0)},
         ),
-    }  # fmt: skip
+    }
 
 
 def bad(value, r):
@@ -193,6 +261,6 @@ def calls(r, count, only=()):
 
 def shown_all(given):
     """Arguments as they can be shown."""
-    from ftlm.utils.validation import shown
+    from ftlm.utils.validation import short_repr
 
-    return {name: shown(value, 100) for name, value in given.items()}
+    return {name: short_repr(value, 100) for name, value in given.items()}

@@ -16,9 +16,15 @@ from pathlib import Path
 
 #: The C library with its parts of old, and the compiler's run time: every Linux of a manylinux policy has them.
 SYSTEM = {
-    "libc.so.6", "libm.so.6", "libdl.so.2", "libpthread.so.0", "librt.so.1", "libgcc_s.so.1",
-    "ld-linux-x86-64.so.2", "ld-linux-aarch64.so.1",
-}  # fmt: skip
+    "libc.so.6",
+    "libm.so.6",
+    "libdl.so.2",
+    "libpthread.so.0",
+    "librt.so.1",
+    "libgcc_s.so.1",
+    "ld-linux-x86-64.so.2",
+    "ld-linux-aarch64.so.1",
+}
 
 
 #: The whole C library of a Linux of a musllinux policy.

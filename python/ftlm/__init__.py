@@ -10,16 +10,16 @@ if _typing.TYPE_CHECKING:
     from ftlm import rig
     from ftlm._core import __version__
     from ftlm.arm.energy_balance import energies
-    from ftlm.arm.flexible_link import PARAMETERS, LinkParameters, flexible_link, link_model, order_law
+    from ftlm.arm.flexible_link import PARAMETER_SETS, LinkParameters, flexible_link, link_model, order_law
     from ftlm.data.frequency_data import FrequencyData
     from ftlm.data.run import Run
     from ftlm.errors import ConvergenceError, DataError, FtlmError, InternalError, ModelError, RigFault
-    from ftlm.estimation.consistency import Agreement, Difference, agreement
+    from ftlm.estimation.consistency import Consistency, ParameterDifference, consistency
     from ftlm.estimation.frequency_domain import identify_frequency
     from ftlm.estimation.frequency_result import FrequencyIdentification, FrequencyValidation
     from ftlm.estimation.genetic import Genetic
-    from ftlm.estimation.identify import Identified, identify, identify_many
-    from ftlm.estimation.linear import Trace, multi_innovation_trace
+    from ftlm.estimation.identify import BatchResult, identify, identify_many
+    from ftlm.estimation.linear import MultiInnovationTrace, multi_innovation_trace
     from ftlm.estimation.output_error import ProfileInterval
     from ftlm.estimation.physical_parameters import PhysicalParameter, physical_parameters
     from ftlm.estimation.result import Identification
@@ -47,7 +47,7 @@ if _typing.TYPE_CHECKING:
     from ftlm.simulation.simulate import explicit_euler, simulate
     from ftlm.structure.equation import Equation, Friction, Stribeck, Term
     from ftlm.structure.order import Order
-    from ftlm.structure.order_grid import Lattice, lattice
+    from ftlm.structure.order_grid import OrderGrid, order_grid
     from ftlm.structure.parser import equation
     from ftlm.structure.sensor_filter import SensorFilter
     from ftlm.structure.structure import Structure
@@ -59,15 +59,15 @@ if _typing.TYPE_CHECKING:
     from ftlm.validation.residual_tests import CorrelationTest, FeedbackTest, OutputResiduals, Residuals, resid
 
 __all__ = [
-    "PARAMETERS",
-    "Agreement",
+    "PARAMETER_SETS",
     "Assumption",
+    "BatchResult",
     "Comparison",
+    "Consistency",
     "ConvergenceError",
     "CorrelationTest",
     "DataError",
     "DesignedInput",
-    "Difference",
     "Equation",
     "Estimate",
     "FeedbackTest",
@@ -79,19 +79,20 @@ __all__ = [
     "FtlmError",
     "Genetic",
     "Identification",
-    "Identified",
     "InformationCriteria",
     "InternalError",
-    "Lattice",
     "Layout",
     "LinkParameters",
     "Metrics",
     "Model",
     "ModelError",
+    "MultiInnovationTrace",
     "OpenedFile",
     "Order",
     "OrderCertificate",
+    "OrderGrid",
     "OutputResiduals",
+    "ParameterDifference",
     "PhysicalParameter",
     "ProfileInterval",
     "Reproduction",
@@ -106,15 +107,14 @@ __all__ = [
     "Stribeck",
     "Structure",
     "Term",
-    "Trace",
     "Trial",
     "Validation",
     "Verdict",
     "__version__",
-    "agreement",
     "block_pulse_matrix",
     "certify_orders",
     "compare",
+    "consistency",
     "design_input",
     "energies",
     "equation",
@@ -129,7 +129,6 @@ __all__ = [
     "identify_frequency",
     "identify_many",
     "information_criteria",
-    "lattice",
     "link_model",
     "load",
     "load_frequency",
@@ -138,6 +137,7 @@ __all__ = [
     "multi_innovation_trace",
     "open_file",
     "operational_matrix",
+    "order_grid",
     "order_law",
     "physical_parameters",
     "reproduce",
@@ -151,7 +151,7 @@ __all__ = [
 ]
 
 #: Module of each public name.
-_HOMES = {
+_MODULE_BY_NAME = {
     name: home
     for home, names in {
         "_core": "__version__",
@@ -199,7 +199,7 @@ _HOMES = {
     for name in names.split()
 }
 #: Public modules that are attributes of the package.
-_MODULES = frozenset(
+_PUBLIC_MODULES = frozenset(
     {
         "control",
         "errors",
@@ -217,9 +217,9 @@ _MODULES = frozenset(
 
 def __getattr__(name: str) -> object:
     """Import a public name or module, such as `ftlm.rig`, on first use."""
-    if name in _HOMES:
-        value = getattr(_importlib.import_module(f"ftlm.{_HOMES[name]}"), name)
-    elif name in _MODULES:
+    if name in _MODULE_BY_NAME:
+        value = getattr(_importlib.import_module(f"ftlm.{_MODULE_BY_NAME[name]}"), name)
+    elif name in _PUBLIC_MODULES:
         value = _importlib.import_module(f"ftlm.{name}")
     else:
         raise AttributeError(f"module 'ftlm' has no attribute {name!r}")
@@ -229,4 +229,4 @@ def __getattr__(name: str) -> object:
 
 def __dir__() -> list[str]:
     """Public names, imported or not."""
-    return sorted({*globals(), *__all__, *_MODULES})
+    return sorted({*globals(), *__all__, *_PUBLIC_MODULES})

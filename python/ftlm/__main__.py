@@ -13,14 +13,14 @@ def _leave(*_: object) -> None:
 
 
 # Libraries may convert a KeyboardInterrupt during an import to another exception.
-_OURS = (
+_OWNS_INTERRUPT = (
     signal.getsignal(signal.SIGINT) is signal.default_int_handler
     and threading.current_thread() is threading.main_thread()
 )
-if _OURS:
+if _OWNS_INTERRUPT:
     signal.signal(signal.SIGINT, _leave)
 
-if _OURS:
+if _OWNS_INTERRUPT:
     signal.signal(signal.SIGINT, signal.default_int_handler)
 
 __all__ = ["main"]

@@ -10,7 +10,7 @@ from numpy.typing import ArrayLike, NDArray
 
 from ftlm import _core
 from ftlm.errors import ModelError
-from ftlm.utils.validation import along, as_floats, check_pulses, real_number
+from ftlm.utils.validation import apply_along_axis, as_floats, check_pulses, real_number
 
 
 def fractional_integral(
@@ -55,7 +55,7 @@ def fractional_integral(
     O(n log n) for n samples.
     """
     eta, width = real_number("order", order), real_number("step", step)
-    return along("x", x, axis, lambda rows: _core.fractional_integral(rows, eta, width, rule))
+    return apply_along_axis("x", x, axis, lambda rows: _core.fractional_integral(rows, eta, width, rule))
 
 
 def fractional_derivative(
@@ -115,7 +115,7 @@ def fractional_derivative(
         starts = np.ascontiguousarray(starts)
         return _core.fractional_derivative(rows, alpha, width, definition, starts)
 
-    return along("x", x, axis, work)
+    return apply_along_axis("x", x, axis, work)
 
 
 def haar_transform(x: ArrayLike, *, axis: int = -1) -> NDArray[np.float64]:
@@ -138,7 +138,7 @@ def haar_transform(x: ArrayLike, *, axis: int = -1) -> NDArray[np.float64]:
     ModelError
         A length that is no power of two.
     """
-    return along("x", x, axis, _core.haar_transform)
+    return apply_along_axis("x", x, axis, _core.haar_transform)
 
 
 def haar_inverse(x: ArrayLike, *, axis: int = -1) -> NDArray[np.float64]:
@@ -161,7 +161,7 @@ def haar_inverse(x: ArrayLike, *, axis: int = -1) -> NDArray[np.float64]:
     ModelError
         A length that is no power of two.
     """
-    return along("x", x, axis, _core.haar_inverse)
+    return apply_along_axis("x", x, axis, _core.haar_inverse)
 
 
 def _step(m: int, duration: float) -> float:

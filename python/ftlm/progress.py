@@ -14,33 +14,33 @@ from rich.progress import Progress as RichProgress
 from rich.progress import TaskID
 
 #: Work that ends sooner shows no bar.
-PATIENCE = 1.0
+BAR_DELAY_S = 1.0
 #: Work that takes longer [s] is announced with its estimated duration.
-WONDER = 2.0
+ANNOUNCEMENT_THRESHOLD_S = 2.0
 #: Smallest width of a bar and of its label, and terminal width from which the count of candidates is shown [columns].
-LEAST_BAR, LEAST_LABEL, ROOMY = 10, 12, 100
+MIN_BAR_COLUMNS, MIN_LABEL_COLUMNS, WIDE_TERMINAL_COLUMNS = 10, 12, 100
 
 
-class Parts(int):
+class ShareTotal(int):
     """Total that stands for a whole: the bar shows a percentage instead of a count."""
 
 
 #: Total of work without a natural count.
-PARTS = Parts(1000)
+TOTAL_PARTS = ShareTotal(1000)
 
 
-def left_in_words(seconds: float) -> str:
+def format_time_left(seconds: float) -> str:
     """Return the time left as text with one digit."""
     if seconds < 90:
-        return f"about {rounded(seconds):g} s left"
+        return f"about {round_coarsely(seconds):g} s left"
     if seconds < 5400:
-        return f"about {rounded(seconds / 60):g} min left"
-    return f"about {rounded(seconds / 3600):g} h left"
+        return f"about {round_coarsely(seconds / 60):g} min left"
+    return f"about {round_coarsely(seconds / 3600):g} h left"
 
 
-def expected_in_words(least: float, most: float) -> str:
+def format_duration_estimate(least: float, most: float) -> str:
     """Return an estimated duration [s] as text: about one value, a range, or an upper bound."""
-    low, high = left_in_words(least).split(" ")[1:3], left_in_words(most).split(" ")[1:3]
+    low, high = format_time_left(least).split(" ")[1:3], format_time_left(most).split(" ")[1:3]
     if low == high:
         return f"about {' '.join(high)}"
     if least < 1.0:
@@ -48,13 +48,13 @@ def expected_in_words(least: float, most: float) -> str:
     return f"{low[0]} to {' '.join(high)}" if low[1] == high[1] else f"{' '.join(low)} to {' '.join(high)}"
 
 
-def rounded(value: float) -> float:
+def round_coarsely(value: float) -> float:
     """Return one of 1, 2, 3, 5, 7 times a power of ten, at least 1."""
     power = 10.0 ** max(math.floor(math.log10(max(value, 1.0))), 0)
     return power * min((1, 2, 3, 5, 7, 10), key=lambda digit: abs(digit * power - value))
 
 
-class Course:
+class ShareTracker:
     """Share of completed work with independent parts; it never decreases.
 
     Parameters
@@ -68,30 +68,30 @@ class Course:
         self.reached = 0.0
         self._said = -1
 
-    def at(self, share: float) -> None:
+    def advance_to(self, share: float) -> None:
         """Report that this share of the whole is done."""
         self.reached = max(self.reached, min(share, 1.0))
-        parts = round(PARTS * self.reached)
+        parts = round(TOTAL_PARTS * self.reached)
         if self._told is not None and parts > self._said:
             self._said = parts
-            self._told(parts, PARTS)
+            self._told(parts, TOTAL_PARTS)
 
-    def until(self, share: float, sweep: float = 0.5) -> Callable[[int, int], None]:
+    def subtask(self, share: float, sweep: float = 0.5) -> Callable[[int, int], None]:
         """Return a callback (done, total) for a part of the work that ends at this share of the whole.
 
         If the part restarts its count, each pass takes the same share of the remainder.
         """
         begun, last = self.reached, 0.0
 
-        def told(done: int, total: int) -> None:
+        def report_subtask(done: int, total: int) -> None:
             nonlocal begun, last
             fraction = done / max(total, 1)
             if fraction < last:
                 begun = self.reached
             last = fraction
-            self.at(begun + sweep * (share - begun) * fraction)
+            self.advance_to(begun + sweep * (share - begun) * fraction)
 
-        return told
+        return report_subtask
 
 
 class _Bars:
@@ -125,7 +125,9 @@ class _Bars:
         with self._lock:
             if self._shown is not None:
                 figures = (str(state.get(name, "")) for name in ("counted", "pruned", "left"))
-                room = max(self._shown.console.width - sum(len(f) + 1 for f in figures) - LEAST_BAR, LEAST_LABEL)
+                room = max(
+                    self._shown.console.width - sum(len(f) + 1 for f in figures) - MIN_BAR_COLUMNS, MIN_LABEL_COLUMNS
+                )
                 label = str(state["description"])
                 label = label if len(label) <= room else f"{label[: room - 1].rstrip(' ,')}…"
                 self._shown.update(task, **state | {"description": label})
@@ -172,25 +174,25 @@ class Progress:
 
     def __call__(self, done: int, total: int, pruned: int | None = None) -> None:
         """Show ``done`` of ``total`` candidates, ``pruned`` of them excluded early."""
-        if self._quiet or time.monotonic() - self._start < PATIENCE or total == 0:
+        if self._quiet or time.monotonic() - self._start < BAR_DELAY_S or total == 0:
             return
         if self._task is None:
             self._task = self._bars.start(total)
         passed = max(time.monotonic() - self._start, 1e-9)
         counted = f"{100 * done // total:.0f} %"
         # Of work without a count of its own a person wants to know the share alone.
-        if not isinstance(total, Parts):
-            counted += f" of {total:,.0f}" if self._bars.width >= ROOMY else ""
+        if not isinstance(total, ShareTotal):
+            counted += f" of {total:,.0f}" if self._bars.width >= WIDE_TERMINAL_COLUMNS else ""
             counted += f" {done / passed:,.0f}/s"
         share = "" if pruned is None else f"{100 * pruned / max(done, 1):.1f} % pruned"
-        left = left_in_words(passed * (total - done) / done) if 0 < done < total else ""
+        left = format_time_left(passed * (total - done) / done) if 0 < done < total else ""
         state = {"description": self._label, "counted": counted, "pruned": share, "left": left}
         self._bars.update(self._task, completed=done, total=total, **state)
         if done >= total:
             # The next search of the same job starts a bar of its own.
             self._stop()
 
-    def beside(self) -> Progress:
+    def add_bar(self) -> Progress:
         """Return another bar on the same display, for work in another thread."""
         other = Progress(self._label, quiet=self._quiet)
         other._bars = self._bars
@@ -199,7 +201,7 @@ class Progress:
     def so_far(self, done: int, known: int) -> None:
         """Show progress of work whose total is not known."""
         passed = time.monotonic() - self._start
-        if self._quiet or passed < PATIENCE:
+        if self._quiet or passed < BAR_DELAY_S:
             return
         if self._task is None:
             self._task = self._bars.start(None)
@@ -214,8 +216,8 @@ class Progress:
     def expect(self, what: str, least: float, most: float | None = None) -> None:
         """Announce the estimated duration, or its range [s], of long work."""
         most = least if most is None else most
-        if not self._quiet and most >= WONDER:
-            print(f"{what} takes {expected_in_words(least, most)}; Ctrl-C ends it", file=sys.stderr)
+        if not self._quiet and most >= ANNOUNCEMENT_THRESHOLD_S:
+            print(f"{what} takes {format_duration_estimate(least, most)}; Ctrl-C ends it", file=sys.stderr)
 
     def name(self, label: str) -> None:
         """Set the label of the bar."""

@@ -85,7 +85,7 @@ def parquet(data):
 
 def answer(data):
     """What the child that reads .mat and parquet files says; it may have been taken over by the file."""
-    answers = apart._Answers(data)
+    answers = apart._ReaderOutput(data)
     while answers.table(Path("x.mat"), Layout()) is not None:
         pass
 
@@ -114,13 +114,13 @@ def sealed(data):
 
     The input is a chain of payloads, each behind its length.
     """
-    pieces, at, digest = [frames.MAGIC], 0, bytes(frames.DIGEST)
-    offset = len(frames.MAGIC)
+    pieces, at, digest = [frames.FILE_SIGNATURE], 0, bytes(frames.DIGEST_BYTES)
+    offset = len(frames.FILE_SIGNATURE)
     while at + 4 <= len(data):
         (length,) = struct.unpack_from("<I", data, at)
         payload = data[at + 4 : at + 4 + length]
         at += 4 + length
-        piece, digest = frames.framed(payload, offset, digest)
+        piece, digest = frames.encode_frame(payload, offset, digest)
         pieces.append(piece)
         offset += len(piece)
     stored(b"".join(pieces))
@@ -137,29 +137,51 @@ def stored(data):
 TARGETS = {
     f.__name__: f
     for f in (
-        csv, csv_header, opened, packed, columns, mat, parquet, answer, model, equation, order, values, sealed, stored
+        csv,
+        csv_header,
+        opened,
+        packed,
+        columns,
+        mat,
+        parquet,
+        answer,
+        model,
+        equation,
+        order,
+        values,
+        sealed,
+        stored,
     )
 } | {
-    "read_sheet": _read("sheet", ".xlsx"), "read_hdf5": _read("hdf5", ".h5"), "read_numpy": _read("numpy", ".npz"),
+    "read_sheet": _read("sheet", ".xlsx"),
+    "read_hdf5": _read("hdf5", ".h5"),
+    "read_numpy": _read("numpy", ".npz"),
     "read_feather": _read("feather", ".feather"),
-}  # fmt: skip
+}
 #: What must be installed for some.
 NEEDS = {
-    "mat": "scipy", "parquet": "pyarrow", "read_feather": "pyarrow", "read_hdf5": "h5py",
+    "mat": "scipy",
+    "parquet": "pyarrow",
+    "read_feather": "pyarrow",
+    "read_hdf5": "h5py",
     "read_sheet": "python_calamine",
-}  # fmt: skip
+}
 #: Those that start a child for every input.
 SLOW = ("mat", "parquet")
 
 
 def unsealed(data):
     """Payloads of a store, each behind its length: what :func:`sealed` takes."""
-    at, out = len(frames.MAGIC), []
+    at, out = len(frames.FILE_SIGNATURE), []
     while at < len(data):
         (length,) = struct.unpack_from("<I", data, at)
-        assert struct.unpack_from("<I", data, at + 4)[0] == frames._check(data[at : at + 4], at) != zlib.crc32(b"")
+        assert (
+            struct.unpack_from("<I", data, at + 4)[0]
+            == frames._length_checksum(data[at : at + 4], at)
+            != zlib.crc32(b"")
+        )
         out.append(data[at : at + 4] + data[at + 8 : at + 8 + length])
-        at += 8 + length + frames.DIGEST
+        at += 8 + length + frames.DIGEST_BYTES
     return b"".join(out)
 
 
@@ -203,9 +225,10 @@ def _seeds(target, folder):
     y = np.cumsum(np.random.default_rng(0).standard_normal(n))
     run = ftlm.Run.from_arrays(step=0.1, inputs={"u": u}, outputs={"y": y}, units={"y": "deg"}, name="seed")
     words = [
-        "D^2.2 y = a1 D^0.9 y + a0 y + b0 u", "D^alpha y = -3.5 D^(alpha-0.5) y + 2 D^nu u; D^1.5 z = c y - 1e-3 z",
+        "D^2.2 y = a1 D^0.9 y + a0 y + b0 u",
+        "D^alpha y = -3.5 D^(alpha-0.5) y + 2 D^nu u; D^1.5 z = c y - 1e-3 z",
         "D^(2*alpha1 - mu2 + 0.1) y = - k D^beta y + u",
-    ]  # fmt: skip
+    ]
     if target in ("csv", "csv_header"):
         run.to_csv(folder / "a.csv")
         own = (folder / "a.csv").read_bytes()
@@ -251,17 +274,17 @@ def _seeds(target, folder):
         return (b"0.5:1.5:0.05", b"1", b"0.1:0.2")
     structure = ftlm.equation("D^alpha y = a D^beta y + b u")
     ftlm.search_orders(
-        run, structure, ftlm.lattice(step=0.25), m=16, store=folder / "a.ftlm", early_stopping=False, threads=1
+        run, structure, ftlm.order_grid(step=0.25), m=16, store=folder / "a.ftlm", early_stopping=False, threads=1
     )
     whole = (folder / "a.ftlm").read_bytes()
     halves = unsealed(whole)
-    request = frames.DECODER.decode(halves[4 : 4 + struct.unpack_from("<I", halves)[0]])
-    half = frames.Begun(
+    request = frames.FRAME_DECODER.decode(halves[4 : 4 + struct.unpack_from("<I", halves)[0]])
+    half = frames.PartialRounds(
         0, 0, 1, (0, 1, 4, 256, float("inf")), ((0, 1.0, (1.0, 2.0), ((),)),), (0, 0, 1, 0, 0, 0, 0), ()
     )
     payloads = [msgspec.msgpack.encode(frame) for frame in (request, half)]
     half_done = b"".join(struct.pack("<I", len(p)) + p for p in payloads)
     law = ftlm.equation("D^alpha y = a D^beta y + b D^(alpha-beta) u")
-    ftlm.search_orders(run, law, ftlm.lattice(step=0.25), m=16, store=folder / "b.ftlm", keep=3, threads=1)
+    ftlm.search_orders(run, law, ftlm.order_grid(step=0.25), m=16, store=folder / "b.ftlm", keep=3, threads=1)
     of_law = (folder / "b.ftlm").read_bytes()
     return (halves, half_done, unsealed(of_law)) if target == "sealed" else (whole, of_law)

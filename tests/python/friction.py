@@ -24,9 +24,16 @@ def weights(order: float, count: int) -> np.ndarray:
 
 
 def naive_run(
-    force: np.ndarray, step: float, alpha: float, own: Sequence[tuple[float, float]], friction: float,
-    level: float = 0.0, rate: float = 0.0, more: float = 0.0, speed: float = 1.0,
-) -> tuple[np.ndarray, np.ndarray]:  # fmt: skip
+    force: np.ndarray,
+    step: float,
+    alpha: float,
+    own: Sequence[tuple[float, float]],
+    friction: float,
+    level: float = 0.0,
+    rate: float = 0.0,
+    more: float = 0.0,
+    speed: float = 1.0,
+) -> tuple[np.ndarray, np.ndarray]:
     """Position and velocity at the instants of `force`; `own` are (coefficient, order) with orders in [0, alpha).
 
     What friction has `more` near rest is that of the velocity an instant ago.
@@ -58,9 +65,15 @@ def naive_run(
 
 
 def between_events(
-    force: Callable[[float], float], times: np.ndarray, viscous: float, friction: float, rate: float = 0.0,
-    more: float = 0.0, speed: float = 1.0, spring: float = 0.0,
-) -> tuple[np.ndarray, np.ndarray]:  # fmt: skip
+    force: Callable[[float], float],
+    times: np.ndarray,
+    viscous: float,
+    friction: float,
+    rate: float = 0.0,
+    more: float = 0.0,
+    speed: float = 1.0,
+    spring: float = 0.0,
+) -> tuple[np.ndarray, np.ndarray]:
     """Mass of 1 with viscous, Coulomb and Stribeck friction, integrated between its events: stops, turns, breaks away.
 
     A spring of this stiffness holds it at 0.
@@ -99,8 +112,9 @@ def between_events(
 
         rest.terminal, rest.direction = True, -s
         inside = times[(times > now) & (times <= end)]
-        found = solve_ivp(motion, (now, end), state, events=rest, rtol=1e-10, atol=1e-12, dense_output=True,
-                          max_step=(end / 500))  # fmt: skip
+        found = solve_ivp(
+            motion, (now, end), state, events=rest, rtol=1e-10, atol=1e-12, dense_output=True, max_step=(end / 500)
+        )
         reached = inside[inside <= found.t[-1]]
         if reached.size:
             at = [np.searchsorted(times, t) for t in reached]
@@ -118,9 +132,15 @@ def regularised(
 ) -> np.ndarray:
     """Position of the same mass where sgn is tanh(v / width)."""
     found = solve_ivp(
-        lambda t, x: [x[1], force(t) - viscous * x[1] - friction * np.tanh(x[1] / width)], (0.0, float(times[-1])),
-        [0.0, rate], method="LSODA", t_eval=times, rtol=1e-9, atol=1e-11, max_step=float(times[-1]) / 2000,
-    )  # fmt: skip
+        lambda t, x: [x[1], force(t) - viscous * x[1] - friction * np.tanh(x[1] / width)],
+        (0.0, float(times[-1])),
+        [0.0, rate],
+        method="LSODA",
+        t_eval=times,
+        rtol=1e-9,
+        atol=1e-11,
+        max_step=float(times[-1]) / 2000,
+    )
     return np.asarray(found.y[0])
 
 
@@ -155,10 +175,17 @@ def exact_cart(
 
 
 def hub_and_link(
-    force: Callable[[float], float], times: np.ndarray, hub: tuple[float, float, float], link: tuple[float, float],
-    friction: float, more: float = 0.0, speed: float = 1.0, start: Sequence[float] = (0.0, 0.0, 0.0, 0.0),
-    low_pass: tuple[float, float] | None = None, held: Sequence[float] = (0.0, 0.0, 0.0, 0.0),
-) -> tuple[np.ndarray, np.ndarray]:  # fmt: skip
+    force: Callable[[float], float],
+    times: np.ndarray,
+    hub: tuple[float, float, float],
+    link: tuple[float, float],
+    friction: float,
+    more: float = 0.0,
+    speed: float = 1.0,
+    start: Sequence[float] = (0.0, 0.0, 0.0, 0.0),
+    low_pass: tuple[float, float] | None = None,
+    held: Sequence[float] = (0.0, 0.0, 0.0, 0.0),
+) -> tuple[np.ndarray, np.ndarray]:
     """A hub on dry friction that carries an elastic link, between its events: angles, and the hub's velocity.
 
     With a low pass of second order (corner [rad/s], damping ratio) two more rows are both angles behind it, each with
@@ -203,8 +230,17 @@ def hub_and_link(
             return abs(pull(t, x)) - most if t > begun + 1e-9 else -1.0
 
         event.terminal, event.direction = True, -1.0 if side else 1.0
-        found = solve_ivp(motion, (now, end), state, events=event, rtol=1e-11, atol=1e-13, method="DOP853",
-                          dense_output=True, max_step=end / 1000)  # fmt: skip
+        found = solve_ivp(
+            motion,
+            (now, end),
+            state,
+            events=event,
+            rtol=1e-11,
+            atol=1e-13,
+            method="DOP853",
+            dense_output=True,
+            max_step=end / 1000,
+        )
         inside = np.flatnonzero((times > now) & (times <= found.t[-1]))
         if inside.size:
             there = found.sol(times[inside])
@@ -220,11 +256,15 @@ def hub_and_link(
 
 
 def bodies(
-    force: Callable[[float], Sequence[float]], times: np.ndarray, springs: Sequence[Sequence[float]],
-    dampers: Sequence[Sequence[float]], friction: Sequence[tuple[float, float, float] | None],
-    start: Sequence[float] | None = None, width: float | None = None,
+    force: Callable[[float], Sequence[float]],
+    times: np.ndarray,
+    springs: Sequence[Sequence[float]],
+    dampers: Sequence[Sequence[float]],
+    friction: Sequence[tuple[float, float, float] | None],
+    start: Sequence[float] | None = None,
+    width: float | None = None,
     carried: Sequence[Sequence[float]] | None = None,
-) -> tuple[np.ndarray, np.ndarray]:  # fmt: skip
+) -> tuple[np.ndarray, np.ndarray]:
     """Bodies that pull at each other, some on dry friction, between their events: positions, velocities, (n, times).
 
     D^2 y_i = sum_j (springs_ij y_j + dampers_ij Dy_j + carried_ij D^2 y_j) + F_i - (f_i + fs_i exp(-(Dy_i/vs_i)^2))
@@ -267,8 +307,9 @@ def bodies(
                 pulled[i] -= rubs(i, x[2 * i + 1]) * np.tanh(x[2 * i + 1] / width)
             return np.stack([x[1::2], np.linalg.solve(mass, pulled)]).T.ravel()
 
-        found = solve_ivp(smooth, (0.0, end), state, method="LSODA", t_eval=times, rtol=1e-9, atol=1e-11,
-                          max_step=end / 2000)  # fmt: skip
+        found = solve_ivp(
+            smooth, (0.0, end), state, method="LSODA", t_eval=times, rtol=1e-9, atol=1e-11, max_step=end / 2000
+        )
         return found.y[::2], found.y[1::2]
 
     def on_from(t: float, x: np.ndarray, known: dict[int, float]) -> list[float]:
@@ -305,8 +346,17 @@ def bodies(
             event.terminal, event.direction = True, -1.0 if sides[i] else 1.0
             return event
 
-        found = solve_ivp(motion, (now, end), state, events=[event_of(i) for i in rough], rtol=1e-11, atol=1e-13,
-                          method="DOP853", dense_output=True, max_step=end / 500)  # fmt: skip
+        found = solve_ivp(
+            motion,
+            (now, end),
+            state,
+            events=[event_of(i) for i in rough],
+            rtol=1e-11,
+            atol=1e-13,
+            method="DOP853",
+            dense_output=True,
+            max_step=end / 500,
+        )
         inside = np.flatnonzero((times > now) & (times <= found.t[-1]))
         if inside.size:
             there = np.array([rested(column) for column in found.sol(times[inside]).T]).T

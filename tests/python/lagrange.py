@@ -21,7 +21,7 @@ PLANTS: dict[int, tuple[dict[str, float], dict[str, float]]] = {
         {"alpha3": 2.0, "alpha4": 2.0, "gamma3": 0.9, "beta4": 0.2, "mu4": 0.8},
         {"a3": 2271.117, "b3": -496.763, "d3": 28.351, "g3": 288.122, "r": (0.00301955 + 0.0064387) / 0.0064387},
     ),
-}  # fmt: skip
+}
 
 
 def truth(stage: int) -> dict[str, float]:
@@ -62,7 +62,9 @@ def current(shape: str, rows: int = ROWS) -> np.ndarray:
 def clean_run(stage: int, shape: str) -> ftlm.Run:
     """Point samples without noise, converged to 1e-7."""
     blank = ftlm.Run.from_arrays(
-        step=STEP, inputs={f"I{stage}": current(shape)},
-        outputs={f"theta{stage}{k}": np.zeros(ROWS) for k in (1, 2)}, name=shape,
-    )  # fmt: skip
+        step=STEP,
+        inputs={f"I{stage}": current(shape)},
+        outputs={f"theta{stage}{k}": np.zeros(ROWS) for k in (1, 2)},
+        name=shape,
+    )
     return model(stage).simulate(blank, tolerance=1e-7)

@@ -20,11 +20,12 @@ def laws(problem: FreeProblem) -> list[Any]:
 
     return [
         (
-            signals.index(e.output), affine(e.order, problem.orders),
+            signals.index(e.output),
+            affine(e.order, problem.orders),
             [
                 (signals.index(t.signal), affine(t.order, problem.orders), monomial(t.coefficient, t.factor))
                 for t in e.terms
             ],
         )
         for e in problem.structure.equations
-    ]  # fmt: skip
+    ]

@@ -49,9 +49,17 @@ def columns(
 
 
 def projected(
-    signals: Signals, step: float, output: str, point: Sequence[float], terms: Sequence[Term], *,
-    filtered: Sequence[str], offset: bool = False, known: np.ndarray | None = None, first: float | None = None,
-) -> tuple[np.ndarray, np.ndarray]:  # fmt: skip
+    signals: Signals,
+    step: float,
+    output: str,
+    point: Sequence[float],
+    terms: Sequence[Term],
+    *,
+    filtered: Sequence[str],
+    offset: bool = False,
+    known: np.ndarray | None = None,
+    first: float | None = None,
+) -> tuple[np.ndarray, np.ndarray]:
     """Coefficients of the terms, unless known (all, or the first), and what is left over."""
     table = columns(signals, step, *point, terms, filtered, offset)
     y, count = signals[output], len(terms)
@@ -75,9 +83,16 @@ def fit_percent(y: np.ndarray, left: np.ndarray) -> float:
 
 
 def fitted(
-    signals: Signals, step: float, output: str, terms: Sequence[Term], starts: Sequence[tuple[float, float]],
-    *, filtered: Sequence[str], offset: bool = False, first: float | None = None,
-) -> tuple[np.ndarray, np.ndarray]:  # fmt: skip
+    signals: Signals,
+    step: float,
+    output: str,
+    terms: Sequence[Term],
+    starts: Sequence[tuple[float, float]],
+    *,
+    filtered: Sequence[str],
+    offset: bool = False,
+    first: float | None = None,
+) -> tuple[np.ndarray, np.ndarray]:
     """Stiffness and damping of the best of several descents, and the coefficients of the terms there."""
     best, size = None, np.linalg.norm(signals[output])
     asked: dict[str, Any] = {"filtered": filtered, "offset": offset, "first": first}

@@ -26,10 +26,13 @@ class Planar:
         link1, hub2 = np.array([1.0, 1.0, 0.0, 0.0]), np.array([k, k, 1.0, 0.0])
         link2 = hub2 + np.array([0.0, 0.0, 0.0, 1.0])
         self.inertia = (
-            j11 * np.outer([1, 0, 0, 0], [1, 0, 0, 0]) + own * np.outer(link1, link1)
-            + arm.turned * j21 * np.outer(hub2, hub2) + (1.0 - arm.turned) * j21 * np.outer([0, 0, 1, 0], [0, 0, 1, 0])
-            + j22 * np.outer(link2, link2) + k * lever * (np.outer(link1, link2) + np.outer(link2, link1))
-        )  # fmt: skip
+            j11 * np.outer([1, 0, 0, 0], [1, 0, 0, 0])
+            + own * np.outer(link1, link1)
+            + arm.turned * j21 * np.outer(hub2, hub2)
+            + (1.0 - arm.turned) * j21 * np.outer([0, 0, 1, 0], [0, 0, 1, 0])
+            + j22 * np.outer(link2, link2)
+            + k * lever * (np.outer(link1, link2) + np.outer(link2, link1))
+        )
         self.stiffness = np.array([0.0, first.a * j11, 0.0, second.a * j21])
         self.damping = np.array([-first.b * j11, first.d * j11, -second.b * j21, second.d * j21])
         self.torque = np.array([first.g * j11, second.g * j21])

@@ -13,14 +13,30 @@ from ftlm.reproduction.simulated_arm import demo_plant
 #: Cramer-Rao standard deviations at 40 dB, as printed to one to three digits.
 CRAMER_RAO_40_DB = {
     "A": {
-        "alpha1": 0.0008, "alpha2": 0.0008, "gamma1": 0.0002, "beta2": 0.0002, "mu2": 0.0004, "a1": 2.01, "b1": 0.159,
-        "d1": 0.092, "g1": 0.351, "r1": 0.0011,
+        "alpha1": 0.0008,
+        "alpha2": 0.0008,
+        "gamma1": 0.0002,
+        "beta2": 0.0002,
+        "mu2": 0.0004,
+        "a1": 2.01,
+        "b1": 0.159,
+        "d1": 0.092,
+        "g1": 0.351,
+        "r1": 0.0011,
     },
     "A2": {
-        "alpha3": 0.0016, "alpha4": 0.0012, "gamma3": 0.0006, "beta4": 0.0007, "mu4": 0.0009, "a3": 42.4, "b3": 7.94,
-        "d3": 0.98, "g3": 4.61, "r2": 0.0072,
+        "alpha3": 0.0016,
+        "alpha4": 0.0012,
+        "gamma3": 0.0006,
+        "beta4": 0.0007,
+        "mu4": 0.0009,
+        "a3": 42.4,
+        "b3": 7.94,
+        "d3": 0.98,
+        "g3": 4.61,
+        "r2": 0.0072,
     },
-}  # fmt: skip
+}
 THREE_TERMS = {"alpha": 2.2, "nu": 0.9, "a1": -0.625, "a0": -1.25, "b0": 1.25}
 
 
@@ -53,9 +69,8 @@ def with_noise(clean: ftlm.Run, snr: float, seed: list[int]) -> ftlm.Run:
     """White noise on every output, ``snr`` in decibel."""
     rng = np.random.default_rng(seed)
     outputs = {
-        n: clean[n] + np.std(clean[n]) * 10 ** (-snr / 20) * rng.standard_normal(clean.length)
-        for n in clean.outputs
-    }  # fmt: skip
+        n: clean[n] + np.std(clean[n]) * 10 ** (-snr / 20) * rng.standard_normal(clean.length) for n in clean.outputs
+    }
     inputs = {n: clean[n] for n in clean.inputs}
     return ftlm.Run.from_arrays(step=clean.step, inputs=inputs, outputs=outputs, name=f"{clean.name} {seed}")
 

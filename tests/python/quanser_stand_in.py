@@ -60,7 +60,7 @@ class Board:
         self.hooks = {}
         self.time = 0.0
         self.in_use = False
-        self.page = None if page is None else watchdog.Page(page, create=True)
+        self.page = None if page is None else watchdog.RegisterPage(page, create=True)
         self.random = np.random.default_rng(seed)
         self.reset()
 

@@ -26,13 +26,20 @@ FIRST = 600
 def commanded(unit: str) -> ftlm.Run:
     """The run of a unit under its commanded currents."""
     return ftlm.load(
-        DATA / f"two_link_{unit}" / f"{unit}.csv", time="t_s", inputs={"I1": "Im1_cmd_A", "I2": "Im2_cmd_A"},
+        DATA / f"two_link_{unit}" / f"{unit}.csv",
+        time="t_s",
+        inputs={"I1": "Im1_cmd_A", "I2": "Im2_cmd_A"},
         outputs={
-            "theta11": "th11_deg", "theta12": "th12_deg", "theta21": "th21_deg", "theta22": "th22_deg",
-            "I1_measured": "Im1_meas_A", "I2_measured": "Im2_meas_A",
+            "theta11": "th11_deg",
+            "theta12": "th12_deg",
+            "theta21": "th21_deg",
+            "theta22": "th22_deg",
+            "I1_measured": "Im1_meas_A",
+            "I2_measured": "Im2_meas_A",
         },
-        units=dict.fromkeys(ANGLES, "deg"), name=unit,
-    )  # fmt: skip
+        units=dict.fromkeys(ANGLES, "deg"),
+        name=unit,
+    )
 
 
 def beside(real: ftlm.Run, name: str) -> ftlm.Run:
@@ -42,9 +49,7 @@ def beside(real: ftlm.Run, name: str) -> ftlm.Run:
         columns = np.column_stack([real.time, real["I1"], real["I2"]])
         np.savetxt(path, columns, delimiter=",", header="t_s,I1,I2", comments="")
         arm = replace(rig.ArmParameters.of(name), travel=(9.0, 9.0))
-        return rig.record(
-            input="csv", file=path, duration=real.duration, parameters=arm, sensor_filter="stock", seed=1
-        )  # fmt: skip
+        return rig.record(input="csv", file=path, duration=real.duration, parameters=arm, sensor_filter="stock", seed=1)
 
 
 def filtered(values: np.ndarray, numerator: list[float], denominator: list[float], step: float) -> np.ndarray:

@@ -50,8 +50,9 @@ def german():
     """A German spreadsheet's csv: a title, semicolons, decimal commas, units in names, the encoding of Windows."""
     text = "Messprotokoll Prüfstand 3;;\n;;\nZeit [ms];Strom (A);Weg [mm]\n"
     text += table(separator=";", time=1e3, gain=1e3).replace(".", ",")
-    return Stranger("messung.csv", text.replace("\n", "\r\n").encode("cp1252"),
-                    ("-u", "u=Strom", "-y", "y=Weg", "--unit", "y=mm"))  # fmt: skip
+    return Stranger(
+        "messung.csv", text.replace("\n", "\r\n").encode("cp1252"), ("-u", "u=Strom", "-y", "y=Weg", "--unit", "y=mm")
+    )
 
 
 def labview():
@@ -202,8 +203,11 @@ def columns():
     text = "   t      force   tip\n   min    N       mm\n"
     t, u, y = record()
     rows = (f"  {a / 60:.12f}   {b:8.4f}   {c:12.6f}\n" for a, b, c in zip(t, u, 1e3 * y, strict=True))
-    return Stranger("bench.dat", (text + "".join(rows).replace(".", ",")).encode(),
-                    ("-u", "u=force", "-y", "y=tip", "--unit", "y=mm"))  # fmt: skip
+    return Stranger(
+        "bench.dat",
+        (text + "".join(rows).replace(".", ",")).encode(),
+        ("-u", "u=force", "-y", "y=tip", "--unit", "y=mm"),
+    )
 
 
 #: What a heated rod is made of: conductance of its surface and strength of its heater, over what sqrt(k rho c) says.
@@ -230,10 +234,19 @@ def rod(changes, seed, rows=450):
 
 #: How each is made; those that need a folder are given one.
 MAKERS = {
-    "German csv": german, "LabVIEW text": labview, "oscilloscope": oscilloscope, "dates": logger,
-    "MATLAB 7.3": matlab73, "xlsx": excel, "ods": opendocument, "npz": npz, "feather": feather, "gz": gzipped,
-    "utf-16": unicode_text, "line of units": columns,
-}  # fmt: skip
+    "German csv": german,
+    "LabVIEW text": labview,
+    "oscilloscope": oscilloscope,
+    "dates": logger,
+    "MATLAB 7.3": matlab73,
+    "xlsx": excel,
+    "ods": opendocument,
+    "npz": npz,
+    "feather": feather,
+    "gz": gzipped,
+    "utf-16": unicode_text,
+    "line of units": columns,
+}
 
 
 def made(name, folder):

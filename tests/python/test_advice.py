@@ -213,9 +213,14 @@ def test_advice_prints_counts_and_is_json(small_run):
 def test_advice_changes_nothing_and_takes_hostile_runs():
     rng = np.random.default_rng(4)
     for y in (
-        np.zeros(3), np.array([0.0, 1e150, -1e150]), np.full(300, 1e-310), 1e149 * rng.standard_normal(300),
-        np.where(np.arange(600) == 300, 1e100, 0.0), np.arange(400.0), 5e-324 * (np.arange(300) % 2),
-    ):  # fmt: skip
+        np.zeros(3),
+        np.array([0.0, 1e150, -1e150]),
+        np.full(300, 1e-310),
+        1e149 * rng.standard_normal(300),
+        np.where(np.arange(600) == 300, 1e100, 0.0),
+        np.arange(400.0),
+        5e-324 * (np.arange(300) % 2),
+    ):
         run = ftlm.Run.from_arrays(step=0.1, inputs={"u": y[::-1]}, outputs={"y": y})
         before = run["y"].copy()
         str(run.advice())

@@ -11,7 +11,7 @@ from typer.testing import CliRunner
 
 import ftlm
 from ftlm.cli.main import app
-from ftlm.estimation.consistency import differences, together
+from ftlm.estimation.consistency import differences, joint_distance
 
 SECOND = ftlm.equation("D^2 y = d D y + a y + b u")
 
@@ -35,12 +35,12 @@ def changing(stiffness, seed=0, rows=300, step=0.02):
 
 @pytest.fixture(scope="module")
 def same():
-    return ftlm.agreement(changing([40.0, 40.0]), SECOND, threads=1)
+    return ftlm.consistency(changing([40.0, 40.0]), SECOND, threads=1)
 
 
 @pytest.fixture(scope="module")
 def changed():
-    return ftlm.agreement(changing([40.0, 48.0]), SECOND, threads=1)
+    return ftlm.consistency(changing([40.0, 48.0]), SECOND, threads=1)
 
 
 def test_a_machine_that_stays_is_one_model(same):
@@ -71,10 +71,10 @@ def test_a_machine_that_changes_is_named_with_number_parts_and_distance(changed)
 def test_what_parts_are_is_what_is_identified_of_them(changed):
     """By hand: the second half, identified by itself."""
     run = changing([40.0, 48.0])
-    alone = ftlm.identify(run.slice(6.0, None), SECOND, threads=1)
+    alone = ftlm.identify(run.window(6.0, None), SECOND, threads=1)
     assert changed.results[1].coefficients == alone.coefficients
     assert changed.results[1].intervals == alone.intervals
-    assert changed.crossed[1][0] == alone.model.compare(run.slice(0.0, 6.0)).fit_percent
+    assert changed.crossed[1][0] == alone.model.compare(run.window(0.0, 6.0)).fit_percent
 
 
 def test_a_part_begins_as_its_own_fit_found():
@@ -88,18 +88,18 @@ def test_a_part_begins_as_its_own_fit_found():
     y = y + 0.02 * np.random.default_rng(0).standard_normal(y.size)
     y[first] = 0.0
     run = ftlm.Run.from_arrays(step=step, inputs={"u": u[first:]}, outputs={"y": y[first:]})
-    told = ftlm.agreement(run, ftlm.equation("D^alpha y = a y + b u"))
+    told = ftlm.consistency(run, ftlm.equation("D^alpha y = a y + b u"))
     assert told.results[0].model.structure.initial == "history"
-    assert min(fit["y"] for row in told.crossed for fit in row) > 90
+    assert min(fit["y"] for row in told.cross_validation for fit in row) > 90
 
 
 def test_several_runs_are_parts_by_themselves():
     runs = [replace_name(changing([v], seed=k), f"day {k}") for k, v in enumerate([40.0, 40.0, 50.0])]
-    found = ftlm.agreement(runs, SECOND, threads=1)
+    found = ftlm.consistency(runs, SECOND, threads=1)
     assert found.names == ("day 0", "day 1", "day 2")
-    assert {d.parts for d in found.differences if d.apart and d.name == "a"} == {(0, 2), (1, 2)}
+    assert {d.parts for d in found.differences if d.disjoint and d.name == "a"} == {(0, 2), (1, 2)}
     assert found.degrees == 6
-    assert found.same is False
+    assert found.consistent is False
 
 
 def replace_name(run, name):
@@ -110,14 +110,17 @@ def test_all_numbers_together_are_told_by_their_covariances():
     """Two parts by the formula for two: the difference in the sum of their covariances; three by weights."""
     parts = [changing([40.0], seed=seed) for seed in range(3)]
     results = [ftlm.identify(run, SECOND, threads=1) for run in parts]
-    points = [r.joint.values for r in results]
-    spreads = [r.joint.covariance for r in results]
+    points = [r.fit.values for r in results]
+    spreads = [r.fit.covariance for r in results]
     apart = points[0] - points[1]
-    assert together(results[:2]) == (pytest.approx(float(apart @ np.linalg.solve(spreads[0] + spreads[1], apart))), 3)
+    assert joint_distance(results[:2]) == (
+        pytest.approx(float(apart @ np.linalg.solve(spreads[0] + spreads[1], apart))),
+        3,
+    )
     weights = [np.linalg.inv(s) for s in spreads]
     centre = np.linalg.solve(sum(weights), sum(w @ p for w, p in zip(weights, points, strict=True)))
     far = sum((p - centre) @ w @ (p - centre) for w, p in zip(weights, points, strict=True))
-    assert together(results) == (pytest.approx(float(far), rel=1e-6), 6)
+    assert joint_distance(results) == (pytest.approx(float(far), rel=1e-6), 6)
 
 
 def test_a_number_that_a_part_does_not_tell_agrees_with_any(same):
@@ -126,15 +129,15 @@ def test_a_number_that_a_part_does_not_tell_agrees_with_any(same):
     place = second.joint.names[0]
     half = [first, replace(second, joint=blind)]
     told = {d.name: d for d in differences(half)}
-    assert math.isnan(told[place].errors)
-    assert not told[place].apart
-    assert together(half)[1] == 2
+    assert math.isnan(told[place].difference_in_errors)
+    assert not told[place].disjoint
+    assert joint_distance(half)[1] == 2
     found = replace(same, results=tuple(half), differences=tuple(differences(half)))
     assert found.untold == (place,)
     assert f"{place}: not told by some part" in str(found)
     nothing = replace(second.joint, covariance=np.diag([np.inf] * 3))
     none = [first, replace(second, joint=nothing)]
-    assert together(none) == (None, 0)
+    assert joint_distance(none) == (None, 0)
     found = replace(same, results=tuple(none), differences=tuple(differences(none)), distance=None, degrees=0)
     assert found.same is None
     assert found.reason == "Not told: no number is known by two parts"
@@ -155,14 +158,14 @@ def test_intervals_by_profile_are_compared_by_the_ends_that_face_each_other(same
     # Ends that do not face each other may be anywhere.
     wide = [bent(order[0], 1e6, 0.3 * gap), bent(order[1], 0.3 * gap, 1e6)]
     (found,) = [d for d in differences(wide) if d.name == name]
-    assert found.apart
-    assert found.errors == pytest.approx(1.959964 / (0.3 * math.sqrt(2)))
+    assert found.disjoint
+    assert found.difference_in_errors == pytest.approx(1.959964 / (0.3 * math.sqrt(2)))
     (found,) = [d for d in differences([wide[0], bent(order[1], 0.8 * gap, 1e6)]) if d.name == name]
-    assert not found.apart
+    assert not found.disjoint
     (found,) = [d for d in differences([wide[0], bent(order[1], math.inf, 1.0)]) if d.name == name]
-    assert math.isnan(found.errors)
+    assert math.isnan(found.difference_in_errors)
     # A covariance says little of numbers like these.
-    assert together(wide)[1] == 2
+    assert joint_distance(wide)[1] == 2
 
 
 def values(result):
@@ -192,26 +195,28 @@ def test_words_where_nothing_can_be_compared():
     run = changing([40.0])
     for parts in (1, 0, -2, 1.5, True, "2"):
         with pytest.raises(ftlm.ModelError, match="use a whole number, at least 2"):
-            ftlm.agreement(run, SECOND, parts=parts)
+            ftlm.consistency(run, SECOND, parts=parts)
     with pytest.raises(ftlm.ModelError, match="2 runs are parts by themselves; leave parts= out"):
-        ftlm.agreement([run, changing([40.0], seed=1)], SECOND, parts=2)
+        ftlm.consistency([run, changing([40.0], seed=1)], SECOND, parts=2)
     for parts in (200, 10**9):
         with pytest.raises(ftlm.DataError, match=f"motor has 300 rows, too few to be cut into {parts} parts"):
-            ftlm.agreement(run, SECOND, parts=parts)
+            ftlm.consistency(run, SECOND, parts=parts)
     with pytest.raises(ftlm.ModelError, match="store= is of one identification"):
-        ftlm.agreement(run, SECOND, store="a.ftlm")
+        ftlm.consistency(run, SECOND, store="a.ftlm")
     with pytest.raises(ftlm.ModelError, match="method 'least-squares' gives no standard errors of D"):
-        ftlm.agreement(run, SECOND, method="least-squares", threads=1)
+        ftlm.consistency(run, SECOND, method="least-squares", threads=1)
     with pytest.raises(ftlm.DataError, match=r"motor 0 to 3 s: .*'z'"):
-        ftlm.agreement(run, ftlm.equation("D^2 z = a z + b u"))
+        ftlm.consistency(run, ftlm.equation("D^2 z = a z + b u"))
     with pytest.raises(TypeError, match="partz"):
-        ftlm.agreement(run, SECOND, partz=2)
+        ftlm.consistency(run, SECOND, partz=2)
     still = ftlm.Run.from_arrays(
-        step=0.02, inputs={"u": run["u"] * (np.arange(300) < 150)}, outputs={"y": run["y"] * (np.arange(300) < 150)},
+        step=0.02,
+        inputs={"u": run["u"] * (np.arange(300) < 150)},
+        outputs={"y": run["y"] * (np.arange(300) < 150)},
         name="half",
-    )  # fmt: skip
+    )
     with pytest.raises(ftlm.DataError, match=r"half 3 to 6 s: .*constant"):
-        ftlm.agreement(still, SECOND, threads=1)
+        ftlm.consistency(still, SECOND, threads=1)
 
 
 def test_what_cannot_be_meant_is_refused_in_words(same):
@@ -225,7 +230,7 @@ def test_what_cannot_be_meant_is_refused_in_words(same):
         (run, {"intervals": {}}, r"intervals = \{\} is not known"),
     ):
         with pytest.raises(ftlm.FtlmError, match=words):
-            ftlm.agreement(runs, structure, **options)
+            ftlm.consistency(runs, structure, **options)
 
 
 def test_the_command(tmp_path):

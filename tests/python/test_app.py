@@ -21,9 +21,9 @@ import plants
 from ftlm.app import server as serve
 from ftlm.app import session as desks
 from ftlm.app import views as view
-from ftlm.app.forms import NAMED, Reading, Recipe, asked_of, checked_structures, cut_at
-from ftlm.app.server import PATIENCE, Door, patient
-from ftlm.app.session import Desk, safe_name
+from ftlm.app.forms import NAMED_STRUCTURES, FitRequest, RunSource, parse_fields, parse_structures, split_time
+from ftlm.app.server import CLIENT_TIMEOUT_S, WebApplication, make_connection_class
+from ftlm.app.session import Session, safe_name
 from ftlm.app.subprocess_task import Task, TaskError
 from ftlm.cli.main import app
 from ftlm.errors import DataError, FtlmError, ModelError
@@ -37,7 +37,7 @@ RAW = "application/octet-stream"
 def patience():
     """A busy machine may take long to open a file; the answers here are those of one that is open."""
     with pytest.MonkeyPatch.context() as patch:
-        patch.setattr(desks, "PATIENCE", 250.0)
+        patch.setattr(desks, "OPEN_REPLY_TIMEOUT_S", 250.0)
         yield
 
 
@@ -52,8 +52,8 @@ class Page:
 
     def __init__(self, folder, loop):
         folder.mkdir()
-        self.desk = Desk(folder)
-        self.door = Door(self.desk, TOKEN, (HOST, "localhost:8347"), "once")
+        self.desk = Session(folder)
+        self.door = WebApplication(self.desk, TOKEN, (HOST, "localhost:8347"), "once")
         self.loop = loop
         self.pieces = 0
         self.all = []
@@ -89,8 +89,9 @@ class Page:
         return self.ask(method, f"/{TOKEN}/{path}", body, **more)
 
     def upload(self, name, content, **more):
-        return self.own("POST", "files", None, headers={"content-type": RAW}, query=f"name={name}",
-                        chunks=[content], **more)  # fmt: skip
+        return self.own(
+            "POST", "files", None, headers={"content-type": RAW}, query=f"name={name}", chunks=[content], **more
+        )
 
 
 @pytest.fixture
@@ -185,7 +186,7 @@ def test_the_first_address_is_good_once_and_leads_to_the_lasting_one(page):
     assert status == 404
     assert "terminal" in told(text)
     assert page.ask("GET", f"/{TOKEN}")[1]["location"] == f"/{TOKEN}/"
-    without = Door(page.desk, TOKEN, (HOST,))
+    without = WebApplication(page.desk, TOKEN, (HOST,))
     page.door = without
     assert page.ask("GET", "/open/")[0] == 404
 
@@ -215,9 +216,25 @@ def test_the_page_names_nothing_that_is_not_its_own():
     assert [re.findall(r"\son\w+=|<script(?! src)|<style|\sstyle=", text) for text in assets[2:]] == [[]] * 4
 
 
-TRAVERSALS = ["..", "../..", "../../etc/passwd", "/etc/passwd", "....//", "..\\..\\x", "files/../../etc/passwd",
-              "models/../../../etc/passwd/report", "models/..%2f..%2fetc%2fpasswd/report", "files/.", "app.js/../state",
-              "models//report", "static/../app.js", "\0", "file:///etc/passwd", "work.py", "__init__.py"]  # fmt: skip
+TRAVERSALS = [
+    "..",
+    "../..",
+    "../../etc/passwd",
+    "/etc/passwd",
+    "....//",
+    "..\\..\\x",
+    "files/../../etc/passwd",
+    "models/../../../etc/passwd/report",
+    "models/..%2f..%2fetc%2fpasswd/report",
+    "files/.",
+    "app.js/../state",
+    "models//report",
+    "static/../app.js",
+    "\0",
+    "file:///etc/passwd",
+    "work.py",
+    "__init__.py",
+]
 
 
 @pytest.mark.parametrize("path", TRAVERSALS)
@@ -231,9 +248,23 @@ def test_no_file_of_the_machine_is_read_through_a_path(used, path):
 
 def test_ways_that_a_path_does_not_have_are_refused(used):
     (key,), (model,) = used.desk.files, used.desk.models
-    paths = ["", "app.js", "app.css", "state", "files", "models", "check", "comparison", f"files/{key}",
-             f"models/{model}", f"models/{model}/stop", f"models/{model}/resume", f"models/{model}/report", "files/0",
-             "models/0"]  # fmt: skip
+    paths = [
+        "",
+        "app.js",
+        "app.css",
+        "state",
+        "files",
+        "models",
+        "check",
+        "comparison",
+        f"files/{key}",
+        f"models/{model}",
+        f"models/{model}/stop",
+        f"models/{model}/resume",
+        f"models/{model}/report",
+        "files/0",
+        "models/0",
+    ]
     for path in paths:
         for method in ("PUT", "PATCH", "OPTIONS", "TRACE", "CONNECT", "PROPFIND", "X" * 50):
             status, _, _ = used.own(method, path)
@@ -264,16 +295,21 @@ def test_a_length_that_is_none_is_no_fault_and_what_comes_is_counted(page, conte
     headers = {"content-type": RAW, "content-length": length}
     status, _, text = page.own("POST", "files", None, headers=headers, query="name=a.csv", chunks=[content])
     assert (status, "lag" in text or "a.csv" in text) == (200, True)
-    monkeypatch.setattr(desks, "MOST_BYTES", 10)
+    monkeypatch.setattr(desks, "MAX_FILE_BYTES", 10)
     assert page.own("POST", "files", None, headers=headers, query="name=b.csv", chunks=[content])[0] == 413
 
 
 def test_what_is_longer_than_it_said_is_refused_while_it_comes(page, monkeypatch):
-    monkeypatch.setattr(desks, "MOST_BYTES", 10_000)
+    monkeypatch.setattr(desks, "MAX_FILE_BYTES", 10_000)
     for headers in ({}, {"content-length": "3"}, {"content-length": "x"}, {"content-length": "-5"}):
         page.pieces = 0
-        status, _, _ = page.own("POST", "files", headers={"content-type": RAW, **headers}, query="name=long.csv",
-                                chunks=(b"x" * 1000 for _ in range(1000)))  # fmt: skip
+        status, _, _ = page.own(
+            "POST",
+            "files",
+            headers={"content-type": RAW, **headers},
+            query="name=long.csv",
+            chunks=(b"x" * 1000 for _ in range(1000)),
+        )
         assert status == 413
         assert page.pieces == 11
         assert list(page.desk.folder.iterdir()) == []
@@ -281,10 +317,11 @@ def test_what_is_longer_than_it_said_is_refused_while_it_comes(page, monkeypatch
 
 
 def test_all_files_together_have_a_limit(page, monkeypatch):
-    monkeypatch.setattr(desks, "MOST_BYTES_IN_ALL", 1500)
+    monkeypatch.setattr(desks, "MAX_TOTAL_BYTES", 1500)
     page.loop(put_beside(page.desk, "a.csv", 1000))
-    status, _, text = page.own("POST", "files", headers={"content-type": RAW}, query="name=b.csv",
-                               chunks=(b"x" * 100 for _ in range(10)))  # fmt: skip
+    status, _, text = page.own(
+        "POST", "files", headers={"content-type": RAW}, query="name=b.csv", chunks=(b"x" * 100 for _ in range(10))
+    )
     assert status == 413
     assert "remove one" in told(text)
     assert [p.name for p in page.desk.folder.iterdir()] == ["a.csv"]
@@ -297,7 +334,7 @@ async def put_beside(desk, name, size):
 
 
 def test_more_files_than_there_may_be_are_refused(page):
-    for k in range(desks.MOST_FILES):
+    for k in range(desks.MAX_FILES):
         page.loop(put_beside(page.desk, f"{k}.csv", 1))
     status, _, text = page.upload("one.csv", b"x")
     assert status == 413
@@ -321,8 +358,9 @@ def test_a_file_that_is_being_read_is_not_yet_fitted_and_says_so(page):
 
 
 def test_an_upload_that_is_cut_off_leaves_nothing(page):
-    status, _, text = page.own("POST", "files", headers={"content-type": RAW}, query="name=cut.csv",
-                               chunks=[b"t,u,y\n"], cut=True)  # fmt: skip
+    status, _, text = page.own(
+        "POST", "files", headers={"content-type": RAW}, query="name=cut.csv", chunks=[b"t,u,y\n"], cut=True
+    )
     assert status == 400
     assert "cut off" in told(text)
     assert page.desk.files == {}
@@ -339,8 +377,21 @@ def test_forms_are_no_files(page, kind):
     assert page.pieces == 0
 
 
-BODIES = [b"", b"{", b"[]", b"null", b'"x"', b"[" * 60_000, b"\xff\xfe", b"x" * 70_000, b'{"share": 1e999}',
-          b'{"share": ' + b"9" * 4000 + b"}", b'{"structure": {}}', b'{"structure": [[]]}', b'{"way": []}']  # fmt: skip
+BODIES = [
+    b"",
+    b"{",
+    b"[]",
+    b"null",
+    b'"x"',
+    b"[" * 60_000,
+    b"\xff\xfe",
+    b"x" * 70_000,
+    b'{"share": 1e999}',
+    b'{"share": ' + b"9" * 4000 + b"}",
+    b'{"structure": {}}',
+    b'{"structure": [[]]}',
+    b'{"way": []}',
+]
 
 
 @pytest.mark.parametrize("body", BODIES, ids=range(len(BODIES)))
@@ -367,8 +418,22 @@ def test_a_fault_is_told_without_a_traceback(page, monkeypatch):
     assert told(text) == "a fault in ftlm itself (ZeroDivisionError)"
 
 
-NAMES = ["../../etc/passwd", "/etc/passwd", "..\\..\\boot.ini", "", ".", "..", "...", "/", "a\0b", "a\nb", "x" * 5000,
-         "ä" * 300, "\ud800.csv", "x." + "y" * 5000]  # fmt: skip
+NAMES = [
+    "../../etc/passwd",
+    "/etc/passwd",
+    "..\\..\\boot.ini",
+    "",
+    ".",
+    "..",
+    "...",
+    "/",
+    "a\0b",
+    "a\nb",
+    "x" * 5000,
+    "ä" * 300,
+    "\ud800.csv",
+    "x." + "y" * 5000,
+]
 
 
 @given(name=st.text() | st.sampled_from(NAMES))
@@ -467,14 +532,28 @@ def test_a_model_is_shown_verdict_first(used):
 
 def test_models_side_by_side_are_those_to_be_trusted_first(used):
     (first,) = used.desk.models.values()
-    worse = desks.Model("other", 2, first.recipe, state="made", told={
-        **first.told, "verdict": {**first.told["verdict"], "level": "do not use"},
-    })  # fmt: skip
-    best = desks.Model("best", 3, first.recipe, state="made", told={
-        **first.told, "verdict": {**first.told["verdict"], "level": "trust"},
-        "fits": [{**first.told["fits"][0], "validation": 99.9}],
-    })  # fmt: skip
-    desk = Desk(used.desk.folder)
+    worse = desks.Model(
+        "other",
+        2,
+        first.recipe,
+        state="made",
+        told={
+            **first.told,
+            "verdict": {**first.told["verdict"], "level": "do not use"},
+        },
+    )
+    best = desks.Model(
+        "best",
+        3,
+        first.recipe,
+        state="made",
+        told={
+            **first.told,
+            "verdict": {**first.told["verdict"], "level": "trust"},
+            "fits": [{**first.told["fits"][0], "validation": 99.9}],
+        },
+    )
+    desk = Session(used.desk.folder)
     desk.models = {"o": worse, "b": best}
     shown = view.comparison(desk)
     assert shown.index("#model-best") < shown.index("#model-other")
@@ -523,15 +602,34 @@ def test_what_is_asked_wrongly_is_said_in_ftlm_s_words(used, wanted, words):
 
 
 def test_names_with_scripts_in_them_are_text(used, loop):
-    file = desks.File("k", f"{HOSTILE}.csv", 1, told={
-        **next(iter(used.desk.files.values())).told, "kind": HOSTILE, "problem": HOSTILE, "assumed": [HOSTILE],
-        "notes": [HOSTILE], "advice": [HOSTILE],
-        "columns": [{"name": HOSTILE, "role": "input", "signal": HOSTILE, "unit": HOSTILE, "first": None, "low": None,
-                     "high": None, "words": HOSTILE}],
-        "options": {"inputs": {HOSTILE: HOSTILE}, "units": {HOSTILE: HOSTILE}, "outputs": {HOSTILE: HOSTILE}},
-        "offers": [{"name": HOSTILE, "why": HOSTILE, "structure": HOSTILE, "output": HOSTILE}],
-    })  # fmt: skip
-    recipe = Recipe(Reading(f"{HOSTILE}.csv"), structure=(HOSTILE,))
+    file = desks.File(
+        "k",
+        f"{HOSTILE}.csv",
+        1,
+        preview={
+            **next(iter(used.desk.files.values())).told,
+            "kind": HOSTILE,
+            "problem": HOSTILE,
+            "assumed": [HOSTILE],
+            "notes": [HOSTILE],
+            "advice": [HOSTILE],
+            "columns": [
+                {
+                    "name": HOSTILE,
+                    "role": "input",
+                    "signal": HOSTILE,
+                    "unit": HOSTILE,
+                    "first": None,
+                    "low": None,
+                    "high": None,
+                    "words": HOSTILE,
+                }
+            ],
+            "options": {"inputs": {HOSTILE: HOSTILE}, "units": {HOSTILE: HOSTILE}, "outputs": {HOSTILE: HOSTILE}},
+            "offers": [{"name": HOSTILE, "why": HOSTILE, "structure": HOSTILE, "output": HOSTILE}],
+        },
+    )
+    recipe = FitRequest(RunSource(f"{HOSTILE}.csv"), structure=(HOSTILE,))
     failed = desks.Model("m", 1, recipe, state="failed", error=HOSTILE)
     broken = desks.File("b", f"{HOSTILE}.csv", 1, error=HOSTILE, version=1)
     for shown in (view.file(file), view.file(broken), view.model(failed)):
@@ -543,11 +641,11 @@ def test_names_with_scripts_in_them_are_text(used, loop):
 
 @given(
     name=st.sampled_from([HOSTILE, "a\"b'c", "x\\", "ä b", "a\u2028b", '"""', "$(id)", "\ud800"]) | st.text(min_size=1),
-    text=st.sampled_from(["D y = a y + b u", '"); import os #', "x\n'''", *NAMED]) | st.text(min_size=1),
+    text=st.sampled_from(["D y = a y + b u", '"); import os #', "x\n'''", *NAMED_STRUCTURES]) | st.text(min_size=1),
 )
 def test_a_script_is_python_whatever_names_are_in_it(name, text):
     options = {"time": name, "inputs": {name: text}, "units": {name: "V"}, "slice": [0.5, None], "step": 0.1}
-    recipe = Recipe(Reading(name, options), Reading(name), structure=(text,), method="least-squares")
+    recipe = FitRequest(RunSource(name, options), RunSource(name), structure=(text,), method="least-squares")
     script = recipe._script(None)
     tree = ast.parse(script.encode())
     calls = [ast.unparse(n.func) for n in ast.walk(tree) if isinstance(n, ast.Call)]
@@ -566,11 +664,15 @@ def test_fields_become_arguments():
         {"name": "z", "role": "", "signal": "", "unit": ""},
     ]
     said = {"columns": columns, "step": "", "from": "1.5", "to": "", "header": "1", "decimal": "comma", "missing": ""}
-    assert asked_of(said) == {
-        "slice": [1.5, None], "layout": {"decimal": "comma", "header": 1}, "time": "t", "inputs": {"u": "u [V]"},
-        "outputs": {"y": "y"}, "units": {"u": "V"},
-    }  # fmt: skip
-    assert asked_of({}) == {}
+    assert parse_fields(said) == {
+        "slice": [1.5, None],
+        "layout": {"decimal": "comma", "header": 1},
+        "time": "t",
+        "inputs": {"u": "u [V]"},
+        "outputs": {"y": "y"},
+        "units": {"u": "V"},
+    }
+    assert parse_fields({}) == {}
 
 
 @pytest.mark.parametrize(
@@ -593,7 +695,7 @@ def test_fields_become_arguments():
 )
 def test_fields_that_say_nothing_usable_are_refused(said, words):
     with pytest.raises(DataError, match=re.escape(words)):
-        asked_of(said)
+        parse_fields(said)
 
 
 def test_roles_are_changed_and_what_is_missing_is_said(page, content):
@@ -627,21 +729,21 @@ def test_no_folder_of_the_machine_is_shown(used, page):
 def test_a_share_is_cut_where_rows_are():
     for rows in (10, 300, 1001):
         for step in (0.05, 1 / 3, 1e-3, 7e5):
-            cut = cut_at(rows, step, 0.3)
+            cut = split_time(rows, step, 0.3)
             assert cut == pytest.approx(round(0.7 * rows) * step)
 
 
 def test_recipes_survive_json():
-    recipe = Recipe(Reading("a", {"step": 0.1}), Reading("b"), 0.0, ("D y = a y + b u",), "inside")
-    assert Recipe.of(json.loads(json.dumps(recipe.to_dict()))) == recipe
-    assert [s.name for s in checked_structures(recipe)] == ["equation"]
-    assert [checked_structures(Recipe(Reading("a"), structure=(n,)))[0].name for n in NAMED]
+    recipe = FitRequest(RunSource("a", {"step": 0.1}), RunSource("b"), 0.0, ("D y = a y + b u",), "inside")
+    assert FitRequest.of(json.loads(json.dumps(recipe.to_dict()))) == recipe
+    assert [s.name for s in parse_structures(recipe)] == ["equation"]
+    assert [parse_structures(FitRequest(RunSource("a"), structure=(n,)))[0].name for n in NAMED_STRUCTURES]
 
 
 # -------------------------------------------------------------------------------------- work, its end, and its limits
 
 
-LONG = Recipe(Reading("a.csv"), structure=("D y = a y + b u",))
+LONG = FitRequest(RunSource("a.csv"), structure=("D y = a y + b u",))
 
 
 async def asleep(self, seconds=None):
@@ -657,7 +759,7 @@ def test_models_wait_for_each_other_and_stop_in_any_state(page, monkeypatch):
     async def course():
         desk = page.desk
         await put_beside(desk, "a.csv", 1)
-        models = [desk.start(LONG) for _ in range(desks.MOST_WAITING)]
+        models = [desk.start(LONG) for _ in range(desks.MAX_QUEUED_MODELS)]
         with pytest.raises(DataError, match="8 models wait"):
             desk.start(LONG)
         await asyncio.sleep(0.03)
@@ -675,7 +777,7 @@ def test_models_wait_for_each_other_and_stop_in_any_state(page, monkeypatch):
             desk.stop(model.key)
         await settled(desk)
         desk.remove_file("a.csv")
-        monkeypatch.setattr(desks, "MOST_MODELS", len(desk.models))
+        monkeypatch.setattr(desks, "MAX_MODELS", len(desk.models))
         with pytest.raises(DataError, match="are kept"):
             desk.start(LONG)
 
@@ -697,20 +799,20 @@ def test_a_choice_that_was_stopped_goes_on_where_it_was(tmp_path, content, monke
     Path("lag.csv").write_bytes(content)
     options = json.loads(json.dumps(ftlm.open_file("lag.csv").to_dict()["options"]))
     words = tuple(f"D y = a0 y + b0 u{more}" for more in ("", " + c", " + b1 D^0.5 u"))
-    recipe = Recipe(Reading("lag.csv", options), share=0.25, structure=words, way="offered")
-    plain, store = recipe.made(Quiet()), Path("choice.ftlm")
-    recipe.made(Quiet(), str(store))
+    recipe = FitRequest(RunSource("lag.csv", options), share=0.25, structure=words, way="offered")
+    plain, store = recipe.fit_model(Quiet()), Path("choice.ftlm")
+    recipe.fit_model(Quiet(), str(store))
     whole = store.read_bytes()
     # As a kill in the middle leaves it.
     store.write_bytes(whole[: len(whole) // 2])
-    went_on = recipe.made(Quiet(), str(store))
+    went_on = recipe.fit_model(Quiet(), str(store))
     assert store.stat().st_size == len(whole)
     assert store.read_bytes()[: len(whole) // 4] == whole[: len(whole) // 4]
     assert went_on.choice.reason == plain.choice.reason
     assert went_on.result.coefficients == plain.result.coefficients
     # Nothing is left to be fitted, so nothing is kept once more.
     again = store.read_bytes()
-    recipe.made(Quiet(), str(store))
+    recipe.fit_model(Quiet(), str(store))
     assert store.read_bytes() == again
 
 
@@ -722,7 +824,7 @@ def test_what_was_stopped_goes_on_with_the_same_store_as_long_as_its_file_is_the
         await asleep(self)
 
     monkeypatch.setattr(Task, "answer", noted)
-    choice = Recipe(Reading("a.csv"), structure=("D y = a y + b u",), way="inside")
+    choice = FitRequest(RunSource("a.csv"), structure=("D y = a y + b u",), way="inside")
 
     async def course():
         desk = page.desk
@@ -760,7 +862,7 @@ def test_what_was_stopped_goes_on_with_the_same_store_as_long_as_its_file_is_the
 
 def test_a_file_that_takes_long_is_on_the_page_and_can_be_removed(page, monkeypatch):
     monkeypatch.setattr(Task, "answer", asleep)
-    monkeypatch.setattr(desks, "PATIENCE", 0.01)
+    monkeypatch.setattr(desks, "OPEN_REPLY_TIMEOUT_S", 0.01)
     status, _, text = page.upload("long.csv", b"t,u,y")
     assert status == 200
     assert "Reading" in text
@@ -825,18 +927,18 @@ def test_errors_speak_of_what_the_page_has(words, shown):
 
 def test_progress_is_told_in_shares_and_words():
     model = desks.Model("k", 1, LONG, state="running")
-    desks._note(model, {"phase": "fitting"})
+    desks._record_progress(model, {"phase": "fitting"})
     assert (model.phase, model.share, model.left) == ("fitting", None, "")
-    model.begun_phase -= 10
-    desks._note(model, {"done": 500, "total": 1000})
+    model.phase_started_at -= 10
+    desks._record_progress(model, {"done": 500, "total": 1000})
     assert model.share == 0.5
     assert re.fullmatch(r"about \d+ s left", model.left)
-    desks._note(model, {"done": 5, "total": 0})
+    desks._record_progress(model, {"done": 5, "total": 0})
     assert model.share == 0.5
     # Candidates are counted: more of them come up, and no share may go back.
-    desks._note(model, {"phase": "choosing a structure"})
-    desks._note(model, {"done": 9, "total": 10})
-    desks._note(model, {"done": 10, "total": 20})
+    desks._record_progress(model, {"phase": "choosing a structure"})
+    desks._record_progress(model, {"done": 9, "total": 10})
+    desks._record_progress(model, {"done": 10, "total": 20})
     assert model.share is None
     assert model.left == "10 of 20 candidates known so far are fitted"
 
@@ -924,9 +1026,9 @@ def wired():
     def make():
         config = uvicorn.Config(nobody, lifespan="off", ws="none", timeout_keep_alive=15, log_config=None)
         wire = Wire()
-        connection = patient()(config, ServerState(), {}, wire)
+        connection = make_connection_class()(config, ServerState(), {}, wire)
         connection.connection_made(wire)
-        return wire, connection, PATIENCE
+        return wire, connection, CLIENT_TIMEOUT_S
 
     return make
 
@@ -1027,8 +1129,8 @@ def test_a_second_one_on_the_port_is_told(monkeypatch):
         done = run_command("--port", port, "--no-browser")
         assert done.exit_code == 3
         assert f"--port {port} is taken" in done.stderr
-        monkeypatch.setattr(serve, "PORT", port)
-        sock, note = serve.listening(None)
+        monkeypatch.setattr(serve, "DEFAULT_PORT", port)
+        sock, note = serve.open_socket(None)
         with sock:
             assert sock.getsockname()[0] == "127.0.0.1"
             assert sock.getsockname()[1] != port

@@ -34,9 +34,12 @@ class Served:
     def __init__(self, folder, *words):
         self.process = subprocess.Popen(
             [sys.executable, "-m", "ftlm", "app", "--no-browser", "--port", "0", *map(str, words)],
-            stdout=subprocess.PIPE, stderr=subprocess.PIPE, text=True, env={**os.environ, "TMPDIR": str(folder)},
+            stdout=subprocess.PIPE,
+            stderr=subprocess.PIPE,
+            text=True,
+            env={**os.environ, "TMPDIR": str(folder)},
             start_new_session=True,
-        )  # fmt: skip
+        )
         self.address = re.search(r"http://\S+", self.process.stdout.readline())[0]
         parts = urlsplit(self.address)
         self.port, self.path, self.host = parts.port, parts.path, parts.netloc
@@ -94,10 +97,15 @@ def test_what_no_browser_sends_is_refused(served):
     assert b"256 MB" in big
     form = raw(served.port, f"{head}Content-Type: multipart/form-data\r\nContent-Length: 3\r\n\r\n--x".encode())
     assert form.startswith(b"HTTP/1.1 415")
-    for nonsense in (b"\0" * 100 + b"\r\n\r\n", b"GET\r\n\r\n", b"GET / HTTP/9.9\r\n\r\n", b"\x16\x03\x01 \r\n\r\n",
-                     f"{head}{kind}Transfer-Encoding: chunked\r\n\r\nZZZ\r\n".encode(),
-                     f"{head}{kind}Content-Length: 3\r\nContent-Length: 4\r\n\r\nabcd".encode(),
-                     b"GET / HTTP/1.1\r\nHost: x\r\nX: " + b"y" * 200_000 + b"\r\n\r\n"):  # fmt: skip
+    for nonsense in (
+        b"\0" * 100 + b"\r\n\r\n",
+        b"GET\r\n\r\n",
+        b"GET / HTTP/9.9\r\n\r\n",
+        b"\x16\x03\x01 \r\n\r\n",
+        f"{head}{kind}Transfer-Encoding: chunked\r\n\r\nZZZ\r\n".encode(),
+        f"{head}{kind}Content-Length: 3\r\nContent-Length: 4\r\n\r\nabcd".encode(),
+        b"GET / HTTP/1.1\r\nHost: x\r\nX: " + b"y" * 200_000 + b"\r\n\r\n",
+    ):
         assert raw(served.port, nonsense)[:12] in (b"HTTP/1.1 400", b"HTTP/1.1 403", b"")
     strange = f"GET {served.path} HTTP/1.1\r\nHost: evil.example\r\nConnection: close\r\n\r\n"
     assert raw(served.port, strange.encode()).startswith(b"HTTP/1.1 403")

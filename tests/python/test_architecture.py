@@ -115,7 +115,7 @@ def test_the_walk_of_a_run_is_the_one_it_takes(tmp_path, small_run):
     try:
         run = ftlm.load(tmp_path / "run.csv")
         structure = ftlm.equation("D^alpha y = a D^beta y + b u", initial="rest")
-        options = {"method": "multi-innovation", "lattice": ftlm.lattice(step=0.25), "m": 64, "threads": 1}
+        options = {"method": "multi-innovation", "lattice": ftlm.order_grid(step=0.25), "m": 64, "threads": 1}
         ftlm.identify(run, structure, **options).report(tmp_path / "run.html")
     finally:
         sys.setprofile(before)
@@ -414,8 +414,11 @@ def undocumented(name, function):
     }
     sections = re.findall(r"^(\w[\w ]*)\n-{3,}$", text, re.MULTILINE)
     ordered = [s for s in ("Parameters", "Returns", "Warns", "Raises", "Notes", "Examples") if s in sections]
-    return [*([] if enough else [f"arguments {sorted(named ^ own)}"]), *sorted(silent),
-            *([] if sections == ordered else [f"sections {sections}"])]  # fmt: skip
+    return [
+        *([] if enough else [f"arguments {sorted(named ^ own)}"]),
+        *sorted(silent),
+        *([] if sections == ordered else [f"sections {sections}"]),
+    ]
 
 
 def test_everything_in_the_reference_exists():

@@ -26,15 +26,21 @@ def runs() -> dict[str, ftlm.Run]:
     out = {}
     for name in ("psf", "lqr"):
         run = ftlm.load(
-            DATA / f"two_link_{name}" / f"{name}.csv", time="t_s", inputs=CURRENTS, outputs=ANGLES,
+            DATA / f"two_link_{name}" / f"{name}.csv",
+            time="t_s",
+            inputs=CURRENTS,
+            outputs=ANGLES,
             units=dict.fromkeys(ANGLES, "deg"),
-        )  # fmt: skip
+        )
         if name == "psf":
-            run = run.slice(1.1, 19.5)
+            run = run.window(1.1, 19.5)
         out[name] = ftlm.Run.from_arrays(
-            step=4 * run.step, inputs={n: run[n][::4] for n in CURRENTS}, outputs={n: run[n][::4] for n in ANGLES},
-            units=run.units, name=name,
-        )  # fmt: skip
+            step=4 * run.step,
+            inputs={n: run[n][::4] for n in CURRENTS},
+            outputs={n: run[n][::4] for n in ANGLES},
+            units=run.units,
+            name=name,
+        )
     return out
 
 
@@ -66,7 +72,7 @@ def test_one_fractional_order_predicts_better_than_none(runs) -> None:
         whole, _ = predicted(stock(GAUGE), runs, fitted)
         fractional, found = predicted(stock(SPRING_POT), runs, fitted)
         assert fractional > whole + 2.0
-        low, high = found.joint.intervals["beta"]
+        low, high = found.fit.intervals["beta"]
         assert 0.0 < low < high < 0.15
 
 
@@ -110,12 +116,16 @@ def test_the_second_link_is_the_same_machine_in_two_laboratories(runs) -> None:
     [
         ("theta12", [("theta11", 2)], None, LINK, False, 66.4, 18.6),
         (
-            "theta12", [("theta11", 2), ("theta21", 2), ("theta22", 0), ("theta21", 0), ("theta11", 0)], -1.0,
+            "theta12",
+            [("theta11", 2), ("theta21", 2), ("theta22", 0), ("theta21", 0), ("theta11", 0)],
+            -1.0,
             "D^2 theta12 = a theta12 + d D theta12 - D^2 theta11 + p D^2 theta21 + q theta22 + s theta21 + r theta11",
-            True, 90.5, 77.5,
+            True,
+            90.5,
+            77.5,
         ),
     ],
-)  # fmt: skip
+)
 def test_scipy_alone_says_the_same(runs, output, terms, first, words, offset: bool, own: float, unseen: float) -> None:
     seen = [s for s in ("theta12", "theta22") if s in words]
     asked = {"filtered": seen, "offset": offset}
@@ -123,16 +133,16 @@ def test_scipy_alone_says_the_same(runs, output, terms, first, words, offset: bo
     step = runs["lqr"].step
     point, known = lsim_link.fitted(tables["lqr"], step, output, terms, [(-115, -2), (-260, -1)], first=first, **asked)
     scipy = {
-        n: lsim_link.fit_percent(
-            t[output], lsim_link.projected(t, step, output, point, terms, known=known, **asked)[1]
-        )
+        n: lsim_link.fit_percent(t[output], lsim_link.projected(t, step, output, point, terms, known=known, **asked)[1])
         for n, t in tables.items()
-    }  # fmt: skip
+    }
     assert scipy == pytest.approx({"lqr": own, "psf": unseen}, abs=0.3)
     made = ftlm.equation(
-        words, sensor_filter=ftlm.SensorFilter.low_pass(seen), offset="constant" if offset else "none",
+        words,
+        sensor_filter=ftlm.SensorFilter.low_pass(seen),
+        offset="constant" if offset else "none",
         initial="caputo",
-    )  # fmt: skip
+    )
     found = ftlm.identify(runs["lqr"], made, method="output-error", intervals="quadratic")
     ours = {n: found.model.compare(r).fit_percent[output] for n, r in runs.items()}
     assert ours == pytest.approx(scipy, abs=0.3)
@@ -142,9 +152,13 @@ def test_scipy_alone_says_the_same(runs, output, terms, first, words, offset: bo
 def test_where_one_signal_stands_for_the_rest_there_is_no_machine(runs) -> None:
     # With the hub's coefficient and an order free the fit on psf ended where theta12 alone drives: 88.7 %, b = 0.03.
     link = ftlm.flexible_link(
-        stage=2, cross_stage="inertial", cross_sensitivity=True, hub=False, sensor_filter="stock",
+        stage=2,
+        cross_stage="inertial",
+        cross_sensitivity=True,
+        hub=False,
+        sensor_filter="stock",
         laws=("orders", "velocities"),
-    )  # fmt: skip
+    )
     made = replace(link.with_orders({"mu4": 1.0}), initial="caputo")
     found = ftlm.identify(runs["psf"], made, method="output-error", intervals="quadratic")
     assert found.fit_percent["theta22"] > 92.0

@@ -11,8 +11,8 @@ from pathlib import Path
 import numpy as np
 import pytest
 
-import ftlm
 import crate_structure
+import ftlm
 from ftlm import _core
 
 TESTS = Path(__file__).resolve().parents[1]

@@ -65,8 +65,12 @@ def test_what_is_silently_taken_shows_in_no_number(page):
     """The cases without a word are those whose numbers are good numbers."""
     silent = {case for (case, _), (verdict, _) in page.items() if verdict == "taken"}
     assert silent <= {
-        "time in ms, said to be s", "time since 1970", "whole numbers", "truth values", "degrees, said to be rad",
-    }  # fmt: skip
+        "time in ms, said to be s",
+        "time since 1970",
+        "whole numbers",
+        "truth values",
+        "degrees, said to be rad",
+    }
 
 
 @pytest.mark.parametrize("size", [1e-141, 1e-200, 1e-310, 5e-324])

@@ -8,21 +8,24 @@ import pytest
 
 import ftlm
 from ftlm.estimation import genetic
-from ftlm.estimation.genetic import Genetic, genetic_search, polynomial, simulated_binary
+from ftlm.estimation.genetic import Genetic, genetic_search, polynomial_mutation, simulated_binary_crossover
 from ftlm.simulation.discretization import prepare
 from ftlm.validation.comparison import compare_means
 
 EQUATION = "D^alpha y = a D^nu y + c y + b u"
 BOUNDS = {"a": (-10.0, 0.0), "c": (-20.0, 0.0), "b": (0.0, 10.0)}
-LATTICE = ftlm.lattice(step=0.1, alpha=(1.3, 1.9))
+LATTICE = ftlm.order_grid(step=0.1, alpha=(1.3, 1.9))
 
 
 @pytest.fixture(scope="module")
 def found(small_run):
     return ftlm.identify(
-        small_run, ftlm.equation(EQUATION), method="genetic", lattice=LATTICE,
+        small_run,
+        ftlm.equation(EQUATION),
+        method="genetic",
+        lattice=LATTICE,
         genetic=Genetic(seeds=(0, 1), evaluations=12000, population=100, bounds=BOUNDS),
-    )  # fmt: skip
+    )
 
 
 def test_the_optimum_of_a_clean_run_is_found(found):
@@ -52,7 +55,7 @@ def test_what_the_result_depends_on_is_told(found):
 
 def test_orders_keep_to_their_steps_and_below_alpha(found):
     for value in found.orders.values():
-        assert value == pytest.approx(round(value / genetic.RESOLUTION) * genetic.RESOLUTION, abs=1e-12)
+        assert value == pytest.approx(round(value / genetic.ORDER_RESOLUTION) * genetic.ORDER_RESOLUTION, abs=1e-12)
     assert found.orders["nu"] < found.orders["alpha"]
 
 
@@ -76,21 +79,24 @@ def test_equal_seeds_give_equal_results_for_any_number_of_threads_and_touch_no_g
 
 def test_leaving_hopeless_candidates_early_changes_nothing(small_run, monkeypatch):
     early = searched(small_run)
-    monkeypatch.setattr(genetic._Kept, "limit", property(lambda self: np.inf))
+    monkeypatch.setattr(genetic._ParentThreshold, "limit", property(lambda self: np.inf))
     assert searched(small_run) == early
 
 
 def test_as_many_evaluations_as_the_lattice_has_candidates(small_run):
-    lattice = ftlm.lattice(step=0.25, alpha=(1.25, 2.0))
+    lattice = ftlm.order_grid(step=0.25, alpha=(1.25, 2.0))
     candidates = ftlm.search_orders(
         small_run, ftlm.equation(EQUATION), lattice, coefficients="least-squares"
     ).candidates
     told = []
     structure = ftlm.equation(EQUATION)
     found = genetic_search(
-        prepare([small_run], structure, 256, power_of_two=True), structure, lattice,
-        Genetic(seeds=(0,), population=8, bounds=BOUNDS), progress=lambda done, total: told.append((done, total)),
-    )  # fmt: skip
+        prepare([small_run], structure, 256, power_of_two=True),
+        structure,
+        lattice,
+        Genetic(seeds=(0,), population=8, bounds=BOUNDS),
+        progress=lambda done, total: told.append((done, total)),
+    )
     assert candidates <= found.evaluations[0] <= candidates + 8
     assert told[-1] == (candidates, candidates)
     assert [done for done, _ in told] == sorted(done for done, _ in told)
@@ -99,9 +105,13 @@ def test_as_many_evaluations_as_the_lattice_has_candidates(small_run):
 def test_all_equations_of_a_stage_under_their_order_law(clean_a):
     structure = ftlm.flexible_link(form="published", stage=1, coupling="measured")
     found = ftlm.identify(
-        clean_a, structure, method="genetic", m=256, lattice=ftlm.lattice(alpha=(2.0, 2.0)),
+        clean_a,
+        structure,
+        method="genetic",
+        m=256,
+        lattice=ftlm.order_grid(alpha=(2.0, 2.0)),
         genetic=Genetic(seeds=(0,), evaluations=400, population=40),
-    )  # fmt: skip
+    )
     assert set(found.orders) == set(structure.order_names)
     law = ftlm.order_law(1, form="published")["beta1"].at(found.orders)
     assert found.model.equations[0].terms[0].order.constant == pytest.approx(law, abs=1e-9)
@@ -116,11 +126,11 @@ def test_operators_keep_to_what_they_promise():
     generator = np.random.RandomState(0)
     low, high = np.array([-1.0, 0.0, 5.0]), np.array([1.0, 2.0, 5.0 + 1e-9])
     parents = generator.uniform(low, high, (30, 3))
-    children = simulated_binary(parents, (201, 3), generator)
+    children = simulated_binary_crossover(parents, (201, 3), generator)
     assert children.shape == (201, 3)
     # Children spread around their parents without a drift.
     assert np.allclose(children.mean(axis=0), parents.mean(axis=0), atol=0.2)
-    moved = polynomial(children, low, high, generator)
+    moved = polynomial_mutation(children, low, high, generator)
     assert np.all(moved >= low)
     assert np.all(moved <= high)
     assert np.any(moved != children)

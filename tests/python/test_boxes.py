@@ -14,7 +14,7 @@ BOXED = 1 << 25
 
 def search(run, *, alpha=(1.05, 2.0), threads=2, **options):
     equation = ftlm.equation(EQUATION, initial="rest")
-    lattice = ftlm.lattice(step=0.015, alpha=alpha)
+    lattice = ftlm.order_grid(step=0.015, alpha=alpha)
     return ftlm.search_orders(run, equation, lattice, coefficients="least-squares", m=64, threads=threads, **options)
 
 
@@ -41,7 +41,7 @@ def check_one_by_one(run, whole, **options):
     rows = sorted((row for part in parts for row in rows_of(part)), key=lambda row: row[0])
     assert rows_of(whole) == rows[: len(whole.table)]
     assert sum(whole.pruned.values()) + len(whole.table) == whole.candidates
-    assert [part.boxed for part in parts] == [0, 0]
+    assert [part.excluded_by_box for part in parts] == [0, 0]
     assert 0 < whole.boxed <= whole.pruned["bound"]
     assert f"{whole.pruned['bound']} bound ({whole.boxed} of them in boxes excluded whole)" in str(whole)
     assert "of these in boxes excluded whole" in whole._repr_html_()
@@ -58,7 +58,7 @@ def test_boxes_keep_the_table_of_squared_equation_errors(run, tmp_path):
     path = tmp_path / "s.ftlm"
     whole = search(run, store=path, **options)
     check_one_by_one(run, whole, **options)
-    assert whole.boxed > whole.candidates // 4
+    assert whole.excluded_by_box > whole.candidates // 4
     data = path.read_bytes()
     path.write_bytes(data[: len(data) * 19 // 20])
     assert 0 < ftlm.search_status(path)["y"].done < whole.candidates
@@ -91,7 +91,7 @@ def unruly():
 
 
 def closely(run, path=None, highest=2.0, **options):
-    equation, lattice = ftlm.equation(EQUATION, initial="rest"), ftlm.lattice(step=0.05, alpha=(1.15, highest))
+    equation, lattice = ftlm.equation(EQUATION, initial="rest"), ftlm.order_grid(step=0.05, alpha=(1.15, highest))
     return ftlm.search_orders(run, equation, lattice, coefficients="least-squares", m=32, store=path, **options)
 
 
@@ -101,8 +101,8 @@ def test_a_search_by_close_proofs_goes_on_where_it_was_cut_or_stopped(unruly, tm
     # One too small for them excludes next to nothing.
     small = closely(unruly, highest=1.9)
     assert small.candidates < 1 << 18 <= whole.candidates
-    assert small.pruned["bound"] < small.candidates // 10
-    assert whole.pruned["bound"] > whole.candidates // 2
+    assert small.exclusion_counts["bound"] < small.candidates // 10
+    assert whole.exclusion_counts["bound"] > whole.candidates // 2
     assert bytes_of(closely(unruly, threads=3)) == bytes_of(whole)
     data = path.read_bytes()
     # What is searched, and where, stands first and is most of it.

@@ -42,8 +42,12 @@ def folder(tmp_path_factory, small_model, small_run, with_noise):
     fit = ftlm.identify(run, replace(ftlm.equation(words), name="fit " + HOSTILE))
     fit.report(where / "fit.html", validation=other)
     estimated = fit.comparison
-    np.savez(where / "fit.npz", time=estimated.times[0], measured=estimated.measured["y"][0],
-             simulated=estimated.simulated["y"][0])  # fmt: skip
+    np.savez(
+        where / "fit.npz",
+        time=estimated.times[0],
+        measured=estimated.measured["y"][0],
+        simulated=estimated.simulated["y"][0],
+    )
     free = ftlm.equation(words, orders={"alpha": "1.3:1.9:0.1", "nu": "0.2:1.2:0.1"})
     searched = ftlm.identify(run, replace(free, name="search " + HOSTILE), method="multi-innovation")
     warned = replace(searched, warnings=(*searched.warnings, "a warning " + HOSTILE))

@@ -12,7 +12,7 @@ from ftlm.cli.main import app
 from ftlm.errors import ModelError
 
 WORDS = "D^alpha y = a D^beta y + c y + b u"
-LATTICE = ftlm.lattice(step=0.1, alpha=(1.3, 1.8), beta=(0.5, 0.9))
+LATTICE = ftlm.order_grid(step=0.1, alpha=(1.3, 1.8), beta=(0.5, 0.9))
 
 
 @pytest.fixture(scope="module")
@@ -37,9 +37,14 @@ def proved(run, equation):
 def rmse(run, equation, alpha, beta):
     """Of the search itself, at one candidate."""
     return ftlm.search_orders(
-        run, equation, ftlm.Lattice(orders={"alpha": [alpha], "beta": [beta]}), criterion="equation-error", norm="l2",
-        coefficients="least-squares", m=128,
-    ).score  # fmt: skip
+        run,
+        equation,
+        ftlm.OrderGrid(orders={"alpha": [alpha], "beta": [beta]}),
+        criterion="equation-error",
+        norm="l2",
+        coefficients="least-squares",
+        m=128,
+    ).score
 
 
 def test_no_search_between_the_values_of_the_lattice_does_better(run, equation, proved):
@@ -49,9 +54,14 @@ def test_no_search_between_the_values_of_the_lattice_does_better(run, equation, 
     assert rmse(run, equation, *proved.orders.values()) == pytest.approx(proved.best, rel=1e-6)
     fine: dict = {"alpha": "1.3:1.798:0.003", "beta": "0.5:0.899:0.003"}
     found = ftlm.search_orders(
-        run, equation, ftlm.Lattice(orders=fine), criterion="equation-error", norm="l2", coefficients="least-squares",
+        run,
+        equation,
+        ftlm.OrderGrid(orders=fine),
+        criterion="equation-error",
+        norm="l2",
+        coefficients="least-squares",
         m=128,
-    )  # fmt: skip
+    )
     assert proved.at_least <= found.score
     assert proved.best <= found.score * 1.01
     assert set(proved.orders) == {"alpha", "beta"}
@@ -60,24 +70,24 @@ def test_no_search_between_the_values_of_the_lattice_does_better(run, equation, 
 
 def test_the_best_may_stand_on_an_edge(run, equation):
     """Where no middle of a box is."""
-    edge = ftlm.lattice(step=0.1, alpha=(1.3, 1.5), beta=(0.85, 0.9))
+    edge = ftlm.order_grid(step=0.1, alpha=(1.3, 1.5), beta=(0.85, 0.9))
     found = ftlm.certify_orders(run, equation, edge, within=0.05, m=128)
     assert found.orders["alpha"] in (1.3, 1.5) or found.orders["beta"] in (0.85, 0.9)
     lattice = ftlm.search_orders(
         run, equation, edge, criterion="equation-error", norm="l2", coefficients="least-squares", m=128
     )
-    assert found.at_least <= lattice.score
+    assert found.lower_bound <= lattice.score
     assert found.best <= lattice.score * (1 + 1e-9)
     # Cells that an interval only touches have bounds of their own.
-    assert found.open == 0
-    assert found.within <= 0.05 + 1e-6
+    assert found.open_cells == 0
+    assert found.proved_tolerance <= 0.05 + 1e-6
 
 
 def test_several_runs_of_their_own_steps_and_threads(run, equation, proved):
     again = ftlm.certify_orders(run, equation, LATTICE, within=0.05, m=128, threads=1)
     assert again == proved
     twice = ftlm.certify_orders([run, run.slice(1.0, 5.0)], equation, LATTICE, within=0.2, m=128)
-    assert 0 < twice.at_least <= twice.best
+    assert 0 < twice.lower_bound <= twice.best
 
 
 def test_it_says_in_words_what_is_proved_and_what_is_not(run, equation, proved):
@@ -87,7 +97,7 @@ def test_it_says_in_words_what_is_proved_and_what_is_not(run, equation, proved):
     assert f"{proved.cells} boxes" in text
     assert "asked" not in text
     cut = ftlm.certify_orders(run, equation, LATTICE, within=0.05, m=128, cells=proved.cells - 1)
-    assert cut.open > 0
+    assert cut.open_cells > 0
     assert "was asked for" in str(cut) or "nothing is proved" in str(cut)
     nothing = replace(proved, at_least=0.0, open=7)
     assert nothing.within == 1
@@ -95,7 +105,7 @@ def test_it_says_in_words_what_is_proved_and_what_is_not(run, equation, proved):
     document = json.loads(json.dumps(proved.to_dict()))
     assert document["at_least"] == proved.at_least
     assert document["orders"] == proved.orders
-    searched = ftlm.search_orders(run, equation, ftlm.lattice(step=0.3), m=32)
+    searched = ftlm.search_orders(run, equation, ftlm.order_grid(step=0.3), m=32)
     whole = replace(searched, certificate=proved)
     assert str(whole).endswith(text)
     assert "certificate" not in searched._repr_html_()
@@ -120,13 +130,13 @@ def test_it_says_in_words_what_is_proved_and_what_is_not(run, equation, proved):
         (WORDS, {"largest": 0.1}, "largest"),
         (WORDS, {"lattice": "fine"}, "lattice"),
         (WORDS, {"threads": 0}, "threads"),
-        (WORDS, {"lattice": ftlm.lattice(alpha=(0.5, 0.6), beta=(0.58, 0.7))}, "no orders in these intervals"),
+        (WORDS, {"lattice": ftlm.order_grid(alpha=(0.5, 0.6), beta=(0.58, 0.7))}, "no orders in these intervals"),
     ],
 )
 def test_what_cannot_be_had_is_said(run, words, options, said):
     given = {"lattice": LATTICE, "m": 128} | options
     if "3 u" in words and "lattice" not in options:
-        given["lattice"] = ftlm.lattice(step=0.1)
+        given["lattice"] = ftlm.order_grid(step=0.1)
     with pytest.raises(ModelError, match=said):
         ftlm.certify_orders(run, ftlm.equation(words, initial="rest"), **given)
 
@@ -146,10 +156,27 @@ def csv(run, tmp_path_factory):
 
 def test_the_command_line_prints_it_behind_the_table(csv, proved):
     words = [
-        "search", str(csv), "--structure", WORDS, "-u", "u", "-y", "y", "--initial", "rest", "--m", "128",
-        "--step", "0.1", "--lattice", "alpha=1.3:1.8:0.1", "--lattice", "beta=0.5:0.9:0.1", "--coefficients",
+        "search",
+        str(csv),
+        "--structure",
+        WORDS,
+        "-u",
+        "u",
+        "-y",
+        "y",
+        "--initial",
+        "rest",
+        "--m",
+        "128",
+        "--step",
+        "0.1",
+        "--lattice",
+        "alpha=1.3:1.8:0.1",
+        "--lattice",
+        "beta=0.5:0.9:0.1",
+        "--coefficients",
         "least-squares",
-    ]  # fmt: skip
+    ]
     ranked = ["--criterion", "equation-error", "--norm", "l2"]
     told = CliRunner().invoke(app, [*words, *ranked, "--certify", "0.05"])
     assert told.exit_code == 0, told.output

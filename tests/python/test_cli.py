@@ -18,7 +18,7 @@ import pytest
 from typer.testing import CliRunner
 
 import ftlm
-from ftlm.cli.framework import broken_line, say
+from ftlm.cli.framework import broken_line, print_text
 from ftlm.cli.main import app
 from measured import DATA, needs_data
 
@@ -286,11 +286,26 @@ def test_ctrl_c_ends_a_search_with_130_and_shows_progress_before(folder: Path) -
     # A pseudo-terminal, so that the progress bar is there too.
     master, slave = pty.openpty()
     process = subprocess.Popen(
-        [sys.executable, "-m", "ftlm", "search", "square.csv",
-         "--structure", "D^alpha y = a2 D^nu y + a1 D^mu y + a0 D^xi y + b0 u",
-         "--coefficients", "least-squares", "--step", "0.005", "--lattice", "alpha=1.0:2.0:0.005"],
-        cwd=folder, stdout=subprocess.DEVNULL, stderr=slave, env={**os.environ, "TERM": "xterm"},
-    )  # fmt: skip
+        [
+            sys.executable,
+            "-m",
+            "ftlm",
+            "search",
+            "square.csv",
+            "--structure",
+            "D^alpha y = a2 D^nu y + a1 D^mu y + a0 D^xi y + b0 u",
+            "--coefficients",
+            "least-squares",
+            "--step",
+            "0.005",
+            "--lattice",
+            "alpha=1.0:2.0:0.005",
+        ],
+        cwd=folder,
+        stdout=subprocess.DEVNULL,
+        stderr=slave,
+        env={**os.environ, "TERM": "xterm"},
+    )
     os.close(slave)
     seen = b""
     deadline = time.monotonic() + 60
@@ -316,9 +331,23 @@ def test_the_real_arm_from_csv_and_from_mat_files_is_one_model(tmp_path: Path) -
     mats = sorted(str(p) for p in run.glob("*.mat"))
     assert len(mats) == 6
     for cross in ((), ("--cross-stage",)):
-        options = ("--slice", "1.1:7.1", "--structure", "flexible-link:1", "--coupling", "measured",
-                   "--method", "least-squares", "--step", "0.2", "--initial", "caputo", "--json", "--force",
-                   *cross)  # fmt: skip
+        options = (
+            "--slice",
+            "1.1:7.1",
+            "--structure",
+            "flexible-link:1",
+            "--coupling",
+            "measured",
+            "--method",
+            "least-squares",
+            "--step",
+            "0.2",
+            "--initial",
+            "caputo",
+            "--json",
+            "--force",
+            *cross,
+        )
         found = [
             ftlm_command("identify", *files, "--columns", columns, *options, "-o", out, cwd=tmp_path)
             for files, columns, out in (([str(run / "psf.csv")], "csv.toml", "a.json"), (mats, "mat.toml", "b.json"))
@@ -329,9 +358,15 @@ def test_the_real_arm_from_csv_and_from_mat_files_is_one_model(tmp_path: Path) -
         for name, value in first["coefficients"].items():
             assert second["coefficients"][name] == pytest.approx(value, rel=1e-6)
         compared = ftlm_command(
-            "compare", "a.json", str(DATA / "two_link_lqr" / "lqr.csv"), "--columns", "csv.toml", "--slice", "0:6",
+            "compare",
+            "a.json",
+            str(DATA / "two_link_lqr" / "lqr.csv"),
+            "--columns",
+            "csv.toml",
+            "--slice",
+            "0:6",
             cwd=tmp_path,
-        )  # fmt: skip
+        )
         assert compared.returncode == 0, compared.stderr
         for words in ("equation error", "output error", "theta11", "theta12"):
             assert words in compared.stdout
@@ -385,15 +420,17 @@ LONG = {
         "  + 6.64195 D^0.7498 theta12 + 140.4 I1(t - 0.035 s)",
     ],
     "  gain   theta11 from I1: none, it integrates: 2.2312 ± 0.0027 rad/A; order 0.95 ± 0.01": [
-        "  gain   theta11 from I1: none, it integrates:", "         2.2312 ± 0.0027 rad/A; order 0.95 ± 0.01",
+        "  gain   theta11 from I1: none, it integrates:",
+        "         2.2312 ± 0.0027 rad/A; order 0.95 ± 0.01",
     ],
     "! residuals of y are not white: the model leaves something out, of which nothing is known": [
-        "! residuals of y are not white: the model leaves something", "  out, of which nothing is known",
+        "! residuals of y are not white: the model leaves something",
+        "  out, of which nothing is known",
     ],
     "a row  of a table  with  many cells  stays as it is  whatever  its length may be in the end": None,
     "next: ftlm identify a.csv -u u -y y --structure 'D^alpha y = a0 y + b0 u' --time t --time-unit ms": None,
     "short": None,
-}  # fmt: skip
+}
 
 
 @pytest.mark.parametrize("line", LONG)
@@ -404,7 +441,7 @@ def test_lines_break_between_words_and_equations_between_terms(monkeypatch, line
     assert " ".join(p.strip() for p in parts) == line.strip()
     # Who reads a pipe gets each line whole.
     monkeypatch.setattr("sys.stdout", io.StringIO())
-    say(line)
+    print_text(line)
     assert sys.stdout.getvalue() == f"{line}\n"
 
 

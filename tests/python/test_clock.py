@@ -6,8 +6,8 @@ from scipy import signal
 
 import ftlm
 from ftlm.estimation.free_parameters import FreeProblem
-from ftlm.estimation.free_parameters import clock as clock_of
-from ftlm.estimation.objective import Attempt, Grid, descend
+from ftlm.estimation.free_parameters import time_scaling as clock_of
+from ftlm.estimation.objective import Iterate, Objective, minimize_cost
 
 #: Of a lag of first order two orders and an own term too many: along the bottom of a valley nothing tells them.
 FLAT = "D^alpha y = d D^mu y + a y + b u"
@@ -35,7 +35,7 @@ def in_seconds(values, scale):
 @pytest.mark.parametrize("seed", [0, 2])
 def test_a_flat_fit_does_not_depend_on_the_unit_of_time(seed):
     found = {
-        unit: ftlm.identify(lag(seed, scale), ftlm.equation(FLAT), threads=1, intervals="quadratic").joint
+        unit: ftlm.identify(lag(seed, scale), ftlm.equation(FLAT), threads=1, intervals="quadratic").fit
         for unit, scale in UNITS.items()
     }
     seconds = found["s"]
@@ -60,9 +60,9 @@ def test_a_descent_takes_the_same_steps_in_any_unit(plain):
     ended = []
     for scale in UNITS.values():
         here = start | {n: v for n, v in in_seconds(start, 1.0 / scale).items()}
-        grid = Grid(problem, [lag(1, scale)], [20.0])
-        attempt = Attempt([here[n] for n in problem.orders], [here[n] for n in problem.coefficients], "", {})
-        ended.append(descend(problem, grid.experiments, attempt, evaluations=6, plain=plain))
+        grid = Objective(problem, [lag(1, scale)], [20.0])
+        attempt = Iterate([here[n] for n in problem.orders], [here[n] for n in problem.coefficients], "", {})
+        ended.append(minimize_cost(problem, grid.experiments, attempt, evaluations=6, plain=plain))
     for other in ended[1:]:
         assert other.orders == pytest.approx(ended[0].orders, abs=1e-7)
         assert other.outcome["cost"] == pytest.approx(ended[0].outcome["cost"], rel=1e-9)

@@ -10,8 +10,8 @@ from typer.testing import CliRunner
 import ftlm
 import loops
 from ftlm import cli
-from ftlm.estimation.closed_loop import driven_by
-from ftlm.validation.residual_tests import feedback_test, past_columns
+from ftlm.estimation.closed_loop import instrument_runs
+from ftlm.validation.residual_tests import feedback_test, past_regressors
 
 STRUCTURE = ftlm.equation("D^alpha y = -a y + b u", initial="rest")
 
@@ -48,7 +48,7 @@ def test_the_regression_is_that_of_dense_least_squares():
     ends = []
     for horizon in (5, 25):
         rows = range(25, 400 - 25)
-        past = [past_columns(u, 0, 200)[k][25:375] for k in range(len(past_columns(u, 0, 200)))]
+        past = [past_regressors(u, 0, 200)[k][25:375] for k in range(len(past_regressors(u, 0, 200)))]
         future = [[u[t + k] for t in rows] for k in range(1, horizon + 1)]
         target = noise[25:375]
         sums = []
@@ -59,7 +59,7 @@ def test_the_regression_is_that_of_dense_least_squares():
         statistic = (sums[0][0] - sums[1][0]) / (sums[1][0] / degrees)
         ends.append((statistic / (horizon * fisher.ppf(1 - 0.005, horizon, degrees)), statistic))
     ratio, statistic = max(ends)
-    assert test.found
+    assert test.has_feedback
     assert test.statistic == pytest.approx(statistic, rel=1e-9)
     assert test.statistic / test.limit == pytest.approx(ratio, rel=0.1)
 
@@ -94,7 +94,7 @@ def test_the_reference_takes_the_bias_out():
             found = ftlm.identify(run, STRUCTURE, **options)
             errors[how].append((found.coefficients["b"] - loops.TRUTH["b"]) / found.standard_errors["b"])
             assert bool(loop_warnings(found)) == (how == "measured")
-            assert found.joint.converged
+            assert found.fit.converged
     assert abs(np.mean(errors["r"])) < 0.5 * abs(np.mean(errors["measured"]))
 
 
@@ -102,9 +102,9 @@ def test_residuals_are_orthogonal_to_what_follows_the_reference():
     # The oracle: sensitivities by differences of the exact step response's convolutions with the answer to r.
     run = loops.loop("closed, coloured", 3)
     found = ftlm.identify(run, STRUCTURE, reference="r")
-    assert found.joint.converged
-    values = found.joint_values
-    (answer,), _ = driven_by([run], STRUCTURE, "r")
+    assert found.fit.converged
+    values = found.parameter_values
+    (answer,), _ = instrument_runs([run], STRUCTURE, "r")
 
     def free(u: np.ndarray, alpha: float, a: float, b: float) -> np.ndarray:
         t = np.arange(run.length) * loops.STEP
@@ -166,7 +166,7 @@ def test_what_is_no_reference_is_refused(options, error, words):
 def test_instrumental_variables_count_the_error_of_their_orders():
     # The true order is on no lattice; errors at the order found alone covered one in three.
     held = []
-    near = ftlm.lattice(alpha=(1.5, 1.9))
+    near = ftlm.order_grid(alpha=(1.5, 1.9))
     for seed in range(3):
         run = loops.open_run(seed, noise=0.05)
         found = ftlm.identify(run, STRUCTURE, method="instrumental-variables", lattice=near)
@@ -175,6 +175,6 @@ def test_instrumental_variables_count_the_error_of_their_orders():
         assert found.standard_errors["alpha"] >= 0.5 * abs(found.orders["alpha"] - 1.73)
         at_order = ftlm.identify(
             run, STRUCTURE.with_orders({"alpha": found.orders["alpha"]}), method="instrumental-variables"
-        )  # fmt: skip
+        )
         assert found.standard_errors["a"] > at_order.standard_errors["a"]
     assert np.mean(held) >= 0.9

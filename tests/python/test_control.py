@@ -46,9 +46,11 @@ def test_rounding_the_impulses_to_samples_would_leave_vibration():
     at = shaper.times[1] * rate
     for taps in (
         np.bincount([0, round(at)], weights=shaper.amplitudes),
-        np.bincount([0, int(at), int(at) + 1],
-                    weights=[shaper.amplitudes[0], *np.multiply(shaper.amplitudes[1], (1 - at % 1, at % 1))]),
-    ):  # fmt: skip
+        np.bincount(
+            [0, int(at), int(at) + 1],
+            weights=[shaper.amplitudes[0], *np.multiply(shaper.amplitudes[1], (1 - at % 1, at % 1))],
+        ),
+    ):
         assert left_after(np.convolve(step, taps)[:101], rate, W, Z, 10) > 0.01
 
 
@@ -79,7 +81,7 @@ def test_what_a_shaper_says_is_left_is_what_is_simulated(kind):
 
 def test_two_modes_are_shaped_together():
     model = ftlm.Model(ftlm.equation("D^4 y = -3.7 D^3 y - 1000 D^2 y - 1500 D y - 200000 y + 200000 u"))
-    modes = sorted((m for m in model.modes() if m.swings), key=lambda m: m.damping)
+    modes = sorted((m for m in model.modes() if m.oscillatory), key=lambda m: m.damping)
     shaper = control.input_shaper(model, modes_shaped=2)
     for mode in modes:
         assert float(shaper.residual(mode.frequency, mode.damping)) < 1e-12
@@ -96,8 +98,12 @@ def test_a_fractional_models_own_pole_is_shaped():
     step = np.r_[0.0, np.zeros(49), np.ones(1451)]
     left = {}
     for name, x in (("step", step), ("shaped", shaper.filter(step, 500.0))):
-        run = ftlm.Run.from_arrays(step=0.002, inputs={"x": np.convolve(x, np.ones(25) / 25)[:1501]},
-                                   outputs={"y": 0 * t}, intersample={"x": "foh"})  # fmt: skip
+        run = ftlm.Run.from_arrays(
+            step=0.002,
+            inputs={"x": np.convolve(x, np.ones(25) / 25)[:1501]},
+            outputs={"y": 0 * t},
+            intersample={"x": "foh"},
+        )
         bend = model.simulate(run)["y"][200:700]
         # About a mean that creeps, as a power of time does.
         left[name] = np.std(bend - np.polyval(np.polyfit(t[200:700], bend, 3), t[200:700]))
@@ -247,8 +253,8 @@ def test_designs_are_made_over_the_intervals():
     model = uncertain(HUB, {4: 0.01, 2: 3.0})
     design = control.fractional_pid(model, crossover=40.0, samples=60)
     assert len(design.samples) == 60
-    assert design.kept == 1.0
-    low, high = design.within("phase")
+    assert design.stable_share == 1.0
+    low, high = design.margin_interval("phase")
     assert low < 59.9
     assert high > 60.05 or low > 50.0
     assert design == control.fractional_pid(model, crossover=40.0, samples=60)
@@ -301,7 +307,7 @@ PID = control.FractionalPid(6.4, 300.0, 2.5, 0.9, 0.6)
 
 def test_what_runs_is_the_exact_controller_within_what_it_says():
     """Its own answer to a sine over many periods, against powers of jw."""
-    realised = control.Realised(PID, 500.0)
+    realised = control.DiscretePid(PID, 500.0)
     assert realised.gain_error < 0.5
     assert realised.phase_error < 5.0
     for w in (5.0, 40.0, 150.0):
@@ -318,7 +324,7 @@ def test_what_runs_is_the_exact_controller_within_what_it_says():
 
 
 def test_its_memory_is_bounded_and_of_the_size_it_says():
-    realised = control.Realised(PID, 500.0, order=4)
+    realised = control.DiscretePid(PID, 500.0, order=4)
     assert realised.memory == 2 * 9 + 2  # an integral and the error before besides
     for v in np.random.default_rng(0).standard_normal(5000):
         assert math.isfinite(realised(float(v)))
@@ -327,7 +333,7 @@ def test_its_memory_is_bounded_and_of_the_size_it_says():
 
 def test_its_step_is_that_of_the_sum_over_the_whole_past():
     """Half a second of a ramp against Gruenwald-Letnikov's sums."""
-    realised = control.Realised(PID, 500.0)
+    realised = control.DiscretePid(PID, 500.0)
     rows = 400
     ramp = np.arange(rows) / 500.0
     found = np.array([realised(float(v)) for v in ramp])
@@ -342,19 +348,19 @@ def test_its_step_is_that_of_the_sum_over_the_whole_past():
 
 
 def test_the_first_sample_kicks_nothing_and_the_limit_winds_nothing_up():
-    assert control.Realised(PID, 500.0)(0.1) == pytest.approx(PID.kp * 0.1, rel=1e-9)
-    realised = control.Realised(PID, 500.0, limit=0.9)
+    assert control.DiscretePid(PID, 500.0)(0.1) == pytest.approx(PID.kp * 0.1, rel=1e-9)
+    realised = control.DiscretePid(PID, 500.0, limit=0.9)
     assert {realised(1.0) for _ in range(2000)} == {0.9}
     # Two seconds at the limit are forgotten within a few samples of the other sign.
     assert [realised(-0.1) < 0 for _ in range(3)][-1]
-    free = control.Realised(PID, 500.0)
+    free = control.DiscretePid(PID, 500.0)
     for _ in range(2000):
         free(1.0)
     assert free(-0.1) > 100.0
 
 
 def test_a_reset_forgets():
-    realised = control.Realised(PID, 500.0)
+    realised = control.DiscretePid(PID, 500.0)
     first = [realised(v) for v in (0.1, 0.3, -0.2)]
     realised.reset()
     assert [realised(v) for v in (0.1, 0.3, -0.2)] == first
@@ -379,9 +385,9 @@ def test_a_reset_forgets():
 )
 def test_what_cannot_be_realised_is_refused(options, words):
     with pytest.raises(ftlm.ModelError, match=words):
-        control.Realised(PID, **{"rate": 500.0, **options})
+        control.DiscretePid(PID, **{"rate": 500.0, **options})
     with pytest.raises(ftlm.ModelError, match="Realised or Lqg controllers"):
-        control.HubLoops(PID)
+        control.JointControllers(PID)
 
 
 @pytest.mark.parametrize(
@@ -404,7 +410,7 @@ def test_what_cannot_be_realised_is_refused(options, words):
 )
 def test_what_is_no_controller_is_refused(numbers, words):
     with pytest.raises(ftlm.ModelError, match=words):
-        control.Realised(control.FractionalPid(**{**dataclasses.asdict(PID), **numbers}), 500.0)
+        control.DiscretePid(control.FractionalPid(**{**dataclasses.asdict(PID), **numbers}), 500.0)
 
 
 @pytest.mark.parametrize("given", [None, 3.0, "pid", {}])
@@ -412,18 +418,19 @@ def test_what_is_no_model_and_no_controller_is_named(given):
     with pytest.raises(ftlm.ModelError, match="not a Model"):
         control.fractional_pid(given, crossover=40.0)
     with pytest.raises(ftlm.ModelError, match="no FractionalPid"):
-        control.Realised(given, 500.0)
+        control.DiscretePid(given, 500.0)
 
 
 def test_a_designed_loop_runs_on_the_virtual_arm_and_holds_what_it_is_told():
     """Tuned on the arm's linear fractional model, run on the arm with friction, coupling, offset and noise."""
     arm = ftlm.rig.ArmParameters.of("linear").model()
     design = control.fractional_pid(arm, output="theta11", input="I1", crossover=100.0)
-    loops = control.HubLoops(control.Realised(design.pid, 500.0, limit=0.94),
-                             control.Realised(design.pid, 500.0, limit=1.2))  # fmt: skip
+    loops = control.JointControllers(
+        control.DiscretePid(design.pid, 500.0, limit=0.94), control.DiscretePid(design.pid, 500.0, limit=1.2)
+    )
     angle = np.clip(0.5 * (np.arange(1201) * 0.002 - 0.1), 0.0, 0.3)
     run = ftlm.rig.control(loops, np.column_stack([angle, 0 * angle]), offset=(0.02, -0.02))
-    assert run.about["faults"] == []
+    assert run.metadata["faults"] == []
     assert np.abs(run["theta11"][-200:] - 0.3).max() < 0.002
     assert np.abs(run["theta21"]).max() < 0.01
-    assert run.about["control"]["controller"]["settings"]["hub1"]["memory"] > 10
+    assert run.metadata["control"]["controller"]["settings"]["hub1"]["memory"] > 10

@@ -20,8 +20,23 @@ def saved(tmp_path_factory):
     return str(path)
 
 
-WORDS = ["control", "--design", "lqg", "--allowed", "hub=0.02", "--allowed", "bend=0.02", "--effort", "1", "--noise",
-         "hub=3e-4", "--noise", "bend=2e-4", "--samples", "0"]  # fmt: skip
+WORDS = [
+    "control",
+    "--design",
+    "lqg",
+    "--allowed",
+    "hub=0.02",
+    "--allowed",
+    "bend=0.02",
+    "--effort",
+    "1",
+    "--noise",
+    "hub=3e-4",
+    "--noise",
+    "bend=2e-4",
+    "--samples",
+    "0",
+]
 
 
 def run(*words):
@@ -32,7 +47,9 @@ def run(*words):
 def test_a_controller_comes_back_from_its_file_to_the_last_bit(kind, tmp_path):
     limit = 0.9
     made = (
-        control.Realised(PID, 250.0, limit=limit, order=4) if kind == "pid" else designed(samples=0).controlled(limit)
+        control.DiscretePid(PID, 250.0, limit=limit, order=4)
+        if kind == "pid"
+        else designed(samples=0).with_limit(limit)
     )
     control.save_controller(made, tmp_path / "c.json", model="by hand")
     read = control.load_controller(tmp_path / "c.json")
@@ -47,18 +64,20 @@ def test_a_controller_comes_back_from_its_file_to_the_last_bit(kind, tmp_path):
 
 def test_a_pid_runs_from_the_numbers_of_its_file_alone(tmp_path):
     """As the file says it, in plain Python."""
-    made = control.Realised(PID, 250.0, order=4)
+    made = control.DiscretePid(PID, 250.0, order=4)
     control.save_controller(made, tmp_path / "c.json")
     told = json.loads((tmp_path / "c.json").read_text(encoding="utf-8"))["controller"]
     assert "every lag becomes" in json.loads((tmp_path / "c.json").read_text(encoding="utf-8"))["meaning"]
     states, last = None, 0.0
     for e in np.sin(np.arange(100) * 0.05) + 0.2:
         if states is None:
-            states = [0.0 if g["of"] == "integral" else e * (g["now"] + g["before"]) / (1 - g["keep"])
-                      for g in told["lags"]]  # fmt: skip
+            states = [
+                0.0 if g["of"] == "integral" else e * (g["now"] + g["before"]) / (1 - g["keep"]) for g in told["lags"]
+            ]
         else:
-            states = [g["keep"] * x + g["now"] * e + g["before"] * last
-                      for g, x in zip(told["lags"], states, strict=True)]  # fmt: skip
+            states = [
+                g["keep"] * x + g["now"] * e + g["before"] * last for g, x in zip(told["lags"], states, strict=True)
+            ]
         output = (told["kp"] + told["direct"]) * e
         output += sum(g["weight"] * x for g, x in zip(told["lags"], states, strict=True))
         assert made(float(e)) == pytest.approx(output, rel=1e-9)
@@ -85,8 +104,20 @@ def test_an_lqg_runs_from_the_numbers_of_its_file_alone(saved, tmp_path):
 
 def broken_files():
     good = {"format": "ftlm-controller", "schema": 1, "written_by": "", "model": "", "meaning": ""}
-    pid = {"type": "pid", "kp": 1.0, "ki": 1.0, "kd": 0.0, "lam": 1.0, "mu": 1.0, "rate": 100.0, "limit": None,
-           "band": [1.0, 10.0], "order": 3, "direct": 0.0, "lags": []}  # fmt: skip
+    pid = {
+        "type": "pid",
+        "kp": 1.0,
+        "ki": 1.0,
+        "kd": 0.0,
+        "lam": 1.0,
+        "mu": 1.0,
+        "rate": 100.0,
+        "limit": None,
+        "band": [1.0, 10.0],
+        "order": 3,
+        "direct": 0.0,
+        "lags": [],
+    }
     yield b"", "no ftlm controller"
     yield b"[" * 100_000, "no ftlm controller"
     yield json.dumps(good).encode(), "missing required field"
@@ -152,7 +183,7 @@ def test_control_writes_a_controller_and_a_plan(saved, tmp_path):
     pid = tmp_path / "pid.json"
     done = run("control", saved, "--output", "hub", "--crossover", 30, "--samples", 0, "-o", pid)
     assert done.exit_code == 0, done.output
-    assert isinstance(control.load_controller(pid), control.Realised)
+    assert isinstance(control.load_controller(pid), control.DiscretePid)
 
 
 def test_shape_writes_what_a_reference_is_convolved_with(saved, tmp_path):
@@ -193,7 +224,7 @@ REFUSED = [
     (("shape", "MODEL", "--rate", 1), "fewer than four samples"),
     (("shape", "MODEL", "--kind", "zw"), "is not one of"),
     (("shape", "MODEL", "-o", "s.json"), "does not end in .csv"),
-]  # fmt: skip
+]
 
 
 @pytest.mark.parametrize("case", range(len(REFUSED)))
@@ -209,8 +240,11 @@ def test_what_the_commands_cannot_use_is_refused_in_words(case, saved, tmp_path,
 def test_a_model_that_is_not_stable_is_refused(tmp_path):
     path = tmp_path / "u.json"
     ftlm.Model(ftlm.equation("D^2 hub = 9 D hub + I")).save(path)
-    for words in (("control", path, "--crossover", 40), ("control", path, "--design", "lqg", "--allowed", "hub=1",
-                  "--effort", 1, "--noise", "hub=1e-3"), ("shape", path)):  # fmt: skip
+    for words in (
+        ("control", path, "--crossover", 40),
+        ("control", path, "--design", "lqg", "--allowed", "hub=1", "--effort", 1, "--noise", "hub=1e-3"),
+        ("shape", path),
+    ):
         failed = run(*words)
         assert failed.exit_code == 2
         assert "not stable" in failed.output

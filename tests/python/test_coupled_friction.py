@@ -166,10 +166,13 @@ def test_where_a_hub_starts_moves_nothing(nu: float) -> None:
 @pytest.mark.parametrize(
     ("orders", "passes"),
     [
-        ((1.9, 0.95, 2.1), None), ((1.8, 0.9, 1.95), None), ((1.95, 1.1, 2.0), None),
-        ((1.9, 0.95, 2.1), [False, True]), ((1.95, 1.1, 2.0), [True, True]),
+        ((1.9, 0.95, 2.1), None),
+        ((1.8, 0.9, 1.95), None),
+        ((1.95, 1.1, 2.0), None),
+        ((1.9, 0.95, 2.1), [False, True]),
+        ((1.95, 1.1, 2.0), [True, True]),
     ],
-)  # fmt: skip
+)
 def test_derivatives_are_those_of_finite_differences(orders, passes) -> None:
     rng = np.random.default_rng(1)
 
@@ -189,11 +192,21 @@ def test_derivatives_are_those_of_finite_differences(orders, passes) -> None:
 
     # Free orders are alpha and gamma of the hub and that of the hub in the link; the link's stiffness is a product.
     laws = [
-        (0, order(0.0, 0), [(1, order(0.2), (1.0, [(0, 1)])), (0, order(0.0, 1), (-1.0, [(1, 1)])),
-                            (2, order(0.0), (1.0, [(2, 1)]))]),
-        (1, order(2.0), [(0, order(0.0, 2), (-1.0, [])), (1, order(0.2), (-1.0, [(0, 1), (3, 1)])),
-                         (1, order(0.8), (-1.0, [(4, 1)]))]),
-    ]  # fmt: skip
+        (
+            0,
+            order(0.0, 0),
+            [(1, order(0.2), (1.0, [(0, 1)])), (0, order(0.0, 1), (-1.0, [(1, 1)])), (2, order(0.0), (1.0, [(2, 1)]))],
+        ),
+        (
+            1,
+            order(2.0),
+            [
+                (0, order(0.0, 2), (-1.0, [])),
+                (1, order(0.2), (-1.0, [(0, 1), (3, 1)])),
+                (1, order(0.8), (-1.0, [(4, 1)])),
+            ],
+        ),
+    ]
     # What a filter of the second order holds are two states more of each output that passes it.
     each = 6 if passes is None else 6 + 2 * sum(passes)
     count, states = 9, 2 * each
@@ -202,9 +215,19 @@ def test_derivatives_are_those_of_finite_differences(orders, passes) -> None:
 
     def at(point):
         return _core.friction_error(
-            runs, laws, [(0, law)], [(1.05, 2.0), (0.0, 1.5), (0.0, 2.5)], ["plain"] * 6, begun, list(point[:3]),
-            list(point[3:count]), [], [list(point[count : count + each]), list(point[count + each :])], 1, 1e-9,
-        )  # fmt: skip
+            runs,
+            laws,
+            [(0, law)],
+            [(1.05, 2.0), (0.0, 1.5), (0.0, 2.5)],
+            ["plain"] * 6,
+            begun,
+            list(point[:3]),
+            list(point[3:count]),
+            [],
+            [list(point[count : count + each]), list(point[count + each :])],
+            1,
+            1e-9,
+        )
 
     plain = [0.02, -0.3, 0.01, 0.2, 0.4, 0.1, -0.05, 0.1, 0.02, -0.3, 0.3, -0.1]
     starts = [v for run in (plain[:6], plain[6:]) for v in (*run, *rng.normal(scale=0.01, size=each - 6))]
@@ -220,9 +243,9 @@ def test_several_equations_with_friction_follow_each_other() -> None:
     structure = ftlm.equation(WORDS)
     assert structure.coupling == "simulated"
     assert ftlm.equation(WORDS.replace(" - fc*sign(D x)", "")).coupling == "measured"
-    assert structure.sticks == (0,)
+    assert structure.friction_equations == (0,)
     turned = ftlm.equation("; ".join(reversed(WORDS.split("; "))))
-    assert turned.sticks == (1,)
+    assert turned.friction_equations == (1,)
     t = np.arange(401) * 0.01
     run = run_of(force(t), 0 * t, 0 * t, 0.01)
     first = ftlm.Model(ftlm.equation(WORDS, fixed={**TRUTH, "fc": 4.0})).simulate(run)
@@ -251,7 +274,7 @@ def test_what_is_not_followed_is_refused(make, said: str) -> None:
 @pytest.mark.parametrize("cross", [False, "torques", "inertial"])
 def test_hubs_keep_their_friction_beside_the_other_stage(cross) -> None:
     structure = ftlm.flexible_link(stage="both", coupling="simulated", friction=True, cross_stage=cross)
-    assert structure.sticks == (0, 2)
+    assert structure.friction_equations == (0, 2)
 
 
 def test_friction_is_named() -> None:
@@ -259,8 +282,9 @@ def test_friction_is_named() -> None:
     assert str(named) == str(ftlm.flexible_link(stage="both", coupling="simulated", friction=True))
     near = ftlm.flexible_link(stage="both", coupling="simulated", friction="stribeck")
     assert [f.names for e in near.equations if (f := e.friction) is not None] == [
-        ("fc1", "fs1", "vs1"), ("fc2", "fs2", "vs2"),
-    ]  # fmt: skip
+        ("fc1", "fs1", "vs1"),
+        ("fc2", "fs2", "vs2"),
+    ]
     # The hub holds at rest what it takes at speed and more, until 0.5 A push it away.
     values = {"a1": 628.0, "b1": -62.0, "d1": 2.0, "g1": 140.0, "a2": -235.5, "d2": -0.75}
     t = np.arange(201) * 0.005
@@ -286,7 +310,7 @@ def test_friction_is_named() -> None:
         ({"cross_damping": 1}, "cross_damping = 1 is neither True nor False"),
         ({"cross_sensitivity": "inertial"}, "cross_sensitivity = 'inertial' is neither True nor False"),
     ],
-)  # fmt: skip
+)
 def test_words_that_mean_nothing_are_refused_by_the_link(options, said: str) -> None:
     with pytest.raises(ModelError, match=said):
         ftlm.flexible_link(**options)
@@ -386,7 +410,7 @@ def test_the_arm_is_identified_by_the_natural_call() -> None:
     clean = model.simulate(ftlm.Run.from_arrays(step=0.004, inputs={"I1": current}, outputs=zeros))
     noisy = {n: clean[n] + 0.003 * np.std(clean[n]) * rng.standard_normal(t.size) for n in zeros}
     run = ftlm.Run.from_arrays(step=0.004, inputs={"I1": current}, outputs=noisy)
-    found = ftlm.identify(run, structure, threads=1).joint
+    found = ftlm.identify(run, structure, threads=1).fit
     for name, value in zip(found.names, found.values.tolist(), strict=True):
         assert abs(value - {**orders, **free}[name]) < 4.0 * found.standard_errors[name], name
 

@@ -14,7 +14,7 @@ import ftlm
 import plants
 from ftlm import _core, cli
 from ftlm.estimation.free_parameters import FreeProblem
-from ftlm.estimation.objective import Attempt, descend, experiment
+from ftlm.estimation.objective import Iterate, minimize_cost, sample_run
 from ftlm.estimation.output_error import fit_output_error
 from laws import laws
 
@@ -93,9 +93,9 @@ def test_an_input_that_is_linear_in_between_is_delayed_to_second_order():
     for every in (1, 2, 4):
         problem = FreeProblem.of(structure())
         run = late_run(DELAY, 200, 0, held=False)
-        prepared = [experiment(run, problem, [1.0], every=every)]
-        start = Attempt([2.2, 0.9], [plants.THREE_TERMS[n] for n in ("a1", "a0", "b0")], "truth", {}, [DELAY])
-        end = descend(problem, prepared, start, evaluations=40, plain=True)
+        prepared = [sample_run(run, problem, [1.0], every=every)]
+        start = Iterate([2.2, 0.9], [plants.THREE_TERMS[n] for n in ("a1", "a0", "b0")], "truth", {}, [DELAY])
+        end = minimize_cost(problem, prepared, start, evaluations=40, plain=True)
         errors.append(abs(end.inputs[0] - DELAY))
     assert errors[0] < 0.02 * plants.clean_run("3T").step
     assert errors[2] < errors[0] / 6
@@ -152,7 +152,7 @@ def test_other_methods_refuse_a_free_delay(method):
     with pytest.raises(ftlm.ModelError, match=r"the delay of u is free: only method='output-error'.*give its value"):
         ftlm.identify(plants.noisy_run("3T", 40, 5), fixed, method=method)
     with pytest.raises(ftlm.ModelError, match="the delay of u is free"):
-        ftlm.search_orders(plants.noisy_run("3T", 40, 5), structure(), ftlm.lattice(step=0.2))
+        ftlm.search_orders(plants.noisy_run("3T", 40, 5), structure(), ftlm.order_grid(step=0.2))
 
 
 @pytest.mark.parametrize(
@@ -184,13 +184,22 @@ def test_a_model_has_no_free_delay_and_no_second_name():
 
 def test_the_core_refuses_delays_that_are_none():
     problem = FreeProblem.of(structure())
-    prepared = [experiment(plants.noisy_run("3T", 40, 5), problem, [1.0])]
+    prepared = [sample_run(plants.noisy_run("3T", 40, 5), problem, [1.0])]
 
     def core(delays):
         return _core.output_error(
-            prepared, laws(problem), list(problem.bounds), ["plain"] * 3, False, (False, []),
-            [2.2, 0.9], [-0.6, -1.2, 1.2], [(s, "delay", ends, v) for s, ends, v in delays], 1, 1e-9,
-        )  # fmt: skip
+            prepared,
+            laws(problem),
+            list(problem.bounds),
+            ["plain"] * 3,
+            False,
+            (False, []),
+            [2.2, 0.9],
+            [-0.6, -1.2, 1.2],
+            [(s, "delay", ends, v) for s, ends, v in delays],
+            1,
+            1e-9,
+        )
 
     for delays in ([(0, (0.0, 0.1), 0.0)], [(7, (0.0, 0.1), 0.0)], [(1, (0.2, 0.1), 0.1)], [(1, (0.0, 0.1), np.nan)]):
         with pytest.raises(ftlm.ModelError):

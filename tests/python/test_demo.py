@@ -11,9 +11,15 @@ from ftlm.reproduction.report import demo_details, demo_page, demo_text
 def test_the_demo_is_one_screen_and_its_page_leads_with_the_verdicts(tmp_path, monkeypatch):
     told, named = [], []
     demo = run_demo(
-        tmp_path, step=0.35, noise=1e-4, seed=1, threads=None, force=False, say=named.append,
+        tmp_path,
+        step=0.35,
+        noise=1e-4,
+        seed=1,
+        threads=None,
+        force=False,
+        say=named.append,
         progress=lambda *done: told.append(done),
-    )  # fmt: skip
+    )
     lines = demo_text(demo).splitlines()
     # With what is said beforehand, what was written and the prompt.
     assert len(lines) + 4 <= 40

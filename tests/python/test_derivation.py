@@ -290,9 +290,13 @@ def coefficients(stage, parameters):
     """Evaluate the coefficients of (17), (19) or (20), (21), named a1 … g4, from physical parameters."""
     arm = Stage(stage)
     values = {
-        arm.Ks: parameters["Ks"], arm.J1: parameters["J1"], arm.J2: parameters["J2"],
-        arm.B1: parameters["B1"], arm.B2: parameters["B2"], arm.Kt: parameters["Kt"],
-    }  # fmt: skip
+        arm.Ks: parameters["Ks"],
+        arm.J1: parameters["J1"],
+        arm.J2: parameters["J2"],
+        arm.B1: parameters["B1"],
+        arm.B2: parameters["B2"],
+        arm.Kt: parameters["Kt"],
+    }
     hub, link = (sp.expand(equation) for equation in arm.solved())
     # Each of K_s, B_1, B_2, K_tau marks one term; s and the signals set to 1 leave its coefficient.
     terms = {
@@ -312,21 +316,54 @@ def coefficients(stage, parameters):
 @pytest.mark.parametrize(
     ("stage", "expected"),
     [
-        (1, {"a1": "628.889", "b1": "-62.956", "g1": "140.471", "a2": "-863.333", "b2": "62.956", "g2": "-140.471",
-             "d1": "0.000", "d2": "0.000"}),
-        (2, {"a3": "2271.117", "b3": "-496.763", "d3": "28.351", "g3": "288.122", "a4": "-3336.200", "b4": "496.763",
-             "d4": "-41.647", "g4": "-288.122"}),
+        (
+            1,
+            {
+                "a1": "628.889",
+                "b1": "-62.956",
+                "g1": "140.471",
+                "a2": "-863.333",
+                "b2": "62.956",
+                "g2": "-140.471",
+                "d1": "0.000",
+                "d2": "0.000",
+            },
+        ),
+        (
+            2,
+            {
+                "a3": "2271.117",
+                "b3": "-496.763",
+                "d3": "28.351",
+                "g3": "288.122",
+                "a4": "-3336.200",
+                "b4": "496.763",
+                "d4": "-41.647",
+                "g4": "-288.122",
+            },
+        ),
     ],
-)  # fmt: skip
+)
 def test_effective_parameters_give_the_integer_rows(stage, expected):
     found = coefficients(stage, EFFECTIVE[stage])
     for name, digits in expected.items():
         assert abs(found[name] - float(digits)) <= 0.0005, name
     # Tables 4 and 5 print two decimals (b1, b2 three); a4 alone is off, by 0.02.
     printed = {
-        "a1": 628.89, "b1": -62.956, "g1": 140.47, "a2": -863.33, "b2": 62.956, "g2": -140.47,
-        "a3": 2271.12, "b3": -496.76, "d3": 28.35, "g3": 288.12, "b4": 496.76, "d4": -41.65, "g4": -288.12,
-    }  # fmt: skip
+        "a1": 628.89,
+        "b1": -62.956,
+        "g1": 140.47,
+        "a2": -863.33,
+        "b2": 62.956,
+        "g2": -140.47,
+        "a3": 2271.12,
+        "b3": -496.76,
+        "d3": 28.35,
+        "g3": 288.12,
+        "b4": 496.76,
+        "d4": -41.65,
+        "g4": -288.12,
+    }
     for name in found.keys() & printed.keys():
         assert abs(found[name] - printed[name]) <= 0.0051, name
     if stage == 2:

@@ -57,8 +57,11 @@ def test_the_commands_of_the_tutorial_run(tmp_path: Path) -> None:
     for command in commands_of(blocks(tutorial, "sh")[-1]):
         ran = subprocess.run(
             [sys.executable, "-m", "ftlm", *shlex.split(command)[1:]],
-            cwd=tmp_path, capture_output=True, text=True, check=False,
-        )  # fmt: skip
+            cwd=tmp_path,
+            capture_output=True,
+            text=True,
+            check=False,
+        )
         assert ran.returncode == 0, command + ran.stdout + ran.stderr
     assert (tmp_path / "model.html").exists()
 
@@ -111,8 +114,12 @@ def test_the_notebooks_run(notebook: Path, tmp_path: Path) -> None:
     )
     ran = subprocess.run(
         [sys.executable, "-c", script, str(notebook)],
-        cwd=tmp_path, capture_output=True, text=True, check=False, env={**wide(), "IPYTHONDIR": str(tmp_path)},
-    )  # fmt: skip
+        cwd=tmp_path,
+        capture_output=True,
+        text=True,
+        check=False,
+        env={**wide(), "IPYTHONDIR": str(tmp_path)},
+    )
     assert ran.returncode == 0, ran.stderr[-3000:]
     rich, pictures = map(int, ran.stdout.split())
     assert rich >= 3

@@ -7,10 +7,10 @@ import pytest
 
 import ftlm
 from ftlm.arm.energy_balance import power
-from ftlm.arm.flexible_link import PARAMETERS
+from ftlm.arm.flexible_link import PARAMETER_SETS
 
 FRACTIONAL = {"gamma1": 0.95, "beta2": 0.1, "mu2": 0.85}
-LINK = replace(PARAMETERS["effective"][1], link_friction=0.4)
+LINK = replace(PARAMETER_SETS["effective"][1], link_friction=0.4)
 
 
 def run_of(orders, samples):

@@ -9,7 +9,7 @@ from hypothesis import strategies as st
 
 import ftlm
 from ftlm import _core
-from ftlm.utils.validation import real_number, shown, whole_number, words_of
+from ftlm.utils.validation import error_text, real_number, short_repr, whole_number
 
 N = 65
 U = np.where(np.arange(N) % 20 < 10, 1.0, -1.0)
@@ -35,7 +35,7 @@ def identify(runs=None, words="D^1.5 y = a y + b u", **options):
 
 
 def search(runs=None, words=WORDS, lattice=None, **options):
-    chosen = ftlm.lattice(step=0.5) if lattice is None else lattice
+    chosen = ftlm.order_grid(step=0.5) if lattice is None else lattice
     return ftlm.search_orders(run() if runs is None else runs, ftlm.equation(words), chosen, **{"m": 64} | options)
 
 
@@ -50,8 +50,8 @@ BAD = {
     "alpha of 0": (MODEL, "order alpha = 0 of y", lambda: ftlm.equation("D^0 y = a u")),
     "alpha above 10": (MODEL, "order alpha = 10.01 of y", lambda: ftlm.equation("D^10.01 y = a u")),
     "alpha below 0": (MODEL, "order alpha = -1 of y", lambda: ftlm.equation("D^(-1) y = a u")),
-    "alpha above 10 in a lattice": (MODEL, "order alpha = 10.5", lambda: ftlm.lattice(alpha=(1.0, 10.5))),
-    "alpha of 0 in a lattice": (MODEL, "alpha interval 0:2", lambda: ftlm.lattice(alpha=(0.0, 2.0))),
+    "alpha above 10 in a lattice": (MODEL, "order alpha = 10.5", lambda: ftlm.order_grid(alpha=(1.0, 10.5))),
+    "alpha of 0 in a lattice": (MODEL, "alpha interval 0:2", lambda: ftlm.order_grid(alpha=(0.0, 2.0))),
     "alpha above 10 by name": (
         MODEL,
         "order alpha = 11",
@@ -85,25 +85,25 @@ BAD = {
     "lattice of zero": (
         MODEL,
         "the lattice holds no candidate",
-        lambda: search(lattice=ftlm.lattice(alpha=(0.5, 0.6), beta=[1.0, 2.0])),
+        lambda: search(lattice=ftlm.order_grid(alpha=(0.5, 0.6), beta=[1.0, 2.0])),
     ),
     "lattice of 10^9": (
         MODEL,
         "more than the limit of",
-        lambda: search(words="D^alpha y = a D^b y + c D^e y + d D^f y + u", lattice=ftlm.lattice(step=0.001)),
+        lambda: search(words="D^alpha y = a D^b y + c D^e y + d D^f y + u", lattice=ftlm.order_grid(step=0.001)),
     ),
-    "lattice with a step of 0": (MODEL, "order alpha: step 0 is not positive", lambda: ftlm.lattice(step=0)),
+    "lattice with a step of 0": (MODEL, "order alpha: step 0 is not positive", lambda: ftlm.order_grid(step=0)),
     "lattice of an unknown order": (
         MODEL,
         "lattice order 'betta' is no free order; free are alpha, beta",
-        lambda: search(lattice=ftlm.lattice(betta=1.0)),
+        lambda: search(lattice=ftlm.order_grid(betta=1.0)),
     ),
     "lattice upside down": (
         MODEL,
         "order beta: interval 1:0 is empty",
-        lambda: search(lattice=ftlm.lattice(beta=(1, 0))),
+        lambda: search(lattice=ftlm.order_grid(beta=(1, 0))),
     ),
-    "lattice of a million steps": (MODEL, "order alpha: 1.05:2:1e-09", lambda: ftlm.lattice(step=1e-9)),
+    "lattice of a million steps": (MODEL, "order alpha: 1.05:2:1e-09", lambda: ftlm.order_grid(step=1e-9)),
     "nothing to search": (MODEL, "every order is a number", lambda: search(words="D^1.5 y = a y + b u")),
     # Pulses
     "m above what the data carry": (
@@ -389,11 +389,27 @@ def test_families():
 @pytest.mark.parametrize(
     ("value", "whole"),
     [
-        (3, 3), (0, 0), (-2, -2), (3.0, 3), (np.int8(5), 5), (np.float64(7), 7), (10**40, 10**40), (3.5, None),
-        (True, None), ("3", None), (b"3", None), (None, None), (math.nan, None), (math.inf, None), ([3], None),
-        (3 + 0j, None), (np.complex64(3), None), (np.bool_(True), None), (np.array(3), 3),
+        (3, 3),
+        (0, 0),
+        (-2, -2),
+        (3.0, 3),
+        (np.int8(5), 5),
+        (np.float64(7), 7),
+        (10**40, 10**40),
+        (3.5, None),
+        (True, None),
+        ("3", None),
+        (b"3", None),
+        (None, None),
+        (math.nan, None),
+        (math.inf, None),
+        ([3], None),
+        (3 + 0j, None),
+        (np.complex64(3), None),
+        (np.bool_(True), None),
+        (np.array(3), 3),
     ],
-)  # fmt: skip
+)
 def test_whole_numbers(value, whole):
     assert whole_number(value) == whole
     assert type(whole_number(value)) in (int, type(None))
@@ -408,11 +424,19 @@ def test_real_numbers(value):
 @pytest.mark.parametrize(
     ("value", "words"),
     [
-        ("1", "'1'"), (None, "None"), (True, "True"), (1j, "1j"), ([1], "[1]"), (10**400, "an integer of 1329 bits"),
-        pytest.param(10**5000, "an integer of 16610 bits", id="beyond decimals"), ("x" * 200, "'" + "x" * 59 + "…"),
-        (np.complex64(1), "np.complex64(1+0j)"), (np.array(1 + 2j), "array(1.+2.j)"), (np.bool_(True), "np.True_"),
+        ("1", "'1'"),
+        (None, "None"),
+        (True, "True"),
+        (1j, "1j"),
+        ([1], "[1]"),
+        (10**400, "an integer of 1329 bits"),
+        pytest.param(10**5000, "an integer of 16610 bits", id="beyond decimals"),
+        ("x" * 200, "'" + "x" * 59 + "…"),
+        (np.complex64(1), "np.complex64(1+0j)"),
+        (np.array(1 + 2j), "array(1.+2.j)"),
+        (np.bool_(True), "np.True_"),
     ],
-)  # fmt: skip
+)
 def test_what_is_no_real_number_is_refused(value, words):
     with pytest.raises(ftlm.ModelError) as refused:
         real_number("the step", value)
@@ -426,10 +450,10 @@ def test_what_others_say_is_shown_whatever_it_is():
 
         __str__ = __repr__
 
-    seen = [shown(v) for v in (1.5, -(10**5000), MuteError(), "\ud800")]
+    seen = [short_repr(v) for v in (1.5, -(10**5000), MuteError(), "\ud800")]
     assert seen == ["1.5", "an integer of 16610 bits", "a MuteError", r"'\ud800'"]
-    assert shown("x" * 100, 10) == "'xxxxxxxxx…"
-    said = [words_of(e, 10) for e in (ValueError("why"), MuteError(), ValueError("\ud800"), ValueError("x" * 10**6))]
+    assert short_repr("x" * 100, 10) == "'xxxxxxxxx…"
+    said = [error_text(e, 10) for e in (ValueError("why"), MuteError(), ValueError("\ud800"), ValueError("x" * 10**6))]
     assert said == ["why", "what it says cannot be read", r"\ud800", "x" * 10 + "…"]
 
 
@@ -466,11 +490,20 @@ def hostile_calls(order, alpha, step, signal, output, values, coefficient, expon
         lambda: _core.explicit_euler(means, step, [(structure, [coefficient, 1.0])], inputs),
         lambda: _core.trace_errors(rec, structure, inputs, np.array([[coefficient, 1.0]])),
         lambda: _core.search(
-            [rec], (output, [alpha, order], [(signal, [order, alpha], True)]), inputs, [None], (False, exponents),
-            ("output-error", "l1", 0, 1.0, False, 5, 1, True, 2, 1 << 31), None,
+            [rec],
+            (output, [alpha, order], [(signal, [order, alpha], True)]),
+            inputs,
+            [None],
+            (False, exponents),
+            ("output-error", "l1", 0, 1.0, False, 5, 1, True, 2, 1 << 31),
+            None,
         ),
         lambda: _core.OrderSearch(
-            [rec], (output, [alpha, order], [(signal, [order, alpha], True)]), inputs, [None], (False, exponents),
+            [rec],
+            (output, [alpha, order], [(signal, [order, alpha], True)]),
+            inputs,
+            [None],
+            (False, exponents),
             ("equation-error", "l2", 2, coefficient, True, 5, 1, True, 0, 1 << 31),
         ).rounds(0, signal, [(output, coefficient)], None, 1, None, None),
         lambda: _core.filter_series([(coefficient, order)], [(1.0, alpha)], 8, step),
@@ -482,7 +515,7 @@ def hostile_calls(order, alpha, step, signal, output, values, coefficient, expon
         lambda: _core.metrics(means[0], means[1]),
         lambda: _core.nyquist_margin([(coefficient, order)], step),
         lambda: _core.block_pulse_kernel(order, 9, step, derivative=True),
-    )  # fmt: skip
+    )
     for k, call in enumerate(calls):
         try:
             call()

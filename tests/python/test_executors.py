@@ -28,7 +28,7 @@ def run(small_run, with_noise):
 def search(run, executor=None, *, lattice=None, **options):
     options = {"m": 32, "early_stopping": False, **options}
     equation = ftlm.equation(EQUATION, initial="rest")
-    return ftlm.search_orders(run, equation, lattice or ftlm.lattice(step=0.1), executor=executor, **options)
+    return ftlm.search_orders(run, equation, lattice or ftlm.order_grid(step=0.1), executor=executor, **options)
 
 
 def bytes_of(found):
@@ -42,7 +42,7 @@ def expected(run):
 
 @pytest.fixture(autouse=True)
 def forget():
-    rounds._ready.clear()
+    rounds._cached_searches.clear()
 
 
 @contextlib.contextmanager
@@ -90,7 +90,7 @@ def test_threads_give_the_same_bytes(run, expected):
         {"early_stopping": True},
         {"early_stopping": True, "criterion": "equation-error", "norm": "l2", "rows": "time"},
         {"coefficients": "least-squares", "norm": "l2", "keep": 3},
-        {"early_stopping": True, "coefficients": "instrumental-variables", "lattice": ftlm.lattice(step=0.2)},
+        {"early_stopping": True, "coefficients": "instrumental-variables", "lattice": ftlm.order_grid(step=0.2)},
     ],
 )
 def test_every_kind_of_search_gives_the_same_bytes(run, options):
@@ -162,14 +162,16 @@ def test_a_worker_keeps_few_searches_ready(run):
     with ThreadPoolExecutor(1) as pool:
         for m in (16, 32, 64):
             search(run, pool, m=m)
-    assert len(rounds._ready) == rounds.READY
+    assert len(rounds._cached_searches) == rounds.MAX_CACHED_SEARCHES
 
 
 def test_an_error_of_the_search_is_the_one_of_one_machine(run):
     with ThreadPoolExecutor(2) as pool:
         for here in (None, pool):
             with pytest.raises(ModelError, match=r"order 0\.7 of u is above alpha = 0\.5"):
-                search(run, here, lattice=ftlm.Lattice(orders={"alpha": [0.5], "nu": [0.7], "beta": [0.1], "mu": [0]}))
+                search(
+                    run, here, lattice=ftlm.OrderGrid(orders={"alpha": [0.5], "nu": [0.7], "beta": [0.1], "mu": [0]})
+                )
 
 
 def test_an_executor_that_is_closed_is_said(run):
@@ -189,7 +191,7 @@ def stage_run(plant, drive, with_noise):
 
 
 def search_stage(run, executor=None, **options):
-    lattice = ftlm.Lattice(step=0.1, orders={"alpha": (1.8, 2.0)})
+    lattice = ftlm.OrderGrid(increment=0.1, orders={"alpha": (1.8, 2.0)})
     options = {"m": 64, "keep": 8, "coefficients": "least-squares", **options}
     return ftlm.search_orders(run, ftlm.flexible_link(form="published"), lattice, executor=executor, **options)
 
@@ -222,7 +224,12 @@ def test_spawned_processes_give_the_same_bytes_of_a_stage_and_resume(stage_run, 
 @pytest.mark.parametrize("laws", [(), ("orders", "coefficients")])
 def test_an_identification_by_the_lattice_shares_its_searches_out(stage_run, laws):
     structure = ftlm.flexible_link(form="published", laws=laws, coupling="measured")
-    options = {"method": "least-squares", "lattice": ftlm.Lattice(step=0.3, alpha=(1.8, 2.0)), "m": 64, "keep": 5}
+    options = {
+        "method": "least-squares",
+        "lattice": ftlm.OrderGrid(increment=0.3, alpha=(1.8, 2.0)),
+        "m": 64,
+        "keep": 5,
+    }
     with ThreadPoolExecutor(2) as pool:
         found = ftlm.identify(stage_run, structure, executor=pool, **options)
     assert json.dumps(found.to_dict()) == json.dumps(ftlm.identify(stage_run, structure, **options).to_dict())
@@ -238,8 +245,11 @@ def test_of_a_stage_the_record_is_sent_once_and_tasks_are_ranges(stage_run, stag
     assert bytes_of(search_stage(stage_run, pool)) == stage_expected
     assert pool.carried == 1
     spans = [span for _, _, some, _ in pool.tasks for span in some]
-    assert all(first < last and (equation, len(span)) in {(0, 4), (1, 4)}
-               for span in spans for equation, first, last, _ in [span])  # fmt: skip
+    assert all(
+        first < last and (equation, len(span)) in {(0, 4), (1, 4)}
+        for span in spans
+        for equation, first, last, _ in [span]
+    )
     assert len(pickle.dumps(pool.tasks[-1])) < 10_000
     with pytest.raises(ConvergenceError, match="the network is down"):
         search_stage(stage_run, Counting(fail=range(2, 50)))
@@ -285,7 +295,7 @@ def test_a_cluster_gives_the_same_bytes_of_a_stage(stage_run, stage_expected, tm
 
 @pytest.mark.slow
 def test_ten_million_candidates_on_a_cluster_that_loses_a_worker(run, tmp_path):
-    options = {"lattice": ftlm.lattice(step=0.0205), "m": 256, "early_stopping": True}
+    options = {"lattice": ftlm.order_grid(step=0.0205), "m": 256, "early_stopping": True}
     began = time.monotonic()
     whole = search(run, **options, threads=2)
     alone = time.monotonic() - began

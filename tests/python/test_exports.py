@@ -81,9 +81,13 @@ def test_systems_of_python_control_become_models():
     rng = np.random.default_rng(5)
     w = np.geomspace(0.05, 50, 40)
     states = control.ss(
-        rng.standard_normal((4, 4)) - 3 * np.eye(4), rng.standard_normal((4, 2)), rng.standard_normal((2, 4)),
-        [[0, 0.5], [0, 0]], inputs=["force", "torque"], outputs=["x", "angle"],
-    )  # fmt: skip
+        rng.standard_normal((4, 4)) - 3 * np.eye(4),
+        rng.standard_normal((4, 2)),
+        rng.standard_normal((2, 4)),
+        [[0, 0.5], [0, 0]],
+        inputs=["force", "torque"],
+        outputs=["x", "angle"],
+    )
     made = ftlm.Model.from_control(states)
     assert list(made.outputs) == ["x", "angle"]
     np.testing.assert_allclose(made.frequency_response(w), states(1j * w), rtol=1e-9)
@@ -103,15 +107,18 @@ def test_systems_of_python_control_become_models():
 @pytest.mark.parametrize(
     ("system", "options", "words"),
     [
-        (control.tf([1], [1, 0.5], 0.1), {}, "sampled"), (control.tf([3], [1]), {}, "order 0"),
-        (3.0, {}, "float is no system"), (control.tf([1, 0, 0], [1, 1]), {}, "more zeros than poles"),
-        (control.tf([0], [1, 1]), {}, "order 0"), (control.tf([1], [1, 1]), {"inputs": ["a", "b"]}, "2 given"),
+        (control.tf([1], [1, 0.5], 0.1), {}, "sampled"),
+        (control.tf([3], [1]), {}, "order 0"),
+        (3.0, {}, "float is no system"),
+        (control.tf([1, 0, 0], [1, 1]), {}, "more zeros than poles"),
+        (control.tf([0], [1, 1]), {}, "order 0"),
+        (control.tf([1], [1, 1]), {"inputs": ["a", "b"]}, "2 given"),
         (control.tf([1], [1, 1]), {"inputs": ["y"]}, "input and output at once"),
         (control.tf([1], [1, 1]), {"inputs": ["a b"]}, "a b"),
         (control.frd([1, 2, 3], [1, 2, 3]), {}, "FrequencyData"),
         (control.tf([1], np.poly(-np.arange(1, 12))), {}, "order 11"),
     ],
-)  # fmt: skip
+)
 def test_systems_that_are_no_equations_are_refused(system, options, words):
     with pytest.raises(ftlm.ModelError, match=words):
         ftlm.Model.from_control(system, **options)
@@ -127,12 +134,15 @@ def test_a_poor_approximation_warns_about_margins():
 @pytest.mark.parametrize(
     ("options", "words"),
     [
-        ({"band": (0, 1)}, "is no interval"), ({"band": (2, 1)}, "is no interval"), ({"band": 3}, "no pair"),
-        ({"band": (1, np.inf)}, "is no interval"), ({"band": (1, 2, 3)}, "no pair"),
+        ({"band": (0, 1)}, "is no interval"),
+        ({"band": (2, 1)}, "is no interval"),
+        ({"band": 3}, "no pair"),
+        ({"band": (1, np.inf)}, "is no interval"),
+        ({"band": (1, 2, 3)}, "no pair"),
         ({"band": (1, 2), "order": 0}, "no whole number from 1 to 50"),
         ({"band": (1, 2), "order": 51}, "no whole number from 1 to 50"),
     ],
-)  # fmt: skip
+)
 def test_bands_and_orders_that_are_none_are_refused(options, words):
     with pytest.raises(ftlm.ModelError, match=words):
         model(ONE).to_control(**options)

@@ -35,7 +35,7 @@ def test_the_last_point_of_a_line_is_the_one_that_bisection_finds() -> None:
         alpha = rng.uniform(0.5, 2.9)
         at = np.array([alpha, *rng.uniform(0.05, 0.95, 2) * (alpha - 0.01), *rng.standard_normal(4)])
         towards = at + rng.standard_normal(7) * 0.6
-        found = problem.feasible(at, towards)
+        found = problem.feasible_point(at, towards)
         assert holds(problem, found)
         low, high = 0.0, 1.0
         if not holds(problem, towards):
@@ -52,7 +52,7 @@ def test_a_constraint_that_already_binds_is_followed() -> None:
     problem = FreeProblem.of(ftlm.equation(WORDS))
     at = np.array([1.8, 0.5, 1.8, 0.1, -1.0, 0.2, 0.3])
     towards = at + np.array([-0.02, 0.01, 0.02, 0.05, 0.0, 0.0, 0.0])
-    found = problem.feasible(at, towards)
+    found = problem.feasible_point(at, towards)
     assert holds(problem, found)
     # alpha and gamma stay one; everything else goes where it was going.
     np.testing.assert_allclose(found[[0, 2]], [1.8, 1.8], atol=1e-9)
@@ -61,7 +61,7 @@ def test_a_constraint_that_already_binds_is_followed() -> None:
 
 def test_a_bound_that_already_binds_is_kept_alone() -> None:
     problem = FreeProblem.of(ftlm.equation("D^alpha y = a y + b u", orders={"alpha": "0.5:1.5:0.1"}))
-    found = problem.feasible(np.array([1.5, -1.0, 2.0]), np.array([1.6, -1.1, 2.2]))
+    found = problem.feasible_point(np.array([1.5, -1.0, 2.0]), np.array([1.6, -1.1, 2.2]))
     np.testing.assert_allclose(found, [1.5, -1.1, 2.2], rtol=1e-12)
 
 

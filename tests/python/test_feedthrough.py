@@ -15,9 +15,9 @@ from scipy.special import gamma
 import ftlm
 import loops
 from ftlm.estimation.free_parameters import FreeProblem
-from ftlm.estimation.objective import Attempt, Grid
+from ftlm.estimation.objective import Iterate, Objective
 from ftlm.estimation.output_error import JointFit, fit_output_error
-from ftlm.simulation.output_samples import sampled as one_grid
+from ftlm.simulation.output_samples import simulate_samples as one_grid
 
 STEP = 0.1
 #: (0.5 s + 1)/(s + 1): y' = 0.5 u' + u - y.
@@ -77,7 +77,7 @@ def test_a_cell_with_a_constant_phase_element_feeds_through(hold: str) -> None:
     scored = []
     for seed in range(4):
         found = ftlm.identify(loops.cell_run(800, 0.02, hold, seed, noise=0.01), loops.CELL_STRUCTURE)
-        scored.append([(found.joint_values[n] - v) / found.standard_errors[n] for n, v in loops.CELL.items()])
+        scored.append([(found.parameter_values[n] - v) / found.standard_errors[n] for n, v in loops.CELL.items()])
         assert found.standard_errors["d"] < 0.02
     assert np.max(np.abs(scored)) < 3.5
     assert np.mean(np.abs(scored) < 1.96) >= 0.8
@@ -87,7 +87,7 @@ def test_a_cell_with_a_constant_phase_element_feeds_through(hold: str) -> None:
 def test_a_cell_without_noise_is_itself(hold: str) -> None:
     found = ftlm.identify(loops.cell_run(400, 0.05, hold, 1, noise=0.0), loops.CELL_STRUCTURE)
     for name, value in loops.CELL.items():
-        assert found.joint_values[name] == pytest.approx(value, rel=2e-4)
+        assert found.parameter_values[name] == pytest.approx(value, rel=2e-4)
 
 
 def test_the_relaxation_of_the_cell_is_the_series_of_mittag_leffler() -> None:
@@ -96,11 +96,17 @@ def test_the_relaxation_of_the_cell_is_the_series_of_mittag_leffler() -> None:
         for alpha, rate in ((0.78, 1 / 3), (1.7, 4.0)):
             for integral, second in ((False, 1), (True, 2)):
                 exact = [
-                    float(x ** (second - 1) * mpmath.nsum(
-                        lambda k, x=x, alpha=alpha, rate=rate, second=second: (-rate * mpmath.mpf(x) ** alpha) ** k
-                        / mpmath.gamma(alpha * k + second), [0, mpmath.inf]))
+                    float(
+                        x ** (second - 1)
+                        * mpmath.nsum(
+                            lambda k, x=x, alpha=alpha, rate=rate, second=second: (
+                                (-rate * mpmath.mpf(x) ** alpha) ** k / mpmath.gamma(alpha * k + second)
+                            ),
+                            [0, mpmath.inf],
+                        )
+                    )
                     for x in map(float, t[:3])
-                ]  # fmt: skip
+                ]
                 np.testing.assert_allclose(
                     loops.relaxation(t[:3], alpha, rate, integral=integral), exact, rtol=1e-9, atol=1e-12
                 )
@@ -154,10 +160,10 @@ def test_samples_at_corners_are_read_to_second_order(alpha: float, order: float,
     fitted, free = [], []
     model = ftlm.Model(replace(ftlm.equation(f"D^{alpha} y = {a:g} y + 1 D^{order} u"), initial="rest"))
     for every in (8, 16, 32):
-        grid = Grid(problem, [run], [1.0 / scale], every)
+        grid = Objective(problem, [run], [1.0 / scale], every)
         values = {"a": a, "b": 1.0}
-        start = Attempt([], [values[n] for n in problem.coefficients], "truth", {})
-        fitted.append(float(np.max(np.abs(grid.evaluated(start).outcome["residuals"]))))
+        start = Iterate([], [values[n] for n in problem.coefficients], "truth", {})
+        fitted.append(float(np.max(np.abs(grid.evaluate(start).outcome["residuals"]))))
         free.append(float(np.max(np.abs(one_grid(model, run, every, None)[0][0] - truth)[1:-1])) / scale)
     for errors in (fitted, free):
         assert errors[-1] < 1e-3
@@ -175,11 +181,11 @@ def test_slopes_of_a_term_above_its_equation_are_those_of_differences(behind):
     problem = FreeProblem.of(
         ftlm.equation("D^alpha y = a y + b D^gamma u", initial="caputo", offset="none", sensor_filter=sensor)
     )
-    grid, point = Grid(problem, [run], [1.0]), np.array([1.3, 1.8])
+    grid, point = Objective(problem, [run], [1.0]), np.array([1.3, 1.8])
 
     def at(orders, evaluations):
-        start = Attempt(list(orders), [-4.0, 2.0], "here", {})
-        return grid.descend(start, evaluations, plain=True, held=[2, 3]).outcome
+        start = Iterate(list(orders), [-4.0, 2.0], "here", {})
+        return grid.minimize(start, evaluations, plain=True, held=[2, 3]).outcome
 
     there, shift = at(point, 1), 1e-4
     residuals = np.asarray(there["residuals"])

@@ -22,7 +22,7 @@ from ftlm.data.run import Run
 from ftlm.errors import DataError
 from ftlm.io import isolated_reader as apart
 from ftlm.io.dialect import Layout
-from ftlm.io.load import Options, load, run_from, wanted_of
+from ftlm.io.load import LoadOptions, load, run_from_tables, select_columns
 from ftlm.io.table import FileTable
 from measured import DATA, needs_data
 
@@ -98,7 +98,7 @@ def test_any_file_that_is_text_is_read_as_text(tmp_path, name):
 def test_a_file_of_many_blocks_is_read_whole(tmp_path, monkeypatch):
     path = write(tmp_path, "# note\nt,u,y\n" + rows(500))
     whole = load(path, **HEADED)
-    monkeypatch.setattr("ftlm.io.delimited_text._BLOCK", 97)
+    monkeypatch.setattr("ftlm.io.delimited_text._BLOCK_BYTES", 97)
     pieces = load(path, **HEADED)
     assert pieces["u"].tobytes() == whole["u"].tobytes()
     text = ("t,u,y\n" + rows(500)).replace("\n1.50,", "\n1.50,oops").replace("\n3.50,", "\n3.50,oops")
@@ -311,7 +311,7 @@ def test_bad_paths_are_refused(tmp_path, monkeypatch):
     for name in ("x.parquet", "x.PQ"):
         pytest.importorskip("pyarrow", reason="pyarrow is not here; pip install -r requirements-test.txt")
         messages(["damaged", "intact copy"], lambda name=name: load(write(tmp_path, b"PAR1", name)))
-    monkeypatch.setattr("ftlm.io.load._SIZE_LIMIT", 100)
+    monkeypatch.setattr("ftlm.io.load._MAX_FILE_BYTES", 100)
     messages(["square.csv", "more than the limit of 100"], lambda: load(path, **HEADED))
 
 
@@ -509,14 +509,14 @@ def damaged(content, seed):
     return bytes(flipped)
 
 
-def answered(paths, kind=apart.MATLAB):
+def answered(paths, kind=apart.MATLAB_FORMAT):
     """What becomes of files, read by as few children as live through them: tables, errors, or how a child ended."""
     found = {}
     told = json.dumps({"folders": [str(Path(m.__file__).parents[1]) for m in (np, scipy)], "sheet": None})
     while paths:
-        command = [sys.executable, "-I", str(apart._READER), kind.kind, told, *map(str, paths)]
+        command = [sys.executable, "-I", str(apart._READER_PATH), kind.kind, told, *map(str, paths)]
         done = subprocess.run(command, stdin=subprocess.DEVNULL, capture_output=True, timeout=120, check=False)
-        answers = apart._Answers(done.stdout)
+        answers = apart._ReaderOutput(done.stdout)
         for path in paths:
             try:
                 found[path] = answers.table(path, Layout())
@@ -542,8 +542,8 @@ def test_damaged_mat_files_give_a_run_or_a_data_error(tmp_path):
             with warnings.catch_warnings():
                 warnings.simplefilter("error")
                 try:
-                    wanted = wanted_of(None, None, None, {"u": "V.2"}, {"y": "V.3"}, None, None, None)
-                    text = f"{path.name} with {run_from([answer], wanted, Options()).length} rows"
+                    wanted = select_columns(None, None, None, {"u": "V.2"}, {"y": "V.3"}, None, None, None)
+                    text = f"{path.name} with {run_from_tables([answer], wanted, LoadOptions()).length} rows"
                 except DataError as error:
                     text = str(error)
         else:
@@ -598,19 +598,19 @@ def reader(folder, body):
 )
 def test_a_reader_that_dies_or_babbles_gives_a_data_error(tmp_path, monkeypatch, body, words):
     path = mat(tmp_path, V=table())
-    monkeypatch.setattr(apart, "_READER", reader(tmp_path, body))
-    monkeypatch.setattr(apart, "_READER_SECONDS", 1.0)
+    monkeypatch.setattr(apart, "_READER_PATH", reader(tmp_path, body))
+    monkeypatch.setattr(apart, "_READER_TIMEOUT_S", 1.0)
     messages(["x.mat", *words], lambda: load(path, outputs={"y": "V.3"}))
 
 
 def test_a_crash_names_the_file_that_caused_it(tmp_path, monkeypatch):
     paths = [mat(tmp_path, f"{name}.mat", **{name: table()}) for name in "abc"]
     body = "print('{}', flush=True)\nos.kill(os.getpid(), signal.SIGSEGV)"
-    monkeypatch.setattr(apart, "_READER", reader(tmp_path, body.replace("{}", '{"error": "e", "way_out": "w"}')))
+    monkeypatch.setattr(apart, "_READER_PATH", reader(tmp_path, body.replace("{}", '{"error": "e", "way_out": "w"}')))
     messages(["a.mat", "e; w"], lambda: load(paths, outputs={"y": "a.3"}))
     good = '{"arrays": [{"name": "a", "rows": 1, "columns": 1, "type": "float64"}], "skipped": {}}'
     body = f"sys.stdout.write('{good}\\\\n' + '\\\\0' * 8)\nsys.stdout.flush()\nos.kill(os.getpid(), signal.SIGSEGV)"
-    monkeypatch.setattr(apart, "_READER", reader(tmp_path, body.replace("\\\\", "\\")))
+    monkeypatch.setattr(apart, "_READER_PATH", reader(tmp_path, body.replace("\\\\", "\\")))
     messages(["b.mat", "signal 11"], lambda: load(paths, outputs={"y": "a"}))
 
 
@@ -677,7 +677,7 @@ def test_measured_csv_and_mat_agree():
     for name in from_csv.signals:
         np.testing.assert_allclose(from_csv[name], from_mat[name], rtol=0, atol=1e-6)
     with pytest.raises(DataError, match=r"'theta12' .* constant"):
-        from_csv.slice(0, 1.0).require_outputs(["theta12"])
+        from_csv.window(0, 1.0).require_outputs(["theta12"])
 
 
 @needs_data

@@ -52,8 +52,10 @@ def cart_run(level: float, rate: float, held: tuple[float, float], seed: int) ->
     fine, _ = friction.exact_cart(np.repeat(push, parts), STEP / parts, 1.0, 0.8, level, rate)
     _, read, _ = signal.lsim(
         ([[0.0, 1.0], [-(CORNER**2), -2.0 * DAMPING * CORNER]], [[0.0], [CORNER**2]], [[1.0, 0.0]], [[0.0]]),
-        fine[: (ROWS - 1) * parts + 1], np.arange((ROWS - 1) * parts + 1) * STEP / parts, X0=held,
-    )  # fmt: skip
+        fine[: (ROWS - 1) * parts + 1],
+        np.arange((ROWS - 1) * parts + 1) * STEP / parts,
+        X0=held,
+    )
     read = read[::parts]
     read += 0.005 * np.std(read) * rng.standard_normal(ROWS)
     return ftlm.Run.from_arrays(step=STEP, inputs={"u": push}, outputs={"y": read}, intersample={"u": "zoh"})
@@ -115,8 +117,9 @@ def test_a_cart_is_recovered_behind_its_filter(level: float, rate: float, held: 
 @pytest.mark.slow
 @pytest.mark.parametrize("names", ["q", "xq"])
 def test_both_bodies_are_recovered(names: str) -> None:
-    found = ftlm.identify(hub_run(names, seed=4), ftlm.equation(WORDS, sensor_filter=behind(*names), initial="rest"),
-                          threads=1)  # fmt: skip
+    found = ftlm.identify(
+        hub_run(names, seed=4), ftlm.equation(WORDS, sensor_filter=behind(*names), initial="rest"), threads=1
+    )
     for name, value in TRUTH.items():
         assert abs(found.coefficients[name] - value) < 4.0 * found.standard_errors[name], name
     assert min(found.fit_percent.values()) > 99.5
@@ -125,7 +128,7 @@ def test_both_bodies_are_recovered(names: str) -> None:
 def test_the_arm_s_hub_and_its_filtered_link(tmp_path) -> None:
     structure = ftlm.flexible_link(coupling="simulated", friction=True, sensor_filter="stock")
     assert structure.sensor_filter.signals == ("theta12",)
-    assert not structure.behind_filter
+    assert not structure.all_filtered
     orders = {"alpha1": 1.95, "gamma1": 0.97, "beta2": 0.05, "mu2": 0.9}
     values = {"a1": 628.0, "b1": -62.0, "d1": 2.0, "g1": 140.0, "fc1": 12.0, "a2": -235.5, "d2": -0.75}
     model = ftlm.Model(structure.with_orders(orders).with_coefficients(values), orders=orders)

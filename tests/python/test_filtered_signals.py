@@ -15,9 +15,9 @@ import friction
 import ftlm
 from ftlm.cli.options import StructureOptions
 from ftlm.estimation.free_parameters import FreeProblem
-from ftlm.estimation.objective import Attempt, Grid
+from ftlm.estimation.objective import Iterate, Objective
 from ftlm.estimation.output_error import fit_output_error
-from ftlm.simulation.initial_conditions import answers, exponential, without_held
+from ftlm.simulation.initial_conditions import filter_impulse_responses, matrix_exponential, remove_filter_transient
 from ftlm.utils.validation import Floats
 from ftlm.validation.comparison import compare_means
 
@@ -67,9 +67,11 @@ def measured(filtered: tuple[str, ...], *, together: bool = False, inertial: boo
 
 def run_of(signals: dict[str, Floats], inputs: tuple[str, ...] = ("u", "v"), *, step: float = STEP) -> ftlm.Run:
     return ftlm.Run.from_arrays(
-        step=step, inputs={n: signals[n] for n in inputs},
-        outputs={n: x for n, x in signals.items() if n not in inputs}, intersample=dict.fromkeys(inputs, "foh"),
-    )  # fmt: skip
+        step=step,
+        inputs={n: signals[n] for n in inputs},
+        outputs={n: x for n, x in signals.items() if n not in inputs},
+        intersample=dict.fromkeys(inputs, "foh"),
+    )
 
 
 def sensor(filtered: tuple[str, ...]) -> ftlm.SensorFilter | None:
@@ -112,7 +114,7 @@ def test_equations_that_follow_together_behind_filters(filtered):
 @pytest.mark.parametrize("filtered", [("y",), pytest.param(("v",), marks=pytest.mark.slow)], ids="+".join)
 def test_a_run_in_motion_starts_with_a_filter_in_motion(filtered):
     # What the filter holds of the time before the run is two free motions of it: an acceleration lets them through.
-    run = run_of(measured(filtered, inertial=True)).slice(1.7, None)
+    run = run_of(measured(filtered, inertial=True)).window(1.7, None)
     words = ftlm.equation(WORDS.replace("p v", "p D^2 v"), sensor_filter=sensor(filtered))
     found = ftlm.identify(run, words, method="output-error")
     for name, value in TRUTH.items():
@@ -151,9 +153,12 @@ def above_run(filtered: tuple[str, ...], begin: float, every: int) -> ftlm.Run:
     low = OMEGA**2 / (s**2 + 2 * ZETA * OMEGA * s + OMEGA**2)
     first, last = round(begin / STEP), round((begin + 5.0) / STEP)
     return run_of(
-        {n: np.fft.irfft(x * (low if n in filtered else 1.0), count)[first : last + 1 : every]
-         for n, x in (("u", u), ("v", v), ("y", y))}, step=STEP * every,
-    )  # fmt: skip
+        {
+            n: np.fft.irfft(x * (low if n in filtered else 1.0), count)[first : last + 1 : every]
+            for n, x in (("u", u), ("v", v), ("y", y))
+        },
+        step=STEP * every,
+    )
 
 
 @pytest.mark.parametrize("filtered", SUBSETS, ids="+".join)
@@ -179,15 +184,15 @@ def test_what_a_filter_held_is_told_from_what_came_in():
     came, moved = 0.3 - 0.8 * t, lsim(system, np.zeros(t.size), t, X0=[0.4, -1.7])[1]
     answer = lsim(system, came, t)[1]
     run = ftlm.Run.from_arrays(step=0.004, inputs={}, outputs={"v": answer + moved, "y": np.cos(t)})
-    np.testing.assert_allclose(without_held(run, words)["v"], answer, atol=1e-9)
-    np.testing.assert_array_equal(without_held(run, words)["y"], run["y"])
+    np.testing.assert_allclose(remove_filter_transient(run, words)["v"], answer, atol=1e-9)
+    np.testing.assert_array_equal(remove_filter_transient(run, words)["y"], run["y"])
     # From rest it held nothing.
     rest = replace(words, initial="rest")
-    np.testing.assert_array_equal(without_held(run, rest)["v"], run["v"])
+    np.testing.assert_array_equal(remove_filter_transient(run, rest)["v"], run["v"])
     # Noise leaves the first sample where it is, and little of the rest.
     noise = 1e-3 * np.random.default_rng(5).normal(size=t.size)
     noisy = ftlm.Run.from_arrays(step=0.004, inputs={}, outputs={"v": answer + moved + noise, "y": np.cos(t)})
-    left = without_held(noisy, words)["v"]
+    left = remove_filter_transient(noisy, words)["v"]
     assert left[0] == pytest.approx(0.0, abs=1e-12)
     np.testing.assert_allclose(left - answer - noise, 0.0, atol=5e-3)
 
@@ -198,7 +203,7 @@ def test_filters_of_any_speed_leave_numbers(frequency):
     low_pass = ftlm.SensorFilter.low_pass(("v",), frequency=frequency)
     words = ftlm.equation("D^1.5 y = a y + p D^2 v", sensor_filter=low_pass, initial="caputo")
     run = ftlm.Run.from_arrays(step=0.01, inputs={}, outputs={"v": np.cos(t) + 2.0, "y": np.sin(t)})
-    left, found = without_held(run, words)["v"], answers(low_pass, 2, 100, 0.01)
+    left, found = remove_filter_transient(run, words)["v"], filter_impulse_responses(low_pass, 2, 100, 0.01)
     assert np.abs(left).max() < 3.1
     if frequency > 1e5:
         # What it held is gone before the second sample.
@@ -214,7 +219,7 @@ def test_filters_of_any_speed_leave_numbers(frequency):
 def test_a_filters_answers_to_impulses_are_those_of_its_states():
     sensor_filter = ftlm.SensorFilter(("v",), ((6.0, 0.0),), ((2.0, 3.0), (5.0, 2.0), (7.0, 1.0), (3.0, 0.0)))
     m, step, fine = 40, 0.05, 20
-    found = answers(sensor_filter, 3, m, step)
+    found = filter_impulse_responses(sensor_filter, 3, m, step)
     system = [[0.0, 1.0, 0.0], [0.0, 0.0, 1.0], [-1.5, -3.5, -2.5]]
     t = (np.arange(m * fine) + 0.5) * step / fine
     begun = np.array([0.0, 0.0, 3.0])
@@ -223,10 +228,10 @@ def test_a_filters_answers_to_impulses_are_those_of_its_states():
         np.testing.assert_allclose(row, there.mean(axis=1), atol=1e-4)
         begun = np.array(system) @ begun
     np.testing.assert_allclose(
-        exponential(np.array(system) * 7.0), expm(np.array(system) * 7.0), rtol=1e-12, atol=1e-12
+        matrix_exponential(np.array(system) * 7.0), expm(np.array(system) * 7.0), rtol=1e-12, atol=1e-12
     )
     zero = ftlm.SensorFilter(("v",), ((1.0, 1.0), (6.0, 0.0)), ((1.0, 2.0), (5.0, 1.0), (7.0, 0.0)))
-    assert answers(zero, 1, m, step) is None
+    assert filter_impulse_responses(zero, 1, m, step) is None
 
 
 #: A hub and the elastic link on it; each drives the other, the current both.
@@ -297,7 +302,7 @@ def test_numbers_of_equations_that_follow_together_behind_filters_in_motion(name
 @pytest.mark.slow
 @pytest.mark.parametrize("filtered", [("y",), ("y", "z")], ids="+".join)
 def test_coupled_runs_in_motion_are_identified_from_their_own_start(filtered):
-    run = run_of(measured(filtered, together=True)).slice(1.7, None)
+    run = run_of(measured(filtered, together=True)).window(1.7, None)
     structure = replace(ftlm.equation(TOGETHER, sensor_filter=sensor(filtered)), coupling="simulated")
     found = ftlm.identify(run, structure, method="output-error")
     for name, value in (TRUTH | SECOND).items():
@@ -315,18 +320,18 @@ def test_slopes_beside_a_filter_in_motion_are_those_of_finite_differences():
     t, rng = np.arange(241) * 0.004, np.random.default_rng(1)
     outputs = {n: np.sin(9.0 * t + k) + rng.normal(size=t.size) for k, n in enumerate(("theta11", "theta12"))}
     run = ftlm.Run.from_arrays(step=0.004, inputs={"I1": np.sign(np.sin(7.0 * t))}, outputs=outputs)
-    grid = Grid(problem, [run], [1.0, 3.0], every=2)
+    grid = Objective(problem, [run], [1.0, 3.0], every=2)
     names = [*problem.orders, *problem.coefficients]
     point, count = np.array([(orders | numbers)[n] for n in names]), len(orders)
 
     def at(values):
-        attempt = Attempt(list(values[:count]), list(values[count:]), "here", {})
-        return grid.descend(attempt, 1, plain=True).outcome
+        attempt = Iterate(list(values[:count]), list(values[count:]), "here", {})
+        return grid.minimize(attempt, 1, plain=True).outcome
 
     base = at(point)
     # The hub's filter holds nothing, for it has none.
     bare = replace(grid, problem=FreeProblem.of(replace(structure, sensor_filter=None)))
-    without = bare.descend(Attempt(list(point[:count]), list(point[count:]), "here", {}), 1, plain=True).outcome
+    without = bare.minimize(Iterate(list(point[:count]), list(point[count:]), "here", {}), 1, plain=True).outcome
     held = [len(begun) for begun in base["initial"][0]], [len(begun) for begun in without["initial"][0]]
     assert [a - b for a, b in zip(*held, strict=True)] == [0, 2]
     weights = np.linalg.norm(base["jacobian"], axis=1)
@@ -353,7 +358,7 @@ def test_a_filter_that_holds_more_than_answers_to_impulses_is_refused_in_motion(
 
 @pytest.mark.parametrize("method", ["least-squares", "instrumental-variables"])
 def test_equation_errors_know_the_filters_state(method):
-    run = run_of(measured(("y",), inertial=True)).slice(1.7, None)
+    run = run_of(measured(("y",), inertial=True)).window(1.7, None)
     words = ftlm.equation(WORDS.replace("p v", "p D^2 v"), sensor_filter=sensor(("y",)))
     found = ftlm.identify(run, words, method=method, m=4096)
     for name, value in TRUTH.items():
@@ -459,16 +464,16 @@ def single(count: int, names: tuple[str, ...]) -> ftlm.Run:
 def test_a_link_whose_other_stage_was_not_measured_is_alone(capsys):
     both, alone = single(1, ("theta11", "theta12", "theta21", "theta22")), single(2, ("theta11", "theta12"))
     options = StructureOptions()
-    assert options.measured("arm:1", [both]) == options.structure("arm:1")
-    assert options.measured("arm", [alone]) == options.structure("arm")
+    assert options.structure_for_runs("arm:1", [both]) == options.structure("arm:1")
+    assert options.structure_for_runs("arm", [alone]) == options.structure("arm")
     # One run with stage 2 is enough: the other lacks signals, and is refused for that.
-    assert options.measured("arm:1", [alone, both]) == options.structure("arm:1")
+    assert options.structure_for_runs("arm:1", [alone, both]) == options.structure("arm:1")
     assert capsys.readouterr().err == ""
-    made = options.measured("arm:1", [alone, alone])
+    made = options.structure_for_runs("arm:1", [alone, alone])
     assert "no run has theta21 or theta22: arm:1 is a link alone" in capsys.readouterr().err
     assert str(made) == "D^2 theta12 = a2 theta12 - 1.0 D^2 theta11 + d2 D^mu2 theta12 + e2 theta11 + c"
     assert made.sensor_filter == ftlm.SensorFilter.low_pass(["theta12"])
-    assert options.measured("arm:2", [alone]) == options.structure("arm:2")
+    assert options.structure_for_runs("arm:2", [alone]) == options.structure("arm:2")
 
 
 def test_what_is_free_behind_a_filter_is_known_before_its_offset_is_decided():

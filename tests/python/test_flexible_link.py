@@ -68,8 +68,15 @@ def test_inertia_ratio_and_coefficients_of_parameters():
     )
     assert link.inertia_ratio == 1.5
     assert link.coefficients(2) == {
-        "a3": 3.0, "b3": -0.5, "d3": 0.25, "g3": 1.5, "a4": -4.5, "b4": 0.5, "d4": -0.375, "g4": -1.5,
-    }  # fmt: skip
+        "a3": 3.0,
+        "b3": -0.5,
+        "d3": 0.25,
+        "g3": 1.5,
+        "a4": -4.5,
+        "b4": 0.5,
+        "d4": -0.375,
+        "g4": -1.5,
+    }
 
 
 # ----------------------------------------------------------------------------------------------------------------------
@@ -207,7 +214,7 @@ def test_sensor_filter_follows_its_output_into_one_equation():
     # A deflection that drives a stage passed the filter as well as the one that is modelled.
     pushed = ftlm.flexible_link(stage=2, cross_stage="inertial", sensor_filter="stock")
     assert pushed.sensor_filter.signals == ("theta12", "theta22")
-    assert ftlm.flexible_link(stage=1, cross_stage=True, sensor_filter="stock").equation("theta12").behind_filter
+    assert ftlm.flexible_link(stage=1, cross_stage=True, sensor_filter="stock").equation("theta12").all_filtered
     uncoupled = ftlm.equation("D y = a y; D z = b z", sensor_filter=ftlm.SensorFilter.low_pass(["z"]))
     assert uncoupled.equation("y").sensor_filter is None
 
@@ -241,7 +248,7 @@ def test_options_that_are_not_known_are_refused(options, message):
 def test_manual_model_is_the_integer_rows_of_the_paper():
     model = ftlm.link_model(stage=1, form="published")
     assert model.orders == {"alpha1": 2.0, "beta2": 0.0, "alpha2": 2.0, "gamma1": 1.0, "mu2": 1.0}
-    assert model.coefficients == ftlm.PARAMETERS["effective"][1].coefficients(1)
+    assert model.coefficients == ftlm.PARAMETER_SETS["effective"][1].coefficients(1)
     assert model.units == {"theta11": "rad", "theta12": "rad", "I1": "A"}
     assert str(model).splitlines()[0] == (
         "D^2 theta11 = 628.889 theta12 - 62.9562 D^1 theta11 + 0 D^1 theta12 + 140.471 I1"
@@ -321,27 +328,28 @@ def arm_in_motion(rows, noise=0.0):
 
 def test_stages_that_share_no_order_are_parts_of_their_own():
     both = ftlm.flexible_link(form="published", stage="both").with_delays({"I2": 0.01})
-    parts = both.parts()
+    parts = both.independent_groups()
     assert list(parts) == ["theta11, theta12", "theta21, theta22"]
     for stage, part in zip((1, 2), parts.values(), strict=True):
         assert part.equations == ftlm.flexible_link(form="published", stage=stage).equations
         assert part.order_names == ftlm.flexible_link(form="published", stage=stage).order_names
     assert [p.delay for p in parts.values()] == [{}, {"I2": 0.01}]
-    assert list(ftlm.flexible_link(form="published", stage=1).parts()) == ["stage"]
-    assert list(ftlm.flexible_link(form="published", stage=1, laws=()).parts()) == ["theta11", "theta12"]
-    assert list(ftlm.equation("D^2 y = a D y + b u").parts()) == []
+    assert list(ftlm.flexible_link(form="published", stage=1).independent_groups()) == ["stage"]
+    assert list(ftlm.flexible_link(form="published", stage=1, laws=()).independent_groups()) == ["theta11", "theta12"]
+    assert list(ftlm.equation("D^2 y = a D y + b u").independent_groups()) == []
     # One equation may carry a law by itself, and equations may share an order without one.
-    assert list(ftlm.equation("D^alpha y = a D^(alpha-nu) y + b D^nu u").parts()) == ["stage"]
+    assert list(ftlm.equation("D^alpha y = a D^(alpha-nu) y + b D^nu u").independent_groups()) == ["stage"]
     mixed = ftlm.equation("D^alpha y = a D^nu x + b u; D^kappa x = c D^nu y + d u; D^rho z = e z + f u")
-    assert list(mixed.parts()) == ["y, x", "z"]
+    assert list(mixed.independent_groups()) == ["y, x", "z"]
 
 
 def test_the_whole_arm_is_searched_stage_by_stage():
     run = arm_in_motion(1025)
-    coarse = ftlm.lattice(
-        alpha=(1.9, 2.0), **{f"gamma{h}": (0.9, 1.0) for h in (1, 3)},
+    coarse = ftlm.order_grid(
+        alpha=(1.9, 2.0),
+        **{f"gamma{h}": (0.9, 1.0) for h in (1, 3)},
         **{f"{n}{d}": v for d in (2, 4) for n, v in (("beta", (0.1, 0.2)), ("mu", (0.8, 0.9)))},
-    )  # fmt: skip
+    )
     whole = ftlm.identify(
         run, ftlm.flexible_link(form="published", stage="both"), method="least-squares", lattice=coarse
     )
@@ -362,7 +370,7 @@ def test_the_whole_arm_is_one_joint_fit():
     found = ftlm.identify(
         arm_in_motion(5000, 0.01), replace(ftlm.flexible_link(form="published", stage="both"), initial="rest")
     )
-    assert len(found.joint.names) == 20
+    assert len(found.fit.names) == 20
     for stage in (1, 2):
         for name, value in demo_plant(stage, form="published").orders.items():
             assert abs(found.orders[name] - value) < 5 * found.standard_errors[name], name
@@ -373,9 +381,9 @@ def test_the_whole_arm_is_one_joint_fit():
 def test_hints_are_kept_by_what_changes_a_structure_and_stand_in_no_file_text_or_comparison(clean_a):
     structure = ftlm.flexible_link(form="published", stage=1, coupling="measured")
     fixed = structure.with_orders({"alpha1": 2.0}).with_coefficients({"a1": 600.0})
-    assert fixed.hints.freed["a1"] == "beta1"
+    assert fixed.hints.order_names_by_coefficient["a1"] == "beta1"
     assert replace(structure, hints=UNSET) == structure
     assert "hints" not in repr(structure) + str(structure)
-    job = make_job([clean_a], structure.equation("theta11"), ftlm.lattice(step=0.5), m=64, rows="time")
+    job = make_job([clean_a], structure.equation("theta11"), ftlm.order_grid(step=0.5), m=64, rows="time")
     assert b"hints" not in msgspec.msgpack.encode(job.request("theta11"))
     assert set(structure.equation("theta11").order_names) == {"alpha1", "beta1", "gamma1", "mu1"}

@@ -68,7 +68,11 @@ def test_a_child_forked_beside_busy_threads_fits_and_searches(tmp_path):
     count = 5
     done = subprocess.run(
         [sys.executable, "-c", FORKS.format(work=WORK, count=count)],
-        check=False, timeout=150, capture_output=True, text=True, cwd=tmp_path,
+        check=False,
+        timeout=150,
+        capture_output=True,
+        text=True,
+        cwd=tmp_path,
         env={**os.environ, "OPENBLAS_NUM_THREADS": "1"},
-    )  # fmt: skip
+    )
     assert done.stdout.strip() == str([0] * count), done.stderr

@@ -23,11 +23,17 @@ def frame(index):
 
 
 DATES = {
-    "numpy": STAMPS.to_numpy(), "seconds of numpy": STAMPS[::2].to_numpy().astype("datetime64[s]"),
-    "pandas": pd.Series(STAMPS), "zoned": pd.Series(ZONED), "index": ZONED, "polars": pl.Series(STAMPS.to_numpy()),
-    "datetime": STAMPS.to_pydatetime().tolist(), "zoned datetime": ZONED.to_pydatetime().tolist(),
-    "lapses": (STAMPS - STAMPS[0]).to_numpy(), "days": np.arange(N) + np.datetime64("2024-02-20", "D"),
-}  # fmt: skip
+    "numpy": STAMPS.to_numpy(),
+    "seconds of numpy": STAMPS[::2].to_numpy().astype("datetime64[s]"),
+    "pandas": pd.Series(STAMPS),
+    "zoned": pd.Series(ZONED),
+    "index": ZONED,
+    "polars": pl.Series(STAMPS.to_numpy()),
+    "datetime": STAMPS.to_pydatetime().tolist(),
+    "zoned datetime": ZONED.to_pydatetime().tolist(),
+    "lapses": (STAMPS - STAMPS[0]).to_numpy(),
+    "days": np.arange(N) + np.datetime64("2024-02-20", "D"),
+}
 
 
 @pytest.mark.parametrize("kind", DATES)

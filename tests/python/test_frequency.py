@@ -8,7 +8,7 @@ import pytest
 
 import ftlm
 from ftlm import analysis
-from ftlm.analysis.frequency_response import model_numbers
+from ftlm.analysis.frequency_response import parameter_vector
 from ftlm.analysis.poles import right_zeros, roots_in_base
 from ftlm.reproduction.simulated_arm import demo_plant
 
@@ -259,14 +259,14 @@ def test_laws_carry_their_uncertainty_to_every_number(fits):
 def test_the_covariance_of_a_tied_coefficient_is_that_of_its_product(plant, drive, with_noise):
     clean = plant("A").simulate(drive("A", 1500), tolerance=1e-5)
     fit = ftlm.identify(with_noise(clean, 1e-4, 1), ftlm.flexible_link(form="published", stage=1))
-    numbers = model_numbers(fit.model)
+    numbers = parameter_vector(fit.model)
     deviation = np.sqrt(np.diag(np.array(fit.model.estimate.covariance)))
-    errors, values = fit.standard_errors, fit.joint.coefficients
+    errors, values = fit.standard_errors, fit.fit.coefficients
     at = {t.name: 9 * i + 2 * k + 2 for i, e in enumerate(fit.model.equations) for k, t in enumerate(e.terms)}
     for name in ("a1", "b1"):
         assert numbers[at[name]] == pytest.approx(values[name])
         assert deviation[at[name]] == pytest.approx(errors[name], rel=1e-9)
-    joint, names = fit.joint, fit.joint.names
+    joint, names = fit.fit, fit.fit.names
     a, r = names.index("a1"), names.index("r1")
     product = np.zeros(len(names))
     product[a], product[r] = -values["r1"], -values["a1"]

@@ -17,7 +17,7 @@ import ftlm
 import ftlm.plot
 from ftlm.cli.main import app
 from ftlm.estimation.frequency_domain import ResponseProblem
-from ftlm.estimation.levenberg_marquardt import damped
+from ftlm.estimation.levenberg_marquardt import constrained_least_squares
 
 ARC = "D^alpha U = a U + r D^alpha I + b I"
 W = np.geomspace(0.06, 6e4, 60)
@@ -50,7 +50,8 @@ CLOSED = {
     "diffusion": (
         "D^(alpha+0.5) U = a D^0.5 U + r D^(alpha+0.5) I + b D^0.5 I + c D^alpha I + d I",
         circuits.warburg(W, 0.01, 0.05, 1e-2, 0.8, 0.02),
-        {**TRUTH, "c": 0.02, "d": 0.02 * 1e-2**-0.8}, {},
+        {**TRUTH, "c": 0.02, "d": 0.02 * 1e-2**-0.8},
+        {},
     ),
     "delay": (
         "D^alpha y = a1 D^beta y + a0 y + b1 D^gamma u + b0 u",
@@ -58,7 +59,7 @@ CLOSED = {
         {"alpha": 2.2, "beta": 1.1, "gamma": 0.4, "a1": -2.0, "a0": -5.0, "b1": 3.0, "b0": 5.0, "delay_u": 0.02},
         {"delay": {"u": (0.0, 0.2)}},
     ),
-}  # fmt: skip
+}
 
 
 @pytest.mark.parametrize("name", CLOSED)
@@ -82,7 +83,7 @@ def test_slopes_are_those_of_differences(name):
     structure = structure.with_delays({"i": (0.0, 0.2)} if options else {})
     problem = ResponseProblem(structure, [data], [1 / np.abs(data.response)])
     seconds = 1.1 * np.array([truth[n.replace("delay_i", "delay_u")] for n in problem.names])
-    values = problem.scaled(seconds)
+    values = problem.in_problem_units(seconds)
     _, slopes = problem.residuals(values)
     own = problem.slopes_in_seconds(values, slopes)
     np.testing.assert_allclose(problem.in_seconds(values), seconds, rtol=1e-12)
@@ -92,7 +93,7 @@ def test_slopes_are_those_of_differences(name):
         for side in (step, -step):
             moved = seconds.copy()
             moved[k] += side
-            ends.append(problem.residuals(problem.scaled(moved), slopes=False)[0])
+            ends.append(problem.residuals(problem.in_problem_units(moved), slopes=False)[0])
         naive = (ends[0] - ends[1]) / (2 * step)
         assert np.max(np.abs(own[:, k] - naive)) < 1e-5 * np.max(np.abs(naive)), problem.names[k]
 
@@ -222,9 +223,11 @@ def test_damped_least_squares_keeps_to_its_inequalities():
         return np.array([v[0] - 3.0, v[1] - 1.0]), np.eye(2)
 
     rows, limits = np.array([[1.0, 1.0], [1.0, 0.0]]), np.array([2.0, 1.2])
-    ended = damped(residuals, lambda v: float(np.sum(residuals(v)[0] ** 2)), np.zeros(2), rows, limits)
+    ended = constrained_least_squares(
+        residuals, lambda v: float(np.sum(residuals(v)[0] ** 2)), np.zeros(2), rows, limits
+    )
     np.testing.assert_allclose(ended.values, [1.2, 0.8], atol=1e-9)
-    assert sorted(ended.held) == [0, 1]
+    assert sorted(ended.active_constraints) == [0, 1]
     assert ended.converged
 
 
@@ -235,12 +238,15 @@ def test_a_wall_that_is_met_on_the_way_is_let_go():
         x, y = v
         return np.array([x - 2.0, 3.0 * (y - x * x / 2)]), np.array([[1.0, 0.0], [-3.0 * x, 3.0]])
 
-    ended = damped(
-        residuals, lambda v: float(np.sum(residuals(v)[0] ** 2)), np.array([0.0, -1.0]),
-        np.array([[1.0, -1.0]]), np.array([1.0]),
-    )  # fmt: skip
+    ended = constrained_least_squares(
+        residuals,
+        lambda v: float(np.sum(residuals(v)[0] ** 2)),
+        np.array([0.0, -1.0]),
+        np.array([[1.0, -1.0]]),
+        np.array([1.0]),
+    )
     np.testing.assert_allclose(ended.values, [2.0, 2.0], atol=1e-7)
-    assert ended.held == ()
+    assert ended.active_constraints == ()
 
 
 def scipys(response):
@@ -371,25 +377,34 @@ DECIBELS = 20 * np.log10(np.abs(Z))
 STRANGERS = {
     "Zreal Zimag": (("Freq", "Zreal", "Zimag"), (F, Z.real, Z.imag), {}, "'Freq' taken for Hz"),
     "potentiostat": (
-        ("freq/Hz", "Re(Z)/Ohm", "-Im(Z)/Ohm", "|Z|/Ohm", "Phase(Z)/deg"), (F, Z.real, -Z.imag, np.abs(Z), DEGREES),
-        {"separator": "\t"}, "negative imaginary part",
+        ("freq/Hz", "Re(Z)/Ohm", "-Im(Z)/Ohm", "|Z|/Ohm", "Phase(Z)/deg"),
+        (F, Z.real, -Z.imag, np.abs(Z), DEGREES),
+        {"separator": "\t"},
+        "negative imaginary part",
     ),
     "primes": (
         ("Index", "Frequency (Hz)", "Z' (mΩ)", "-Z'' (mΩ)", "Z (Ω)", "-Phase (°)"),
-        (np.arange(60), F, 1e3 * Z.real, -1e3 * Z.imag, np.abs(Z), -DEGREES), {}, "negative imaginary part",
+        (np.arange(60), F, 1e3 * Z.real, -1e3 * Z.imag, np.abs(Z), -DEGREES),
+        {},
+        "negative imaginary part",
     ),
     "units below": (
-        ("Freq", "Zreal", "Zimag"), (F, Z.real, Z.imag), {"separator": "\t", "units": ("Hz", "ohm", "ohm")}, None,
+        ("Freq", "Zreal", "Zimag"),
+        (F, Z.real, Z.imag),
+        {"separator": "\t", "units": ("Hz", "ohm", "ohm")},
+        None,
     ),
     "bode": (("Hz", "dB", "deg"), (F, DECIBELS, DEGREES), {}, None),
     "angular": (("omega_rad_s", "gain_abs", "phase_rad"), (W, np.abs(Z), np.angle(Z)), {}, None),
     "German": (
-        ("Frequenz [Hz]", "Betrag [dB]", "Phase [°]"), (F, DECIBELS, DEGREES),
-        {"separator": ";", "comma": True, "encoding": "cp1252", "above": "Messung 12\nPrüfling A\n"}, "decimal commas",
+        ("Frequenz [Hz]", "Betrag [dB]", "Phase [°]"),
+        (F, DECIBELS, DEGREES),
+        {"separator": ";", "comma": True, "encoding": "cp1252", "above": "Messung 12\nPrüfling A\n"},
+        "decimal commas",
     ),
     "kilohertz": (("f [kHz]", "Re", "Im"), (F / 1e3, Z.real, Z.imag), {}, None),
     "scatter": (("w", "real", "imag", "sigma"), (W, Z.real, Z.imag, 1e-3 * np.abs(Z)), {}, "taken for rad/s"),
-}  # fmt: skip
+}
 
 
 @pytest.mark.parametrize("name", STRANGERS)

@@ -21,9 +21,12 @@ CART = "D^2 y = - v D y + g u - fc*sign(D y)"
 
 def run_of(force: np.ndarray, step: float, y: np.ndarray | None = None, *, hold: bool = True, name: str = "run"):
     return ftlm.Run.from_arrays(
-        step=step, inputs={"u": force}, outputs={"y": np.zeros(force.size) if y is None else y},
-        intersample={"u": "zoh" if hold else "foh"}, name=name,
-    )  # fmt: skip
+        step=step,
+        inputs={"u": force},
+        outputs={"y": np.zeros(force.size) if y is None else y},
+        intersample={"u": "zoh" if hold else "foh"},
+        name=name,
+    )
 
 
 def model_of(words: str, **values: float) -> ftlm.Model:
@@ -204,9 +207,19 @@ def test_derivatives_are_those_of_finite_differences(orders) -> None:
 
     def at(point):
         return _core.friction_error(
-            runs, [law], [(0, [(1.0, [(2, 1)]), (0.0, []), (1.0, [])])], [(1.05, 2.0), (0.0, 1.5)], ["plain"] * 3,
-            (True, [], 1), list(point[:2]), list(point[2:5]), [], [list(point[5:8]), list(point[8:])], 1, 1e-9,
-        )  # fmt: skip
+            runs,
+            [law],
+            [(0, [(1.0, [(2, 1)]), (0.0, []), (1.0, [])])],
+            [(1.05, 2.0), (0.0, 1.5)],
+            ["plain"] * 3,
+            (True, [], 1),
+            list(point[:2]),
+            list(point[2:5]),
+            [],
+            [list(point[5:8]), list(point[8:])],
+            1,
+            1e-9,
+        )
 
     point = np.array([*orders, 0.7, 1.1, 0.9, 0.1, 0.2, 0.05, -0.2, 0.4, -0.1])
     assert max(friction.slope_errors(at, point, 5)) < 1e-6

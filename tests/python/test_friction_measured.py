@@ -17,12 +17,15 @@ LIMIT = 0.94
 def run_of(path: str, current: str, *, clip: float = np.inf, **options) -> ftlm.Run:
     """A run thinned to 8 ms, angles in rad."""
     angles = {"theta11": "th11_deg", "theta12": "th12_deg"}
-    run = ftlm.load(DATA / path, time="t_s", inputs={"I1": current}, outputs=angles, units=dict.fromkeys(angles, "deg"),
-                    **options)  # fmt: skip
+    run = ftlm.load(
+        DATA / path, time="t_s", inputs={"I1": current}, outputs=angles, units=dict.fromkeys(angles, "deg"), **options
+    )
     return ftlm.Run.from_arrays(
-        step=4 * run.step, inputs={"I1": np.clip(run["I1"], -clip, clip)[::4]},
-        outputs={n: run[n][::4] for n in angles}, name=path.rpartition("/")[2],
-    )  # fmt: skip
+        step=4 * run.step,
+        inputs={"I1": np.clip(run["I1"], -clip, clip)[::4]},
+        outputs={n: run[n][::4] for n in angles},
+        name=path.rpartition("/")[2],
+    )
 
 
 @pytest.mark.parametrize(

@@ -44,7 +44,7 @@ def test_a_finished_store_is_read_to_the_bit(folder, expected, tmp_path):
     assert ftlm.search_status(path)["y"].complete
     found = ftlm.resume_search(path)["y"]
     assert json.loads(json.dumps(found.to_dict()["table"])) == expected["table"]
-    assert (found.candidates, found.pruned) == (expected["candidates"], expected["pruned"])
+    assert (found.candidates, found.exclusion_counts) == (expected["candidates"], expected["pruned"])
     assert path.read_bytes() == (folder / "search.ftlm").read_bytes()
 
 
@@ -57,7 +57,7 @@ def test_a_half_finished_store_goes_on(folder, expected, tmp_path):
     # The processor that began it may have rounded otherwise in the last place.
     assert [row.index for row in found.table] == [row["index"] for row in expected["table"]]
     assert [row.score for row in found.table] == pytest.approx([row["score"] for row in expected["table"]], rel=1e-9)
-    assert found.pruned == expected["pruned"]
+    assert found.exclusion_counts == expected["pruned"]
 
 
 def test_a_finished_store_under_an_order_law_is_read_to_the_bit(folder, tmp_path):
@@ -88,7 +88,7 @@ def test_a_store_under_an_order_law_that_was_cut_goes_on(folder, tmp_path):
 
 def payloads(path):
     """Frames of a store, whatever their classes are called now: the request's records, keys and tags as they stand."""
-    data, at, digest, read = memoryview(path.read_bytes()), len(frames.MAGIC), bytes(frames.DIGEST), []
+    data, at, digest, read = memoryview(path.read_bytes()), len(frames.FILE_SIGNATURE), bytes(frames.DIGEST_BYTES), []
     while at < len(data):
         payload, digest, at = frames.next_frame(data, at, digest)
         read.append(msgspec.msgpack.decode(payload))
@@ -98,22 +98,22 @@ def payloads(path):
 @pytest.mark.parametrize("name", ["search", "law"])
 def test_a_store_is_written_as_it_was_then(folder, tmp_path, monkeypatch, name):
     """Keys, tags, order and numbers of the request; of the rest all but the last places, which are the processor's."""
-    monkeypatch.setattr("ftlm.order_search.checkpoint.INTERVAL", math.inf)
+    monkeypatch.setattr("ftlm.order_search.checkpoint.FLUSH_INTERVAL_S", math.inf)
     # Made anew, exponentials of another processor would end in another last place.
     run = ftlm.load(folder / "run.csv")
     path = tmp_path / "now.ftlm"
     if name == "law":
         structure = ftlm.equation("D^alpha y = a D^beta y + b D^(alpha-beta) u", initial="rest")
-        ftlm.search_orders(run, structure, ftlm.lattice(step=0.05), m=32, threads=1, keep=5, store=path)
+        ftlm.search_orders(run, structure, ftlm.order_grid(step=0.05), m=32, threads=1, keep=5, store=path)
     else:
         structure = ftlm.equation("D^alpha y = a D^beta y + c D^mu y + b u", initial="rest")
-        lattice = ftlm.lattice(step=0.05, beta=(0.0, 1.0), mu=(0.0, 1.0))
+        lattice = ftlm.order_grid(step=0.05, beta=(0.0, 1.0), mu=(0.0, 1.0))
         options = {"m": 32, "early_stopping": False, "threads": 1, "keep": 5, "store": path}
         ftlm.search_orders(run, structure, lattice, **options)
     now, then = payloads(path), payloads(folder / f"{name}.ftlm")
     assert (now[0].pop("version"), then[0].pop("version")) == (ftlm.__version__, folder.name)
     # Small lattices are searched as they were by the first algorithm.
-    assert (now[0].pop("algorithm"), then[0].pop("algorithm")) == (frames.ALGORITHM, 1)
+    assert (now[0].pop("algorithm"), then[0].pop("algorithm")) == (frames.ALGORITHM_VERSION, 1)
     # Compared as bytes: the order of keys counts.
     assert msgspec.msgpack.encode(now[0]) == msgspec.msgpack.encode(then[0])
     assert {tuple(frame) for frame in now[1:]} == {tuple(frame) for frame in then[1:]}

@@ -8,10 +8,10 @@ import numpy as np
 import pytest
 
 import ftlm
-from ftlm.estimation.model_checks import INSEPARABLE, VAGUE
-from ftlm.structure_selection.candidates import Inside
+from ftlm.estimation.model_checks import MAX_PARAMETER_CORRELATION, MAX_RELATIVE_STANDARD_ERROR
+from ftlm.structure_selection.candidates import NestedStructures
 from ftlm.structure_selection.cross_validation import fit
-from ftlm.structure_selection.select import automatic
+from ftlm.structure_selection.select import automatic_structures
 
 WORDS = "D^alpha y = a1 D^nu y + a0 y + b0 u"
 TRUTH = {"alpha": 1.8, "nu": 0.8, "a1": -2.0, "a0": -25.0, "b0": 25.0}
@@ -39,7 +39,7 @@ def sine():
 def identified(runs, method, **orders):
     structure = ftlm.equation(WORDS, orders=orders)
     searched = method != "output-error" and structure.order_names
-    options = {"lattice": ftlm.lattice(step=0.2)} if searched else {}
+    options = {"lattice": ftlm.order_grid(step=0.2)} if searched else {}
     return ftlm.identify(runs, structure, method=method, threads=1, **options)
 
 
@@ -77,10 +77,12 @@ def test_an_input_of_few_frequencies_is_counted(method, u, fixes):
     assert [w for w in found.warnings if said in w]
     if method == "output-error":
         # Correlated by more than 0.995, and yet each known to within a tenth: both can be used.
-        joint = found.joint
+        joint = found.fit
         pair = joint.names.index("a0"), joint.names.index("b0")
-        assert abs(joint.correlation[pair]) > INSEPARABLE
-        assert all(found.standard_errors[n] < VAGUE * abs(found.coefficients[n]) for n in ("a0", "b0"))
+        assert abs(joint.correlation[pair]) > MAX_PARAMETER_CORRELATION
+        assert all(
+            found.standard_errors[n] < MAX_RELATIVE_STANDARD_ERROR * abs(found.coefficients[n]) for n in ("a0", "b0")
+        )
         assert not any("cannot be told apart" in w for w in found.warnings)
         assert truth_is_inside(found)
 
@@ -169,7 +171,7 @@ def test_a_candidate_whose_squares_are_no_numbers_is_one_that_cannot_be_fitted()
     y = machine.simulate(ftlm.Run.from_arrays(step=0.01, inputs={"u": u}, outputs={"y": 0 * t}))["y"]
     y = y + 0.02 * np.random.default_rng(2).standard_normal(t.size)
     measured = ftlm.Run.from_arrays(step=0.01, inputs={"u": u}, outputs={"y": y})
-    inside = Inside(automatic([measured])[3])
-    structure = next(s for c in inside.skeletons() if "a3 D^3 y" in str(s := inside.build(c.variant)))
+    inside = NestedStructures(automatic_structures([measured])[3])
+    structure = next(s for c in inside.simplest() if "a3 D^3 y" in str(s := inside.build(c.variant)))
     with pytest.raises(ftlm.ConvergenceError, match="free run of y ends beyond the range of numbers"):
         fit([measured], structure, [], refine=False)

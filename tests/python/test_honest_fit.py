@@ -106,10 +106,12 @@ def test_simulation_of_a_fractional_order_is_that_of_sixty_digits(alpha, through
             z = [-mpmath.mpf(a) * t**order for t in times]
             direct = mittag_leffler(order, power + 1, z)
             delayed = mittag_leffler(order, order + power + 1, z)
-            return np.array([
-                float(t**power * (through * d + mpmath.mpf(b) * t**order * e))
-                for t, d, e in zip(times, direct, delayed, strict=True)
-            ])  # fmt: skip
+            return np.array(
+                [
+                    float(t**power * (through * d + mpmath.mpf(b) * t**order * e))
+                    for t, d, e in zip(times, direct, delayed, strict=True)
+                ]
+            )
 
         steps, ramps = response(0), response(1) / step
     slopes = np.diff(u, append=u[-1])
@@ -213,8 +215,8 @@ def test_a_real_arm_with_feed_through_prints_what_it_simulates():
 def test_the_printed_fit_is_that_of_the_residuals_where_numbers_cannot_be_told_apart(seed, rows):
     """Three own terms whose orders end beside each other: a flat, bent valley, out of which a straight line leads."""
     whole = resonant_plant(seed, wrong=True)
-    run = whole.slice(0.0, (rows - 1) * whole.step)
+    run = whole.window(0.0, (rows - 1) * whole.step)
     structure = ftlm.equation("D^alpha y = d D^mu y + e D^nu y + a y + b u", initial="rest")
     found = ftlm.identify(run, structure, threads=1, intervals="quadratic")
-    assert found.joint.standard_errors["mu"] > 0.2
-    assert found.output_error["y"].rmse == pytest.approx(found.joint.noise["y"], rel=0.1)
+    assert found.fit.standard_errors["mu"] > 0.2
+    assert found.output_error["y"].rmse == pytest.approx(found.fit.noise["y"], rel=0.1)

@@ -30,8 +30,12 @@ def run_of(length=60):
 def ftlm_child(*arguments, **options):
     return subprocess.run(
         [sys.executable, "-m", "ftlm", *arguments],
-        check=False, timeout=120, stderr=subprocess.PIPE, text=True, **options,
-    )  # fmt: skip
+        check=False,
+        timeout=120,
+        stderr=subprocess.PIPE,
+        text=True,
+        **options,
+    )
 
 
 # ----------------------------------------------------------------------------------------------------------------------
@@ -112,7 +116,7 @@ def test_a_store_that_is_no_file_is_refused_at_once(tmp_path, writing):
 def test_a_sparse_file_of_gigabytes_is_refused_before_it_is_read(tmp_path, start):
     path = tmp_path / "store"
     path.write_bytes(start)
-    os.truncate(path, log.LARGEST + 1)
+    os.truncate(path, log.MAX_FILE_BYTES + 1)
     with pytest.raises(ftlm.DataError, match="is no ftlm search store" if not start else "more than the"):
         read_store(path)
     with pytest.raises(ftlm.DataError, match="is no ftlm search store" if not start else "more than the"):
@@ -235,15 +239,19 @@ class Empty(Executor):
 def test_an_executor_that_returns_nothing_ends(small_run, result):
     with pytest.raises(ftlm.ConvergenceError, match="lost its work"):
         ftlm.search_orders(
-            small_run, ftlm.equation("D^a y = c D^b y + d u"), ftlm.lattice(step=0.2), m=32, executor=Empty(result)
-        )  # fmt: skip
+            small_run, ftlm.equation("D^a y = c D^b y + d u"), ftlm.order_grid(step=0.2), m=32, executor=Empty(result)
+        )
 
 
 def test_what_is_no_executor_is_refused(small_run):
     with pytest.raises(ftlm.ModelError, match="is no executor"):
         ftlm.search_orders(
-            small_run, ftlm.equation("D^a y = c D^b y + d u"), ftlm.lattice(step=0.2), m=32, executor=SimpleNamespace()
-        )  # fmt: skip
+            small_run,
+            ftlm.equation("D^a y = c D^b y + d u"),
+            ftlm.order_grid(step=0.2),
+            m=32,
+            executor=SimpleNamespace(),
+        )
 
 
 CAPSULE = """
@@ -375,7 +383,7 @@ def test_an_output_that_was_closed_stays_closed(written, closed, said):
     call = f'"$0" -m ftlm inspect "$1" {closed}'
     done = subprocess.run(
         ["sh", "-c", call, sys.executable, str(written)], check=False, timeout=120, capture_output=True, text=True
-    )  # fmt: skip
+    )
     assert done.stderr[:6] == said
     assert "Traceback" not in done.stderr
     assert "Exception ignored" not in done.stderr

@@ -53,8 +53,12 @@ def test_least_squares_is_the_oracles(small_run, structure, with_noise):
     ((q, y),) = regression([run], 256)
     assert [found.coefficients[n] for n in "acb"] == pytest.approx(list(oracles.least_squares(q, y)), rel=1e-9)
     assert found.settings == {
-        "criterion": "output-error", "norm": "l1", "coefficients": "least-squares", "m": 256, "initial": "rest",
-    }  # fmt: skip
+        "criterion": "output-error",
+        "norm": "l1",
+        "coefficients": "least-squares",
+        "m": 256,
+        "initial": "rest",
+    }
 
 
 @pytest.mark.parametrize(("p", "k0"), [(1, 1.0), (7, 1.0), (3, 1e-4), (50, 1e6)])
@@ -127,9 +131,12 @@ def test_runs_that_do_not_start_at_rest_get_initial_terms(small_run, structure):
 
 def replace_name(run, name):
     return ftlm.Run.from_arrays(
-        step=run.step, inputs={n: run[n] for n in run.inputs}, outputs={n: run[n] for n in run.outputs},
-        units=run.units, name=name,
-    )  # fmt: skip
+        step=run.step,
+        inputs={n: run[n] for n in run.inputs},
+        outputs={n: run[n] for n in run.outputs},
+        units=run.units,
+        name=name,
+    )
 
 
 def test_known_coefficients_stay_what_they_are(small_run):
@@ -148,7 +155,7 @@ def test_known_coefficients_stay_what_they_are(small_run):
 
 def test_orders_of_one_equation_are_searched(small_run):
     words = ftlm.equation("D^alpha y = a D^nu y + c y + b u")
-    lattice = ftlm.lattice(step=0.2, alpha=(1.2, 2.0))
+    lattice = ftlm.order_grid(step=0.2, alpha=(1.2, 2.0))
     found = ftlm.identify(small_run, words, method="least-squares", lattice=lattice, m=512)
     assert found.orders == {"alpha": 1.6, "nu": 0.6}
     assert found.coefficients == {n: pytest.approx(v, rel=2e-3) for n, v in TRUTH.items()}
@@ -166,12 +173,18 @@ def test_orders_of_one_equation_are_searched(small_run):
 def test_search_settings_are_handed_on(small_run, criterion, norm):
     words = ftlm.equation("D^alpha y = a D^nu y + c y + b u")
     options = {"criterion": criterion, "norm": norm, "keep": 3, "threads": 1, "m": 128}
-    lattice = ftlm.lattice(step=0.2, alpha=(1.2, 2.0))
+    lattice = ftlm.order_grid(step=0.2, alpha=(1.2, 2.0))
     told = []
     found = ftlm.identify(
-        small_run, words, method="multi-innovation", innovation_length=3, prior_covariance=50.0, lattice=lattice,
-        progress=lambda done, total: told.append((done, total)), **options,
-    )  # fmt: skip
+        small_run,
+        words,
+        method="multi-innovation",
+        innovation_length=3,
+        prior_covariance=50.0,
+        lattice=lattice,
+        progress=lambda done, total: told.append((done, total)),
+        **options,
+    )
     same = ftlm.search_orders(
         small_run,
         words,
@@ -188,19 +201,31 @@ def test_search_settings_are_handed_on(small_run, criterion, norm):
 
 def test_equations_without_a_law_are_searched_one_by_one(clean_a):
     structure = ftlm.flexible_link(form="published", laws=(), coupling="measured")
-    lattice = ftlm.Lattice(
+    lattice = ftlm.OrderGrid(
         orders={
-            "alpha1": [1.95, 2.0], "beta1": [0.75], "gamma1": [0.9, 0.95], "mu1": [0.0],
-            "alpha2": [2.0], "beta2": [0.85, 0.8], "gamma2": [1.0, 1.05], "mu2": [0.1],
+            "alpha1": [1.95, 2.0],
+            "beta1": [0.75],
+            "gamma1": [0.9, 0.95],
+            "mu1": [0.0],
+            "alpha2": [2.0],
+            "beta2": [0.85, 0.8],
+            "gamma2": [1.0, 1.05],
+            "mu2": [0.1],
         }
-    )  # fmt: skip
+    )
     found = ftlm.identify(clean_a, structure, method="least-squares", lattice=lattice)
     assert list(found.searches) == ["theta11", "theta12"]
     assert [s.candidates for s in found.searches.values()] == [4, 4]
     assert found.orders == {
-        "alpha1": 2.0, "beta1": 0.75, "gamma1": 0.95, "mu1": 0.0,
-        "alpha2": 2.0, "beta2": 0.85, "gamma2": 1.05, "mu2": 0.1,
-    }  # fmt: skip
+        "alpha1": 2.0,
+        "beta1": 0.75,
+        "gamma1": 0.95,
+        "mu1": 0.0,
+        "alpha2": 2.0,
+        "beta2": 0.85,
+        "gamma2": 1.05,
+        "mu2": 0.1,
+    }
     # One equation that has all its orders is not searched.
     half = structure.with_orders({n: v for n, v in found.orders.items() if n.endswith("1")})
     assert list(
@@ -214,8 +239,8 @@ def test_equations_without_a_law_are_searched_one_by_one(clean_a):
 
 
 def test_law_search_recovers_the_five_free_orders_of_plant_a(clean_a, plants):
-    lattice = ftlm.Lattice(
-        step=0.05,
+    lattice = ftlm.OrderGrid(
+        increment=0.05,
         orders={
             "alpha1": (1.9, 2.0),
             "alpha2": (1.9, 2.0),
@@ -245,7 +270,7 @@ def test_law_search_recovers_the_five_free_orders_of_plant_a(clean_a, plants):
 def test_printed_figures_are_those_of_compare(small_run, second, with_noise, method, initial, tmp_path):
     runs = [with_noise(small_run, 0.01, 1), with_noise(second, 0.02, 2).slice(1.0, None)]
     words = ftlm.equation("D^alpha y = a D^nu y + c y + b u", initial=initial)
-    lattice = ftlm.lattice(step=0.2, alpha=(1.4, 1.8))
+    lattice = ftlm.order_grid(step=0.2, alpha=(1.4, 1.8))
     found = ftlm.identify(runs, words, method=method, lattice=lattice, m=128)
     saved = ftlm.load_model(found.model.save(tmp_path / "model.json"))
     for again in (found.model.compare(runs), ftlm.compare(found.model, runs), saved.compare(runs)):
@@ -325,9 +350,14 @@ def test_a_broken_coefficient_law_is_named(clean_a, with_noise, plants):
 def test_near_identities_are_named(clean_a, with_noise):
     structure = ftlm.flexible_link(form="published").equation("theta12")
     found = ftlm.identify(
-        with_noise(clean_a, 1e-4, 1), structure, method="least-squares", criterion="equation-error", norm="l2",
-        lattice=ftlm.lattice(alpha=(2.0, 2.0), gamma2=0.65), m=1024,
-    )  # fmt: skip
+        with_noise(clean_a, 1e-4, 1),
+        structure,
+        method="least-squares",
+        criterion="equation-error",
+        norm="l2",
+        lattice=ftlm.order_grid(alpha=(2.0, 2.0), gamma2=0.65),
+        m=1024,
+    )
     assert any("so the equation nearly says that theta12 equals itself" in w for w in found.warnings)
 
 
@@ -335,7 +365,7 @@ def test_orders_on_the_edge_and_facts_about_the_run_are_repeated(small_run):
     words = ftlm.equation("D^alpha y = a D^0.6 y + c y + b u")
     resampled = small_run.resample(0.04)
     found = ftlm.identify(
-        resampled, words, method="least-squares", lattice=ftlm.lattice(step=0.1, alpha=(1.2, 1.5)), m=256
+        resampled, words, method="least-squares", lattice=ftlm.order_grid(step=0.1, alpha=(1.2, 1.5)), m=256
     )
     assert "order alpha = 1.5 is on the edge of its interval; widen it" in found.warnings
     assert any(w.startswith(f"run {resampled.name}: resampled from 0.02 s to 0.04 s") for w in found.warnings)
@@ -472,7 +502,7 @@ def test_output_error_is_the_default_and_gives_intervals(small_run, with_noise):
         ({"threads": 0}, "threads = 0 is outside [1, 1024]"),
         ({"m": 600}, "m = 600 is more than run 'small, simulated' carries: 513 rows are 512 pulses"),
         ({"lattice": {"alpha": 1}}, "lattice is dict, not a Lattice"),
-        ({"lattice": ftlm.lattice(beta=0.1)}, "lattice order 'beta' is no free order; free are none"),
+        ({"lattice": ftlm.order_grid(beta=0.1)}, "lattice order 'beta' is no free order; free are none"),
     ],
 )
 @pytest.mark.parametrize("method", ["output-error", *METHODS])
@@ -509,11 +539,11 @@ def test_regressors_that_cannot_be_told_apart_are_refused(small_run):
 def test_arguments_are_never_changed(small_run, structure):
     before = {n: small_run[n].copy() for n in small_run.signals}
     words = str(structure)
-    lattice = ftlm.lattice(step=0.4, alpha=(1.2, 2.0))
+    lattice = ftlm.order_grid(step=0.4, alpha=(1.2, 2.0))
     ftlm.identify(small_run, ftlm.equation("D^alpha y = a y + b u"), method="least-squares", lattice=lattice, m=64)
     assert all(np.array_equal(small_run[n], before[n]) for n in before)
     assert str(structure) == words
-    assert lattice == ftlm.lattice(step=0.4, alpha=(1.2, 2.0))
+    assert lattice == ftlm.order_grid(step=0.4, alpha=(1.2, 2.0))
 
 
 def test_the_record_that_is_estimated_on_is_that_of_the_core(small_run, structure):

@@ -6,7 +6,7 @@ import numpy as np
 import pytest
 
 import ftlm
-from ftlm.data.sampling import interpolated
+from ftlm.data.sampling import resample_uniform
 
 PLANT = "D^0.8 y = -1.5 y + 1.5 u"
 STEP, ROWS, FINE = 0.05, 600, 20
@@ -37,9 +37,11 @@ def jittered(seed: int, jitter: float = 0.3) -> ftlm.Run:
     there = ftlm.Run.from_arrays(inputs={"u": held}, outputs={"y": np.zeros(fine.size)}, step=STEP / FINE)
     y = ftlm.Model(ftlm.equation(PLANT)).simulate(there)["y"][ticks]
     return ftlm.Run.from_arrays(
-        time=ticks * STEP / FINE, inputs={"u": command},
-        outputs={"y": y + 0.01 * np.std(y) * rng.standard_normal(ROWS)}, resample=STEP,
-    )  # fmt: skip
+        time=ticks * STEP / FINE,
+        inputs={"u": command},
+        outputs={"y": y + 0.01 * np.std(y) * rng.standard_normal(ROWS)},
+        resample=STEP,
+    )
 
 
 @pytest.mark.parametrize("step", [0.37, 0.05, 1.3])
@@ -47,7 +49,7 @@ def test_a_held_command_becomes_its_means(step: float) -> None:
     rng = np.random.default_rng(7)
     since = np.concatenate([[0.0], np.cumsum(rng.uniform(0.05, 1.0, 80))])
     data = {"u": rng.standard_normal(81), "y": rng.standard_normal(81)}
-    found = interpolated(since, data, {"u": "zoh"}, step)
+    found = resample_uniform(since, data, {"u": "zoh"}, step)
     expected = naive_means(since, data["u"], step, found["u"].size)
     np.testing.assert_allclose(found["u"], expected, rtol=0, atol=1e-11)
     np.testing.assert_array_equal(found["y"], np.interp(np.arange(found["y"].size) * step, since, data["y"]))
@@ -56,10 +58,10 @@ def test_a_held_command_becomes_its_means(step: float) -> None:
 def test_what_falls_on_the_grid_keeps_its_bits() -> None:
     values = np.random.default_rng(8).standard_normal(500) * 1e3
     since = np.arange(500) * 0.01
-    same = interpolated(since + 1e-10 * np.sin(np.arange(500)) * (since > 0), {"u": values}, {"u": "zoh"}, 0.01)
+    same = resample_uniform(since + 1e-10 * np.sin(np.arange(500)) * (since > 0), {"u": values}, {"u": "zoh"}, 0.01)
     np.testing.assert_array_equal(same["u"], values)
     np.testing.assert_array_equal(
-        interpolated(since, {"u": values}, {"u": "zoh"}, 0.0025)["u"], np.repeat(values, 4)[:-3]
+        resample_uniform(since, {"u": values}, {"u": "zoh"}, 0.0025)["u"], np.repeat(values, 4)[:-3]
     )
 
 

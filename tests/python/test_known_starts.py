@@ -8,7 +8,7 @@ from typer.testing import CliRunner
 
 import ftlm
 from ftlm.cli.main import app
-from ftlm.estimation.free_parameters import FreeProblem, known_starts, values_of_model
+from ftlm.estimation.free_parameters import FreeProblem, values_of_model, warm_starts
 from plants import noisy_run, resonant_plant, structure
 
 RICH = "D^alpha y = d D^mu y + a y + b u"
@@ -28,23 +28,23 @@ def test_a_simpler_model_says_where_the_richer_one_starts(simple):
     problem = FreeProblem.of(ftlm.equation(RICH, initial="rest"))
     told = values_of_model(problem, simple.model, {})
     assert told == {"alpha": 2.0, "mu": 1.0, **simple.coefficients}
-    assert known_starts(problem, told) == [told]
+    assert warm_starts(problem, told) == [told]
 
 
 def test_what_is_not_known_does_nothing_at_first():
     problem = FreeProblem.of(ftlm.equation("D^2 y = d D^mu y + a y + b u + e D^nu y", orders={"mu": (0.5, 1.8, 0.1)}))
-    starts = known_starts(problem, {"a": -2.0, "b": 1.0})
+    starts = warm_starts(problem, {"a": -2.0, "b": 1.0})
     assert {(s["mu"], s["nu"]) for s in starts} == {(1.0, 0.0), (1.0, 1.0), (1.0, 2.0)}
     assert all((s["a"], s["b"], s["d"], s["e"]) == (-2.0, 1.0, 0.0, 0.0) for s in starts)
 
 
 def test_a_richer_structure_from_a_simpler_one_is_never_worse(run, simple):
     rich = ftlm.identify(run, ftlm.equation(RICH, initial="rest"), start=simple, intervals="quadratic", threads=1)
-    assert rich.joint.noise["y"] <= simple.joint.noise["y"] * (1 + 1e-6)
+    assert rich.fit.noise["y"] <= simple.joint.noise["y"] * (1 + 1e-6)
     from_model = ftlm.identify(
         run, ftlm.equation(RICH, initial="rest"), start=simple.model, intervals="quadratic", threads=1
     )
-    assert from_model.joint_values == rich.joint_values
+    assert from_model.parameter_values == rich.parameter_values
 
 
 def test_a_start_leads_where_automatic_ones_do_not():
@@ -53,8 +53,8 @@ def test_a_start_leads_where_automatic_ones_do_not():
     truth = {"alpha": 2.2, "nu": 0.9, "a1": -0.625, "a0": -1.25, "b0": 1.25}
     with_start = ftlm.identify(run, structure("3T"), start=truth, intervals="quadratic", threads=1)
     alone = ftlm.identify(run, structure("3T"), intervals="quadratic", threads=1)
-    assert with_start.joint.cost <= alone.joint.cost * (1 + 1e-9)
-    np.testing.assert_allclose(with_start.joint.values, alone.joint.values, rtol=1e-3)
+    assert with_start.fit.cost <= alone.fit.cost * (1 + 1e-9)
+    np.testing.assert_allclose(with_start.fit.values, alone.fit.values, rtol=1e-3)
 
 
 def test_the_command_takes_a_saved_model(run, simple, tmp_path):

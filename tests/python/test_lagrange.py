@@ -12,7 +12,7 @@ import sympy as sp
 import ftlm
 from ftlm import _core
 from ftlm.estimation.free_parameters import FreeProblem
-from ftlm.estimation.objective import experiment
+from ftlm.estimation.objective import sample_run
 from lagrange import INPUTS, clean_run, model, structure, truth
 from laws import laws
 from plants import with_noise
@@ -37,9 +37,12 @@ def test_both_equations_follow_from_the_energies_7_to_13(stage: int) -> None:
     built = ftlm.flexible_link(stage=stage)
     ratio = arm.J1 / arm.J2
     values = {
-        f"a{h}": arm.Ks / arm.J1, f"b{h}": -arm.B1 / arm.J1, f"d{h}": arm.B2 / arm.J1, f"g{h}": arm.Kt / arm.J1,
+        f"a{h}": arm.Ks / arm.J1,
+        f"b{h}": -arm.B1 / arm.J1,
+        f"d{h}": arm.B2 / arm.J1,
+        f"g{h}": arm.Kt / arm.J1,
         f"j{stage}": ratio,
-    }  # fmt: skip
+    }
     for name, sign, factors in built.coefficient_law:
         values[name] = sp.nsimplify(sign) * sp.prod([values[f] for f in factors])
     signals = {f"theta{stage}1": arm.hub, f"theta{stage}2": arm.link, f"I{stage}": arm.current}
@@ -114,10 +117,21 @@ def test_inertial_coupling_follows_from_the_energies_of_the_planar_arm(velocitie
         raised = s ** (highest[names[i]] - own[names[i]] - highest[names[i + 1]] + own[names[i + 1]])
         sides[i] = (equation - raised * link[i + 1]) / inertia[i]
     values = {
-        "a1": k1 / m1, "b1": -f1 / m1, "d1": d1 / m1, "g1": t1 / m1, "j1": m1 / carried,
-        "a3": k2 / n1, "b3": -f2 / n1, "d3": d2 / n1, "g3": t2 / n1, "j2": n1 / n2,
-        "p2": -(n1 + n2 + h) / carried, "q2": -(n2 + h) / carried, "p3": sp.Integer(-1), "p4": -(n2 + h) / n2,
-    }  # fmt: skip
+        "a1": k1 / m1,
+        "b1": -f1 / m1,
+        "d1": d1 / m1,
+        "g1": t1 / m1,
+        "j1": m1 / carried,
+        "a3": k2 / n1,
+        "b3": -f2 / n1,
+        "d3": d2 / n1,
+        "g3": t2 / n1,
+        "j2": n1 / n2,
+        "p2": -(n1 + n2 + h) / carried,
+        "q2": -(n2 + h) / carried,
+        "p3": sp.Integer(-1),
+        "p4": -(n2 + h) / n2,
+    }
     laws = ("orders", "coefficients", "velocities") if velocities else ("orders", "coefficients")
     built = ftlm.flexible_link(stage="both", cross_stage="inertial", laws=laws)
     for name, sign, factors in built.coefficient_law:
@@ -129,9 +143,10 @@ def test_inertial_coupling_follows_from_the_energies_of_the_planar_arm(velocitie
     for i, item in enumerate(built.equations):
         right = sum(
             (sp.nsimplify(t.fixed) if t.fixed is not None else t.factor * values[t.coefficient])
-            * s ** power(t.order) * x[t.signal]
+            * s ** power(t.order)
+            * x[t.signal]
             for t in item.terms
-        )  # fmt: skip
+        )
         left = s ** power(item.order) * x[item.output] - right
         assert sp.simplify(sp.powsimp(sp.expand(left - sides[i]))) == 0, item.output
 
@@ -168,14 +183,21 @@ def test_forms_and_their_options() -> None:
         ftlm.flexible_link(form="newton")
     link = ftlm.LinkParameters(6.0, 2.0, 4.0, 1.0, 0.5, 3.0)
     assert link.lagrange_coefficients(1) == {
-        "a1": 3.0, "b1": -0.5, "d1": 0.25, "g1": 1.5, "a2": -1.5, "b2": -1.0, "d2": -0.125,
-    }  # fmt: skip
+        "a1": 3.0,
+        "b1": -0.5,
+        "d1": 0.25,
+        "g1": 1.5,
+        "a2": -1.5,
+        "b2": -1.0,
+        "d2": -0.125,
+    }
     made = ftlm.link_model(form="lagrange", parameters={1: link})
     assert made.coefficients == link.lagrange_coefficients(1)
     friction = ftlm.flexible_link(friction=True)
     assert [[t.signal for t in e.terms if t.signal.startswith("coulomb")] for e in friction.equations] == [
-        ["coulomb_theta11"], [],
-    ]  # fmt: skip
+        ["coulomb_theta11"],
+        [],
+    ]
 
 
 # ----------------------------------------------------------------------------------------------------------------------
@@ -203,9 +225,11 @@ def test_frequency_responses_are_those_of_the_derived_form(stage: int) -> None:
 def test_free_runs_are_those_of_the_derived_form(stage: int) -> None:
     t = 0.001 * np.arange(401)
     run = ftlm.Run.from_arrays(
-        step=0.001, inputs={f"I{stage}": 0.3 * np.sin(6.0 * t) ** 4}, intersample={f"I{stage}": "foh"},
+        step=0.001,
+        inputs={f"I{stage}": 0.3 * np.sin(6.0 * t) ** 4},
+        intersample={f"I{stage}": "foh"},
         outputs={f"theta{stage}{k}": np.zeros(t.size) for k in (1, 2)},
-    )  # fmt: skip
+    )
     ours, theirs = (m.simulate(run, tolerance=2e-10) for m in (model(stage), derived(stage)))
     for name in ours.outputs:
         assert np.max(np.abs(ours[name] - theirs[name])) < 1e-9 * np.max(np.abs(theirs[name])), name
@@ -259,10 +283,10 @@ def test_the_core_integrates_by_the_highest_order_whichever_signal_carries_it() 
 
 
 def test_the_jacobian_above_alpha_is_that_of_finite_differences() -> None:
-    run = with_noise(clean_run(1, "multisine"), 40, [1]).slice(None, 0.6)
+    run = with_noise(clean_run(1, "multisine"), 40, [1]).window(None, 0.6)
     for coupling in ("simulated", "measured"):
         problem = FreeProblem.of(replace(ftlm.flexible_link(coupling=coupling), initial="rest"))
-        prepared = [experiment(run, problem, [1.0, 10.0], every=2)]
+        prepared = [sample_run(run, problem, [1.0, 10.0], every=2)]
         named = {"alpha1": 1.93, "gamma1": 0.9, "beta2": 0.23, "mu2": 0.7}
         named |= {"a1": 500.0, "b1": -50.0, "d1": 8.0, "g1": 120.0, "j1": 0.5}
         names = [*problem.orders, *problem.coefficients]
@@ -271,9 +295,17 @@ def test_the_jacobian_above_alpha_is_that_of_finite_differences() -> None:
         def at(values: np.ndarray, problem=problem, prepared=prepared, count=count) -> dict:
             free = list(values[:count]), list(values[count:])
             return _core.output_error(
-                prepared, laws(problem), [(0.01, 3.0)] * count, ["plain"] * len(free[1]),
-                problem.structure.coupling == "simulated", (False, []), *free, [], 1, 1e-12,
-            )  # fmt: skip
+                prepared,
+                laws(problem),
+                [(0.01, 3.0)] * count,
+                ["plain"] * len(free[1]),
+                problem.structure.coupling == "simulated",
+                (False, []),
+                *free,
+                [],
+                1,
+                1e-12,
+            )
 
         base = np.asarray(at(point)["jacobian"])
         for i, name in enumerate(names):
@@ -319,7 +351,7 @@ def test_a_held_input_is_not_differentiated_beyond_the_output() -> None:
 def scores(stage: int, shape: str, level: float, seed: int) -> np.ndarray:
     """z-scores of all nine numbers from the automatic start."""
     run = with_noise(clean_run(stage, shape), level, [seed, round(level), stage])
-    found = ftlm.identify(run, structure(stage), method="output-error", threads=1).joint
+    found = ftlm.identify(run, structure(stage), method="output-error", threads=1).fit
     values = dict(zip(found.names, found.values.tolist(), strict=True))
     assert found.names == list(truth(stage))
     return np.array([(values[n] - v) / found.standard_errors[n] for n, v in truth(stage).items()])

@@ -210,8 +210,8 @@ def test_packed_text_is_limited_and_damage_is_said(tmp_path, monkeypatch):
     assert read(tmp_path, whole, "x.csv.gz").name == "x"
     for bad in (whole[:-9], whole[: len(whole) // 2], whole[:5], b"", whole[:60] + b"\xff" + whole[61:]):
         messages(["x.csv.gz"], lambda bad=bad: read(tmp_path, bad, "x.csv.gz"))
-    monkeypatch.setattr(text, "_LARGEST_UNPACKED", 1000)
-    monkeypatch.setattr(text, "_BLOCK", 500)
+    monkeypatch.setattr(text, "_MAX_UNPACKED_BYTES", 1000)
+    monkeypatch.setattr(text, "_BLOCK_BYTES", 500)
     messages(["unpacked", "more than 1000 bytes"], lambda: read(tmp_path, whole, "x.csv.gz"))
     for name, kind in (("x.mat.gz", ".mat"), ("x.xlsx.gz", "sheet")):
         messages([kind, "unpack it"], lambda name=name: read(tmp_path, whole, name))
@@ -228,9 +228,17 @@ def test_a_hundred_thousand_columns_are_read_and_shown_in_part(tmp_path):
 
 
 SCRIPTS = [
-    "<script>alert(1)</script>", "$(reboot)", "`reboot`", "\x1b[2J\x1b]0;x\x07", "=cmd|' /C calc'!A0",
-    "'; rm -rf ~ #", "__import__('os')", "{{7*7}}", "../../etc/passwd", "\u202egnp",
-]  # fmt: skip
+    "<script>alert(1)</script>",
+    "$(reboot)",
+    "`reboot`",
+    "\x1b[2J\x1b]0;x\x07",
+    "=cmd|' /C calc'!A0",
+    "'; rm -rf ~ #",
+    "__import__('os')",
+    "{{7*7}}",
+    "../../etc/passwd",
+    "\u202egnp",
+]
 
 
 @pytest.mark.parametrize("name", SCRIPTS)
@@ -278,7 +286,7 @@ BAD_SHEETS = {
         ["'t', line 6", "'2024-01-01' stands among numbers"],
     ),
     "a script": ([["t", "u", "<script>"], *BODY], ["'y'", "'<script>'"]),
-}  # fmt: skip
+}
 
 
 @pytest.mark.parametrize("case", BAD_SHEETS)
@@ -393,8 +401,10 @@ def test_matrices_of_hdf5(tmp_path):
         del file["vast"]
     run = ftlm.load(path, time="bench/time", inputs={"u": "bench/V.1"}, outputs={"y": "bench/V.2"})
     np.testing.assert_array_equal(run["y"], y)
-    messages(["'out' (a link)", "'soft' (a link)", "'virtual' (its numbers lie in other files)", "'word' ("],
-             lambda: ftlm.load(path, outputs=["q"]))  # fmt: skip
+    messages(
+        ["'out' (a link)", "'soft' (a link)", "'virtual' (its numbers lie in other files)", "'word' ("],
+        lambda: ftlm.load(path, outputs=["q"]),
+    )
 
 
 def test_mat_of_version_4_is_read(tmp_path):
@@ -433,12 +443,12 @@ def test_no_row_vanishes(tmp_path, content, wanted):
 
 @pytest.mark.parametrize("clock", ["13:00 AM", "24:30", "1" + " " * 70])
 def test_what_is_no_time_of_day(clock):
-    assert not text.is_moment(clock)
-    assert text.Moments.read(["11:59", "1:00 PM"]) is None
+    assert not text.is_timestamp(clock)
+    assert text.Timestamps.read(["11:59", "1:00 PM"]) is None
 
 
 def test_years_of_two_digits_that_may_be_days_are_refused():
-    days = text.Moments.read([f"24-05-0{k}" for k in range(1, 7)])
+    days = text.Timestamps.read([f"24-05-0{k}" for k in range(1, 7)])
     messages(["dates='ymd'", "dates='dmy'"], lambda: days.seconds("x", None))
     assert days.seconds("x", "ymd")[-1] == 5 * 86400.0
 
@@ -482,9 +492,9 @@ def test_a_cell_that_holds_a_duration_has_its_unit_in_itself(tmp_path, title):
 
 
 def test_durations_in_words_of_iso_8601():
-    found = text.Moments.read(["-PT0.5S", "PT0S", "PT90000.25S"])
+    found = text.Timestamps.read(["-PT0.5S", "PT0S", "PT90000.25S"])
     assert found.seconds("t", None).tolist() == [0.0, 0.5, 90000.75]
-    assert text.Moments.read(["PT1S", "12:00"]) is None
+    assert text.Timestamps.read(["PT1S", "12:00"]) is None
 
 
 DATED = {
@@ -511,9 +521,9 @@ def test_the_order_of_dates_that_was_inferred_is_said_and_an_option(tmp_path, da
 
 
 @pytest.mark.parametrize(
-    ("title", "assumed"), [("t", True), ("time", True), ("Zeit", True), ("t_s", False), ("time [ms]", False),
-                           ("seconds", False)],
-)  # fmt: skip
+    ("title", "assumed"),
+    [("t", True), ("time", True), ("Zeit", True), ("t_s", False), ("time [ms]", False), ("seconds", False)],
+)
 def test_seconds_that_nobody_stated_are_said_and_an_option(tmp_path, title, assumed):
     opened = ftlm.open_file(write(tmp_path, f"{title},u,y\n" + rows()), **SIGNALS)
     assert any(a.option == "time_unit" for a in opened.assumed) is assumed
@@ -529,8 +539,8 @@ def test_clocks_of_12_and_of_24_hours_in_one_column_are_refused(tmp_path, monkey
     stamps = stamps[::-1] if first == "24 hours" else stamps
     if first == "another piece":
         # A piece ends between the two, so that each of them is written in one way.
-        monkeypatch.setattr(text, "_BLOCK", 21)
-        monkeypatch.setattr(text, "_SAMPLE", 1)
+        monkeypatch.setattr(text, "_BLOCK_BYTES", 21)
+        monkeypatch.setattr(text, "_SAMPLE_CHARACTERS", 1)
     content = "time,u,y\n" + "".join(f"{stamp},{k},{k}\n" for k, stamp in enumerate(stamps))
     words = ["written in several ways"] if first == "another piece" else [stamps[2], stamps[0], "written in two ways"]
     messages(["'time'", *words], lambda: read(tmp_path, content))
@@ -605,8 +615,10 @@ def test_marks_between_thousands_that_may_be_decimals_are_refused_or_said(tmp_pa
         messages(["line 3", repr(cell)], lambda wrong=wrong: ftlm.load(wrong, **SIGNALS))
     for layout in (dict(thousands="comma", decimal="comma"), dict(thousands="point", decimal="point")):
         messages(["thousands and decimal are both"], lambda layout=layout: ftlm.load(mixed, **SIGNALS, layout=layout))
-    messages(["separator and thousands are both"],
-             lambda: ftlm.load(mixed, **SIGNALS, layout=dict(thousands="space", separator="space")))  # fmt: skip
+    messages(
+        ["separator and thousands are both"],
+        lambda: ftlm.load(mixed, **SIGNALS, layout=dict(thousands="space", separator="space")),
+    )
     messages(["thousands is 3"], lambda: ftlm.load(mixed, **SIGNALS, layout=dict(thousands=3)))
 
 
@@ -654,8 +666,10 @@ def test_units_behind_a_stroke_are_units(tmp_path):
     named = write(tmp_path, "t/s,I/A,theta/deg\n" + "".join(f"{k},{k % 3},{k}\n" for k in range(9)))
     opened = ftlm.open_file(named)
     assert [(c.role, c.signal, c.unit) for c in opened.columns] == [
-        ("time", "", "s"), ("input", "I", "A"), ("output", "theta", "deg")
-    ]  # fmt: skip
+        ("time", "", "s"),
+        ("input", "I", "A"),
+        ("output", "theta", "deg"),
+    ]
     assert opened.load()["theta"][3] == pytest.approx(np.pi / 60)
     # A path, a unit, an abbreviation and a mark for nothing are none of these.
     for name in ("rig/ai/V", "m/s", "N/A", "I/O", "1/s", "in/out", "/A", "A/", "U/min"):

@@ -7,8 +7,8 @@ import pytest
 from scipy.signal import lsim
 
 import ftlm
-from ftlm.simulation.output_samples import FIRST_REFINEMENT, sampled
-from ftlm.simulation.step_refinement import Limit, extrapolated, refined
+from ftlm.simulation.output_samples import FIRST_REFINEMENT, simulate_samples
+from ftlm.simulation.step_refinement import RichardsonTable, extrapolate_row, simulate_refined
 
 TRUTH = np.random.default_rng(0).standard_normal((1, 200))
 SHAPES = list(np.random.default_rng(1).standard_normal((3, 1, 200)))
@@ -21,19 +21,19 @@ def grids(powers: tuple[float, ...], count: int) -> list[np.ndarray]:
 
 
 def told(samples: list[np.ndarray]) -> tuple[np.ndarray, float]:
-    limit = Limit()
+    limit = RichardsonTable()
     for each in samples:
         limit.add(each)
-    found = limit.told()
+    found = limit.estimate()
     return found.samples, float(np.max(found.change))
 
 
 def test_three_powers_of_the_step_are_taken_away():
     rows: list[np.ndarray] = []
     for samples in grids((2, 3, 4), 4):
-        rows = extrapolated(samples, rows)
+        rows = extrapolate_row(samples, rows)
     np.testing.assert_allclose(rows[3], TRUTH, atol=1e-14)
-    np.testing.assert_allclose(extrapolated(*[grids((2,), 2)[1], [grids((2,), 2)[0]]])[1], TRUTH, atol=1e-14)
+    np.testing.assert_allclose(extrapolate_row(*[grids((2,), 2)[1], [grids((2,), 2)[0]]])[1], TRUTH, atol=1e-14)
 
 
 @pytest.mark.parametrize(
@@ -64,7 +64,7 @@ def test_a_logarithm_of_the_step_takes_fewer_grids():
     rows: list[np.ndarray] = []
     moved = []
     for each in samples:
-        rows, before = extrapolated(each, rows), rows
+        rows, before = extrapolate_row(each, rows), rows
         moved.append([float(np.max(np.abs(a - b))) for a, b in zip(rows[1:], before[1:], strict=False)])
     # Not even the finest of these grids was enough for the triangle.
     assert min(moved[5]) > 1e-6
@@ -73,12 +73,12 @@ def test_a_logarithm_of_the_step_takes_fewer_grids():
 def test_numbers_beside_samples_go_where_these_go():
     # Two outputs of different powers, and a number of each that is one of its samples.
     samples = [np.concatenate([a, b]) for a, b in zip(grids((1.37,), 4), grids((1.8,), 4), strict=True)]
-    limit = Limit()
+    limit = RichardsonTable()
     for each in samples:
         limit.add(each, each[[1, 0, 0], [5, 3, 4]])
-    found = limit.told((1, 0, 0))
-    np.testing.assert_allclose(found.beside, TRUTH[0, [5, 3, 4]], atol=1e-12)
-    np.testing.assert_array_equal(found.beside, found.samples[[1, 0, 0], [5, 3, 4]])
+    found = limit.estimate((1, 0, 0))
+    np.testing.assert_allclose(found.initial_terms, TRUTH[0, [5, 3, 4]], atol=1e-12)
+    np.testing.assert_array_equal(found.initial_terms, found.samples[[1, 0, 0], [5, 3, 4]])
 
 
 def test_one_sample_that_moves_tells_no_factor():
@@ -132,10 +132,10 @@ def test_fewer_grids_are_as_close_to_state_space_as_was_asked(words, kind):
     exact = lsim((a, b, np.eye(n)[:1], [[0.0]]), u, t, interp=kind == "foh")[1]
     run = ftlm.Run.from_arrays(step=0.02, inputs={"u": u}, outputs={"y": 0 * u}, intersample={"u": kind})
     model = ftlm.Model(ftlm.equation(words))
-    free = refined(model, run, {}, tolerance=1e-6)
+    free = simulate_refined(model, run, {}, tolerance=1e-6)
     assert np.max(np.abs(free.outputs[0] - exact)) <= 1e-6 * np.max(np.abs(exact))
     # One power alone would have taken more pulses to be as close.
-    two = [sampled(model, run, every, {})[0][0] for every in (free.refinement, free.refinement // 2)]
+    two = [simulate_samples(model, run, every, {})[0][0] for every in (free.refinement, free.refinement // 2)]
     once = (4.0 * two[0] - two[1]) / 3.0
     assert free.refinement <= 16 * FIRST_REFINEMENT
     assert np.max(np.abs(free.outputs[0] - exact)) <= np.max(np.abs(once - exact)) + 1e-9
@@ -157,7 +157,7 @@ def test_a_filtered_signal_with_corners_feeds_through_as_it_was_read():
         step=step, inputs={"u": u, "w": w}, outputs={"y": 0 * u}, intersample={"u": "foh", "w": "foh"}
     )
     # A mean across a corner is off by a share of the step, which no power of it takes away.
-    assert structure.behind_filter
-    found = refined(ftlm.Model(structure), run, {}, tolerance=1e-7)
+    assert structure.all_filtered
+    found = simulate_refined(ftlm.Model(structure), run, {}, tolerance=1e-7)
     assert np.max(np.abs(found.outputs[0] - exact)) <= 1e-6 * np.max(np.abs(exact))
     assert found.refinement <= 32

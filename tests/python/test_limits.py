@@ -10,7 +10,7 @@ from typer.testing import CliRunner
 import ftlm
 from ftlm import cli
 from ftlm.report.typesetting import equation_html, parameter_table
-from ftlm.structure.input_nonlinearity import Limit
+from ftlm.structure.input_nonlinearity import InputNonlinearity
 
 STEP = 0.05
 MATRICES = (np.array([[0.0, 1.0], [-9.0, -1.2]]), np.array([[0.0], [4.5]]), np.eye(2)[:1], np.zeros((1, 1)))
@@ -49,12 +49,13 @@ def run_of(u, y, **options):
 @pytest.mark.parametrize(
     ("words", "options", "by_hand"),
     [
-        ("sat(u, 0.8)", {}, {"sat": 0.8}), ("dead(u, 0.3)", {}, {"dead": 0.3}),
+        ("sat(u, 0.8)", {}, {"sat": 0.8}),
+        ("dead(u, 0.3)", {}, {"dead": 0.3}),
         ("sat(dead(u, 0.3), 0.8)", {}, {"sat": 0.8, "dead": 0.3}),
         ("u", {"saturation": {"u": 0.8}}, {"sat": 0.8}),
         ("u", {"dead_zone": {"u": 0.3}, "saturation": {"u": 0.8}}, {"sat": 0.8, "dead": 0.3}),
     ],
-)  # fmt: skip
+)
 def test_a_free_run_is_scipys_of_the_input_bent_by_hand(words, options, by_hand):
     u = levels(400, 1)
     y = response(bent(u, **by_hand))
@@ -135,10 +136,11 @@ def test_an_input_that_is_linear_in_between_is_limited_at_its_samples():
 @pytest.mark.parametrize(
     ("words", "name", "value", "by_hand"),
     [
-        ("sat(u, 0.1:5)", "sat_u", 0.8, {"sat": 0.8}), ("dead(u, 0:1)", "dead_u", 0.3, {"dead": 0.3}),
+        ("sat(u, 0.1:5)", "sat_u", 0.8, {"sat": 0.8}),
+        ("dead(u, 0:1)", "dead_u", 0.3, {"dead": 0.3}),
         ("sat(dead(u, 0.2), 0.1:5)", "sat_u", 0.7, {"sat": 0.7, "dead": 0.2}),
     ],
-)  # fmt: skip
+)
 def test_a_limit_is_found_within_its_interval(words, name, value, by_hand):
     within = np.zeros(4)
     seeds = 12
@@ -147,7 +149,7 @@ def test_a_limit_is_found_within_its_interval(words, name, value, by_hand):
         y = response(bent(u, **by_hand))
         noisy = y + 0.02 * np.std(y) * np.random.default_rng(seed).standard_normal(y.size)
         found = ftlm.identify(run_of(u, noisy), ftlm.equation(FREE.format(words), initial="rest"), threads=1)
-        assert found.joint.converged
+        assert found.fit.converged
         for k, (n, v) in enumerate((TRUTH | {name: value}).items()):
             low, high = found.intervals[n]
             within[k] += low <= v <= high
@@ -174,8 +176,11 @@ def test_a_limit_is_found_where_rows_have_times_of_their_own():
     times = STEP * (np.arange(600) + np.append(0.0, rng.uniform(-0.05, 0.05, 599)))
     u = levels(600, 15)
     fine = np.repeat(bent(u, sat=0.6), 20)
-    y = np.interp(times, np.arange(fine.size) * STEP / 20, signal.lsim(signal.StateSpace(*MATRICES), fine,
-                  np.arange(fine.size) * STEP / 20, interp=False)[1])  # fmt: skip
+    y = np.interp(
+        times,
+        np.arange(fine.size) * STEP / 20,
+        signal.lsim(signal.StateSpace(*MATRICES), fine, np.arange(fine.size) * STEP / 20, interp=False)[1],
+    )
     noisy = y + 0.02 * np.std(y) * rng.standard_normal(y.size)
     run = ftlm.Run.from_arrays(time=times, inputs={"u": u}, outputs={"y": noisy}, resample=STEP)
     found = ftlm.identify(run, ftlm.equation(FREE.format("sat(u, 0.1:3)"), initial="rest"), threads=1)
@@ -215,7 +220,10 @@ def test_words_are_printed_back():
     text = "D^2 y = d D^0.5 y + a y + b sat(dead(u, 0.05), 0.5:1.5)"
     structure = ftlm.equation(text)
     assert str(structure) == text
-    assert structure.limits == (Limit("u", "dead_zone", 0.05), Limit("u", "saturation", (0.5, 1.5)))
+    assert structure.limits == (
+        InputNonlinearity("u", "dead_zone", 0.05),
+        InputNonlinearity("u", "saturation", (0.5, 1.5)),
+    )
     assert ftlm.equation(str(structure)) == structure
     same = ftlm.equation("D^2 y = d D^0.5 y + a y + b u", dead_zone={"u": 0.05}, saturation={"u": (0.5, 1.5)})
     assert same == structure
@@ -238,7 +246,7 @@ def test_a_model_with_limits_is_kept(tmp_path):
     assert f"sat(u, {found.limits['sat_u']:.6g})" in str(found)
     html = str(equation_html(again.equations[0], limits=again.structure.limits))
     assert "<mi>sat</mi>" in html
-    assert "saturation of u" in parameter_table(again, found.joint).to_html()
+    assert "saturation of u" in parameter_table(again, found.fit).to_html()
     text = found.report(tmp_path / "report.html").read_text()
     assert "saturation of" in text
     assert found.to_dict()["limits"] == found.limits
@@ -247,10 +255,12 @@ def test_a_model_with_limits_is_kept(tmp_path):
 @pytest.mark.parametrize(
     ("text", "options", "words"),
     [
-        ("D y = a y + b sat(u, -1)", {}, "expected a limit"), ("D y = a y + b sat(u)", {}, "expected ','"),
+        ("D y = a y + b sat(u, -1)", {}, "expected a limit"),
+        ("D y = a y + b sat(u)", {}, "expected ','"),
         ("D y = a y + b sat(u, 0)", {}, "saturation of u = 0.0 is no number above 0"),
         ("D y = a y + b sat(u, 2:1)", {}, "from 2.0 to 1.0 is no interval"),
-        ("D y = a y + b sat(u, 1", {}, "expected '\\)'"), ("D y = a y + b sat(D u, 1)", {}, "the name of a signal"),
+        ("D y = a y + b sat(u, 1", {}, "expected '\\)'"),
+        ("D y = a y + b sat(D u, 1)", {}, "the name of a signal"),
         ("D y = a y + b sat(u, 1) + c u", {}, "limited and as it is"),
         ("D y = a y + b sat(u, 1) + d D^0.5 sat(u, 2)", {}, "two limits of one kind"),
         ("D y = a y + b dead(sat(u, 1), 0.1)", {}, "a dead zone acts before a saturation"),
@@ -264,7 +274,7 @@ def test_a_model_with_limits_is_kept(tmp_path):
         ("D y = a y + b u", {"saturation": {"u": (1, 2)}, "delay": {"u": (0, 0.1)}}, "one number of an input"),
         ("D y = a y + sat_u u", {"saturation": {"u": (1, 2)}}, "call the coefficient otherwise"),
     ],
-)  # fmt: skip
+)
 def test_what_is_no_limit_is_refused_in_words(text, options, words):
     with pytest.raises(ftlm.ModelError, match=words):
         ftlm.equation(text, **options)

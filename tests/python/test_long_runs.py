@@ -11,11 +11,11 @@ from scipy.signal import cont2discrete, lfilter, ss2tf
 from scipy.special import erfcx
 
 import ftlm
-from ftlm.estimation.objective import Asked
-from ftlm.estimation.output_error import Outset
+from ftlm.estimation.objective import RunSampler
+from ftlm.estimation.output_error import Initialization
 from ftlm.simulation import step_refinement as long
-from ftlm.simulation.output_samples import started
-from ftlm.simulation.step_refinement import refined
+from ftlm.simulation.output_samples import with_initial_conditions
+from ftlm.simulation.step_refinement import simulate_refined
 
 STEP = 0.02
 
@@ -80,12 +80,13 @@ EVERY = {
     "coupled": ("D^1.6 y = -9 y + 2 z + u\nD^0.9 z = -3 z - y + v", "zoh", {"coupling": "simulated"}),
     "each driven by the other": ("D^1.6 y = -9 y + 2 z + u\nD^0.9 z = -3 z - y + v", "zoh", {"coupling": "measured"}),
     "through a filter": (
-        "D^1.5 y = -9 y + u", "zoh",
+        "D^1.5 y = -9 y + u",
+        "zoh",
         {"sensor_filter": ftlm.SensorFilter.low_pass(["y"], 3.0, 0.7), "coupling": "simulated"},
     ),
     "a limit": ("D^1.4 y = -4 y + 2 u", "zoh", {"saturation": {"u": 0.8}}),
     "an offset": ("D^1.4 y = -4 y + 2 u + c", "zoh", {}),
-}  # fmt: skip
+}
 
 #: None of an input that acted before the run began.
 NONE = ("two inputs, feed-through, delay",)
@@ -106,10 +107,13 @@ def test_the_same_run_as_on_whole_grids(case, moving, monkeypatch):
     words, kind, more = EVERY[case]
     model = ftlm.Model(ftlm.equation(words, **{"initial": "auto", **more}))
     run = noisy(1200, kind, moving=moving)
-    whole = refined(model, run, None, tolerance=1e-6, largest_m=1 << 16)
-    monkeypatch.setattr(long, "LONG", 1000)
-    assert long.long_run(started(model, run), run, None, tolerance=1.0, largest_m=1 << 16) is not None or case in NONE
-    pieces = refined(model, run, None, tolerance=1e-6, largest_m=1 << 16)
+    whole = simulate_refined(model, run, None, tolerance=1e-6, largest_m=1 << 16)
+    monkeypatch.setattr(long, "LONG_RECORD_INTERVALS", 1000)
+    assert (
+        long.simulate_long(with_initial_conditions(model, run), run, None, tolerance=1.0, largest_m=1 << 16) is not None
+        or case in NONE
+    )
+    pieces = simulate_refined(model, run, None, tolerance=1e-6, largest_m=1 << 16)
     assert pieces.refinement < whole.refinement or moving
     size = np.max(np.abs(whole.outputs), axis=1)
     apart = np.max(np.abs(pieces.outputs - whole.outputs), axis=1) / size
@@ -120,11 +124,11 @@ def test_the_same_run_as_on_whole_grids(case, moving, monkeypatch):
 @pytest.mark.parametrize("words", ["D^2 y = -15000 y - 4 D y + u", "D^1.9 y = -9000 y + u", "D^0.3 y = -80 y + u"])
 def test_what_is_left_is_told(words, monkeypatch):
     """With few pulses the change that is told is no less than a small part of the error."""
-    monkeypatch.setattr(long, "LONG", 1000)
+    monkeypatch.setattr(long, "LONG_RECORD_INTERVALS", 1000)
     model, run = ftlm.Model(ftlm.equation(words)), record(2001, u=switched(2001, every=7))
-    fine = refined(model, run, None, tolerance=1e-9, largest_m=1 << 18)
+    fine = simulate_refined(model, run, None, tolerance=1e-9, largest_m=1 << 18)
     for largest_m in (1 << 13, 1 << 14, 1 << 15):
-        found = refined(model, run, None, tolerance=1e-9, largest_m=largest_m)
+        found = simulate_refined(model, run, None, tolerance=1e-9, largest_m=largest_m)
         assert error(found.outputs, fine.outputs) <= 2.5 * (float(found.change[0]) + float(fine.change[0])) + 1e-12
 
 
@@ -144,18 +148,20 @@ def test_starts_of_a_long_fast_record_compete_on_a_part_that_still_shows_its_mot
     u = np.repeat(rng.choice([-1.0, 1.0], size=1200), 50)
     y = lfilter(*(np.ravel(p) for p in cont2discrete(([1.0], [1.0, 2.0, 400.0]), 0.01)[:2]), u)
     asked: set[tuple[int, int | None]] = set()
-    sampled = Asked.sampled
+    sampled = RunSampler.sample
 
-    def noted(self: Asked, every: int, decimation: int, first: int | None) -> list[Any]:
+    def noted(self: RunSampler, every: int, decimation: int, first: int | None) -> list[Any]:
         asked.add((decimation, first))
         return sampled(self, every, decimation, first)
 
-    monkeypatch.setattr(Asked, "sampled", noted)
+    monkeypatch.setattr(RunSampler, "sample", noted)
     structure = ftlm.equation("D^2 y = d D y + a y + b u", initial="rest")
 
     def raced(y: np.ndarray) -> tuple[int, int | None]:
         asked.clear()
-        Outset.of([ftlm.Run.from_arrays(step=0.01, inputs={"u": u}, outputs={"y": y})], structure).race(2, None)
+        Initialization.of(
+            [ftlm.Run.from_arrays(step=0.01, inputs={"u": u}, outputs={"y": y})], structure
+        ).run_multistart(2, None)
         (found,) = asked
         return found
 

@@ -305,9 +305,17 @@ def test_written_out_law_is_the_structure_of_flexible_link(plants, plant):
 
 
 EFFECTIVE = {
-    "a1": 628.889, "b1": -62.956, "g1": 140.471, "a2": -863.332, "a3": 2271.117, "b3": -496.763, "d3": 28.351,
-    "g3": 288.122, "a4": -3336.200, "d4": -41.647,
-}  # fmt: skip
+    "a1": 628.889,
+    "b1": -62.956,
+    "g1": 140.471,
+    "a2": -863.332,
+    "a3": 2271.117,
+    "b3": -496.763,
+    "d3": 28.351,
+    "g3": 288.122,
+    "a4": -3336.200,
+    "d4": -41.647,
+}
 
 
 @pytest.mark.parametrize("name", EFFECTIVE)
@@ -328,7 +336,7 @@ def test_table_3_parameters(name, value):
 
 
 def test_how_table_3_differs_from_the_effective_parameters():
-    effective, printed = ftlm.PARAMETERS["effective"], ftlm.PARAMETERS["table-3"]
+    effective, printed = ftlm.PARAMETER_SETS["effective"], ftlm.PARAMETER_SETS["table-3"]
     for stage in (1, 2):
         assert effective[stage].stiffness / printed[stage].stiffness == pytest.approx(14.8, abs=0.06)
     assert printed[2].link_friction / effective[2].link_friction == pytest.approx(10, rel=1e-3)
@@ -476,7 +484,7 @@ def test_one_coefficient_follows_x_p_over_p_plus_c():
 
 
 def equation_error_search(run, structure, alpha):
-    lattice = ftlm.lattice(alpha=alpha)
+    lattice = ftlm.order_grid(alpha=alpha)
     return ftlm.search_orders(
         run, structure, lattice, criterion="equation-error", coefficients="least-squares", norm="l2", keep=3
     )
@@ -567,7 +575,7 @@ def test_plant_a_standard_deviations_with_derived_input_order(plants, drive):
 @pytest.mark.parametrize("coefficients", ["least-squares"])
 def test_search_finds_plant_a_from_clean_samples(clean_a, coefficients):
     structure = ftlm.flexible_link(form="published").equation("theta12")
-    found = ftlm.search_orders(clean_a, structure, ftlm.lattice(alpha=(1.05, 2.0)), coefficients=coefficients)
+    found = ftlm.search_orders(clean_a, structure, ftlm.order_grid(alpha=(1.05, 2.0)), coefficients=coefficients)
     assert found.candidates == 313_845
     # Own orders are unordered within the signal: the larger comes first.
     assert found.orders == {"alpha2": 2.0, "beta2": 0.85, "gamma2": 1.05, "mu2": 0.1}
@@ -577,7 +585,7 @@ def test_search_finds_plant_a_from_clean_samples(clean_a, coefficients):
 
 def test_plant_a_hub_orders_are_found_from_clean_samples(clean_a):
     structure = ftlm.flexible_link(form="published").equation("theta11")
-    found = ftlm.search_orders(clean_a, structure, ftlm.lattice(alpha=(1.8, 2.0)), coefficients="least-squares")
+    found = ftlm.search_orders(clean_a, structure, ftlm.order_grid(alpha=(1.8, 2.0)), coefficients="least-squares")
     assert found.orders == {"alpha1": 2.0, "beta1": 0.75, "gamma1": 0.95, "mu1": 0.0}
     assert found.coefficients["d1"] == pytest.approx(628.89, rel=1e-3)
 
@@ -614,7 +622,7 @@ def test_least_squares_column_of_3t(snr):
 
 def test_lattice_of_p1_has_313_845_candidates():
     structure = ftlm.flexible_link(form="published").equation("theta12")
-    values = ftlm.lattice(alpha=(1.05, 2.0)).values(structure)
+    values = ftlm.order_grid(alpha=(1.05, 2.0)).values(structure)
     term = {n: list(values[n]) for n in values}
     axes = [(0, term["beta2"], True), (1, term["gamma2"], False), (0, term["mu2"], True), (2, [0.0], False)]
     assert _core.lattice_size((0, term["alpha2"], axes), [False, False, True]) == 313_845

@@ -10,7 +10,13 @@ import pytest
 
 import ftlm
 from ftlm.errors import ModelError
-from ftlm.utils.resources import GIVEN, SHARE, UNKNOWN, available_memory, memory_limit
+from ftlm.utils.resources import (
+    DEFAULT_MEMORY_SHARE,
+    FALLBACK_MEMORY_BYTES,
+    MEMORY_VARIABLE,
+    available_memory,
+    memory_limit,
+)
 
 REFUSED = re.compile(r"(\d+) regressors of all runs.* need (\d+) bytes, more than the (\d+) that a search may take")
 
@@ -55,18 +61,18 @@ V1 = {
     ids=["kernel", "groups", "older groups", "strange groups", "groups alone", "beyond its limit"],
 )
 def test_a_machine_is_asked_what_it_has_left(tmp_path, monkeypatch, files, left):
-    monkeypatch.delenv(GIVEN, raising=False)
+    monkeypatch.delenv(MEMORY_VARIABLE, raising=False)
     system = machine(tmp_path, **files)
     assert available_memory(system) == left
-    assert memory_limit(system) == int(SHARE * left)
+    assert memory_limit(system) == int(DEFAULT_MEMORY_SHARE * left)
 
 
 def test_a_machine_that_tells_nothing_gives_what_is_safe(tmp_path, monkeypatch):
-    monkeypatch.delenv(GIVEN, raising=False)
+    monkeypatch.delenv(MEMORY_VARIABLE, raising=False)
     assert available_memory(tmp_path) > 1 << 20
     monkeypatch.setattr("os.sysconf", lambda _: (_ for _ in ()).throw(ValueError), raising=False)
     assert available_memory(tmp_path) is None
-    assert memory_limit(tmp_path) == UNKNOWN
+    assert memory_limit(tmp_path) == FALLBACK_MEMORY_BYTES
 
 
 def test_this_machine_answers():
@@ -78,13 +84,13 @@ SIZES = {"1": 1, "12345": 12345, "3K": 3072, "2GiB": 2 << 30, "512M": 512 << 20,
 
 @pytest.mark.parametrize("text", SIZES)
 def test_a_limit_that_is_given_counts(monkeypatch, text):
-    monkeypatch.setenv(GIVEN, text)
+    monkeypatch.setenv(MEMORY_VARIABLE, text)
     assert memory_limit() == SIZES[text]
 
 
 @pytest.mark.parametrize("text", ["0", "-1", "2 GiB", "much", "1e9", "nan", "٣", "9" * 18 + "T", "0x10"])
 def test_a_limit_that_is_none_is_refused(monkeypatch, text):
-    monkeypatch.setenv(GIVEN, text)
+    monkeypatch.setenv(MEMORY_VARIABLE, text)
     with pytest.raises(ModelError, match=r"FTLM_MEMORY=.* is no size of memory"):
         memory_limit()
 
@@ -111,13 +117,15 @@ CASES = {
 
 
 def search(structure, runs, **options):
-    lattice = ftlm.lattice(step=0.1) if structure is ONE else ftlm.Lattice(step=0.1, orders={"alpha": (1.9, 2.0)})
+    lattice = (
+        ftlm.order_grid(step=0.1) if structure is ONE else ftlm.OrderGrid(increment=0.1, orders={"alpha": (1.9, 2.0)})
+    )
     return ftlm.search_orders(runs, structure, lattice, m=64, keep=5, **options)
 
 
 def needed(monkeypatch, structure, runs, **options):
     """Columns and bytes that a search says it needs."""
-    monkeypatch.setenv(GIVEN, "1")
+    monkeypatch.setenv(MEMORY_VARIABLE, "1")
     with pytest.raises(ModelError) as refused:
         search(structure, runs, **options)
     assert "or allow more by FTLM_MEMORY" in str(refused.value)
@@ -134,30 +142,30 @@ def test_the_border_is_exact_and_all_runs_count(monkeypatch, case):
     assert columns == same
     # A bank of each run at least.
     assert three - one >= 2 * 8 * 64 * columns
-    monkeypatch.setenv(GIVEN, str(one))
+    monkeypatch.setenv(MEMORY_VARIABLE, str(one))
     found = search(structure, of_one, **options)
-    monkeypatch.setenv(GIVEN, str(one - 1))
+    monkeypatch.setenv(MEMORY_VARIABLE, str(one - 1))
     with pytest.raises(ModelError, match=f"need {one} bytes, more than the {one - 1} that"):
         search(structure, of_one, **options)
-    monkeypatch.delenv(GIVEN)
+    monkeypatch.delenv(MEMORY_VARIABLE)
     assert str(search(structure, of_one, **options)) == str(found)
 
 
 def test_a_layout_and_the_banks_of_all_its_equations_count_together(monkeypatch, plant, drive):
     run = plant("A").simulate(drive("A", samples=201), tolerance=1e-5)
     options = {"coefficients": "least-squares"}
-    monkeypatch.setenv(GIVEN, "1")
+    monkeypatch.setenv(MEMORY_VARIABLE, "1")
     with pytest.raises(ModelError, match="rows of the layout of the order law need") as refused:
         search(LAW, [run], **options)
     layout = int(re.search(r"need (\d+) bytes", str(refused.value))[1])
-    monkeypatch.setenv(GIVEN, str(layout))
+    monkeypatch.setenv(MEMORY_VARIABLE, str(layout))
     search(LAW, [run], **options)
     with pytest.raises(ModelError) as refused:
         search(LAW, [run] * 300, **options)
     assert "and the layout of the order law need" in str(refused.value)
     both = int(REFUSED.search(str(refused.value))[2])
     assert both > layout
-    monkeypatch.setenv(GIVEN, str(layout - 1))
+    monkeypatch.setenv(MEMORY_VARIABLE, str(layout - 1))
     with pytest.raises(ModelError, match=f"rows of the layout of the order law need {layout} bytes"):
         search(LAW, [run], **options)
 
@@ -186,7 +194,7 @@ print(held() - before)
 
 @pytest.mark.skipif(sys.platform != "linux", reason="peaks are counted in kB on Linux")
 def test_what_is_too_large_is_refused_before_it_is_allocated(monkeypatch):
-    monkeypatch.setenv(GIVEN, "300M")
+    monkeypatch.setenv(MEMORY_VARIABLE, "300M")
     done = subprocess.run([sys.executable, "-c", TOO_LARGE], capture_output=True, text=True, check=True, timeout=60)
     message, peak = done.stdout.splitlines()
     told = REFUSED.search(message)

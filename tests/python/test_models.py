@@ -14,12 +14,12 @@ from hypothesis import strategies as st
 
 import ftlm
 from ftlm.model.serialization import ModelFile
-from ftlm.structure.equation import numeric
-from ftlm.structure.order import grid, parse_values
+from ftlm.structure.equation import format_equation
+from ftlm.structure.order import order_axis, parse_values
 from ftlm.structure.parser import parse_equation
 from ftlm.structure.sensor_filter import SensorFilter
 from ftlm.structure.structure import check_initial
-from ftlm.utils.files import COMMAND, PLAIN, RUN, check_free, check_new, write_atomically
+from ftlm.utils.files import COMMAND_MESSAGES, DEFAULT_MESSAGES, RUN_MESSAGES, check_free, check_new, write_atomically
 
 # ----------------------------------------------------------------------------------------------------------------------
 # Orders
@@ -59,12 +59,39 @@ def test_order_is_read(text, constant, weights):
 @pytest.mark.parametrize(
     "text",
     [
-        "", " ", "alpha*mu", "alpha**2", "alpha^2", "sin(alpha)", "alpha/mu", "1/0", "1/0.0", "alpha[0]", "alpha.x",
-        "alpha mu", "2alpha", "'alpha'", "True", "None", "1j", "lambda", "alpha,mu", "[1]", "alpha if 1 else 2",
-        "alpha := 1", "9" * 400, "(" * 500, "alpha\0", "not alpha", "alpha < 1", "f'{alpha}'", "__import__('os')()",
-        True, None,
+        "",
+        " ",
+        "alpha*mu",
+        "alpha**2",
+        "alpha^2",
+        "sin(alpha)",
+        "alpha/mu",
+        "1/0",
+        "1/0.0",
+        "alpha[0]",
+        "alpha.x",
+        "alpha mu",
+        "2alpha",
+        "'alpha'",
+        "True",
+        "None",
+        "1j",
+        "lambda",
+        "alpha,mu",
+        "[1]",
+        "alpha if 1 else 2",
+        "alpha := 1",
+        "9" * 400,
+        "(" * 500,
+        "alpha\0",
+        "not alpha",
+        "alpha < 1",
+        "f'{alpha}'",
+        "__import__('os')()",
+        True,
+        None,
     ],
-)  # fmt: skip
+)
 def test_order_that_is_none_is_refused(text):
     with pytest.raises(ftlm.ModelError, match="neither a number nor a sum of named orders; write"):
         ftlm.Order.parse(text)
@@ -147,7 +174,7 @@ def terms_of(text):
         ("D^2 Dy = D1 Dy", "Dy", "2", [(1, "D1", "0", "Dy")]),
         ("D^1.5 e5 = 2 e5", "e5", "1.5", [(1, 2, "0", "e5")]),
     ],
-)  # fmt: skip
+)
 def test_equation_is_read(text, output, order, terms):
     assert terms_of(text) == (output, order, terms)
 
@@ -185,7 +212,7 @@ def test_equation_is_read(text, output, order, terms):
         ("3 y = a u", 1, "expected the name of a signal at character 1, found '3'"),
         ("y = a u", 0, "its left-hand side has no derivative; write it as in 'D^1.5 y = …'"),
     ],
-)  # fmt: skip
+)
 def test_text_that_is_no_equation_is_refused_at_its_place(text, place, message):
     with pytest.raises(ftlm.ModelError) as refused:
         ftlm.equation(text)
@@ -346,7 +373,7 @@ def test_values_that_are_none_are_refused(spec, message):
 
 
 def test_grid_has_no_rounding_errors():
-    values = grid("alpha", 0.0, 2.0, 0.05)
+    values = order_axis("alpha", 0.0, 2.0, 0.05)
     assert len(values) == 41
     assert values == tuple(float(f"{0.05 * i:.2f}") for i in range(41))
 
@@ -499,7 +526,7 @@ def test_structures_and_models_print_well():
     assert structure._repr_html_() == "<pre>D^alpha y = -2.0 a D^0.5 y + b u</pre>"
     model = ftlm.Model(ftlm.equation("D^1.5 y = -2.123456789 D^0.5 y + 1e-7 u - 3e8 v"))
     assert str(model) == "D^1.5 y = -2.12346 D^0.5 y + 1e-07 u - 3e+08 v"
-    assert numeric(model.equations[0]) == str(model)
+    assert format_equation(model.equations[0]) == str(model)
 
 
 # ----------------------------------------------------------------------------------------------------------------------
@@ -621,9 +648,9 @@ FORCED = "exists; {} with force=True (--force)"
 @pytest.mark.parametrize(
     ("words", "exists", "folder", "missing"),
     [
-        (PLAIN, f"{{}} {FORCED}", f"{{}} {FORCED}", "{} is no folder"),
-        (RUN, f"'{{}}' {FORCED}", "'{}' is a folder; give the name of a file in it", "'{}' is no folder"),
-        (COMMAND, "{} exists; {} with --force", "{} is a folder; name a file in it", "{} is no folder"),
+        (DEFAULT_MESSAGES, f"{{}} {FORCED}", f"{{}} {FORCED}", "{} is no folder"),
+        (RUN_MESSAGES, f"'{{}}' {FORCED}", "'{}' is a folder; give the name of a file in it", "'{}' is no folder"),
+        (COMMAND_MESSAGES, "{} exists; {} with --force", "{} is a folder; name a file in it", "{} is no folder"),
     ],
 )
 def test_whether_a_file_may_be_written_is_said_in_the_words_of_who_asks(tmp_path, words, exists, folder, missing):
@@ -742,11 +769,13 @@ def test_hostile_model_files_are_refused(kind, tmp_path):
     assert message.startswith(str(path))
     later = f"has schema 9, and this version, {ftlm.__version__}, reads up to 8; upgrade ftlm"
     expected = {
-        "too large": "1048577 bytes", "later schema": later, "later schema with what is in it": later,
+        "too large": "1048577 bytes",
+        "later schema": later,
+        "later schema with what is in it": later,
         "later schema, and who wrote it": f"is a model of a later version of ftlm, 'ftlm 7.1': it has schema {10**30}",
         "schema of more than it holds": "says that it has schema 3, and what it holds has schema 2; give a file",
         "unknown key": "is no ftlm model: Object contains unknown field `extra`",
-    }  # fmt: skip
+    }
     assert expected.get(kind, "") in message
 
 

@@ -10,8 +10,8 @@ import pytest
 import ftlm
 from ftlm.analysis import dcgain, modes, steady_states
 from ftlm.analysis.poles import _mode, characteristic, right_zeros, zeros_of
-from ftlm.report.html_report import behaviour_tables
-from ftlm.report.text_summary import behaviour_in_words
+from ftlm.report.html_report import behavior_tables
+from ftlm.report.text_summary import behavior_lines
 
 
 def model(words, covariance=None, **options):
@@ -42,12 +42,12 @@ def test_whole_orders_are_as_python_control_has_them(words):
 def test_one_order_alone_has_its_time_constant_in_closed_form():
     for alpha in (0.4, 0.5, 0.75, 0.9, 0.9137, 1.0):
         (only,) = modes(model(f"D^{alpha} y = -2 y + u"))
-        assert not only.swings
+        assert not only.oscillatory
         assert only.time_constant == pytest.approx(2.0 ** (-1 / alpha), rel=1e-9)
     # Above order 1 it swings: s = a^(1/alpha) exp(j pi/alpha).
     for alpha in (1.3, 1.61803, 1.9):
         (only,) = modes(model(f"D^{alpha} y = -2 y + u"))
-        assert only.swings
+        assert only.oscillatory
         assert only.pole == pytest.approx(2 ** (1 / alpha) * np.exp(1j * math.pi / alpha), rel=1e-9)
         assert only.damping == pytest.approx(-math.cos(math.pi / alpha), rel=1e-9)
 
@@ -83,17 +83,17 @@ def test_a_coupled_model_has_the_poles_of_all_its_equations():
     arm = ftlm.link_model(stage=1)
     upper = sorted((s for s in arm.poles() if s.imag >= -1e-9), key=abs)
     assert [m.pole.real for m in arm.modes()] == pytest.approx([s.real for s in upper], rel=1e-7)
-    assert [m.swings for m in arm.modes()] == [True, False]
+    assert [m.oscillatory for m in arm.modes()] == [True, False]
 
 
 def test_what_grows_says_so():
     (swing,) = modes(model("D^2 y = 0.6 D y - 9 y + u"))
-    assert swing.grows
+    assert swing.unstable
     assert "grows" in str(swing)
     (away,) = modes(model("D y = 2 y + u"))
-    assert (away.grows, away.swings, away.time_constant) == (True, False, 0.5)
+    assert (away.unstable, away.oscillatory, away.time_constant) == (True, False, 0.5)
     (still,) = modes(model("D^2 y = -9 y + u"))
-    assert (still.damping, still.grows, still.time_constant) == (0.0, False, math.inf)
+    assert (still.damping, still.unstable, still.time_constant) == (0.0, False, math.inf)
 
 
 # ----------------------------------------------------------------------------------------------------------------------
@@ -160,21 +160,21 @@ def test_the_error_of_an_order_says_whether_a_steady_state_is_a_gain():
     assert (near.order, near.rate) == (pytest.approx(0.03), pytest.approx(2.0))
     assert near.order_error == pytest.approx(0.02, rel=1e-3)
     assert near.error == pytest.approx(0.05, rel=1e-3)
-    words = behaviour_in_words(model("D^1.5 y = -2 D^0.03 y + 4 u", spread))
+    words = behavior_lines(model("D^1.5 y = -2 D^0.03 y + 4 u", spread))
     assert words[0].endswith("t^0.03/Γ(1.03); order 0.030 ± 0.020, which may be 0: a gain")
-    (table, _) = behaviour_tables(model("D^1.5 y = -2 D^0.03 y + 4 u", spread))
+    (table, _) = behavior_tables(model("D^1.5 y = -2 D^0.03 y + 4 u", spread))
     assert "which may be 0: a gain" in str(table.to_html())
     spread[1, 1] = 0.01**2
-    assert behaviour_in_words(model("D^1.5 y = -2 D^0.03 y + 4 u", spread))[0].endswith("; order 0.0300 ± 0.0100")
+    assert behavior_lines(model("D^1.5 y = -2 D^0.03 y + 4 u", spread))[0].endswith("; order 0.0300 ± 0.0100")
     assert (
         "0.97 ± 0.10, which may be 1: an integrator"
-        in behaviour_in_words(model("D^1.5 y = -2 D^0.97 y + 4 u", 100 * spread))[0]
+        in behavior_lines(model("D^1.5 y = -2 D^0.97 y + 4 u", 100 * spread))[0]
     )
     # Orders that were given have no error, and alpha does not move what is left in the end.
     spread[1, 1], spread[0, 0] = 0.0, 0.1**2
     (given,) = steady_states(model("D^1.5 y = -2 y + 4 u", spread))
     assert given.order_error == 0.0
-    assert behaviour_in_words(model("D^1.5 y = -2 y + 4 u", spread))[0].endswith("2.000 ± 0.050")
+    assert behavior_lines(model("D^1.5 y = -2 y + 4 u", spread))[0].endswith("2.000 ± 0.050")
 
 
 # ----------------------------------------------------------------------------------------------------------------------
@@ -257,9 +257,9 @@ def test_what_hardly_anything_tells_is_no_certain_decay():
     # Right of the axis, and its angle unknown: it is not turned onto the negative axis.
     growing = _mode(complex(np.log(3.0), 1.2), (0.1, 5.0, 2.0))
     assert growing.pole.real > 0
-    assert growing.swings
+    assert growing.oscillatory
     # A little off the axis, within what its own uncertainty says: a relaxation.
-    assert not _mode(complex(np.log(3.0), np.pi - 0.03), (0.1, 0.1, 0.1)).swings
+    assert not _mode(complex(np.log(3.0), np.pi - 0.03), (0.1, 0.1, 0.1)).oscillatory
 
 
 def test_a_dead_time_is_waited_for_and_an_order_of_nearly_0_is_0():

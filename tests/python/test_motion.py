@@ -18,8 +18,8 @@ import motion
 import oracles
 from ftlm import cli
 from ftlm.simulation.discretization import prepare, record
-from ftlm.simulation.initial_conditions import decided, history, misfit, misfit_of_fits
-from ftlm.simulation.output_samples import started
+from ftlm.simulation.initial_conditions import history, misfit, misfit_of_fits, resolve_initial_conditions
+from ftlm.simulation.output_samples import with_initial_conditions
 from ftlm.structure.structure import History
 
 WORDS = motion.PLANTS["0.7"].words
@@ -245,7 +245,9 @@ def test_the_length_follows_the_noise_never_the_fit(halves):
     assert lengths[-1] < lengths[0]
     # A model that fits worse asks for no other powers.
     worse = replace(found.model.structure, equations=structure.with_orders({"alpha": 0.6}).equations)
-    assert decided(run, worse) == decided(run, structure) == history(run, structure)
+    assert (
+        resolve_initial_conditions(run, worse) == resolve_initial_conditions(run, structure) == history(run, structure)
+    )
     assert history(run, ftlm.equation("D^4.2 y = a y + b u"))[-3:] == (2.0, 3.0, 4.0)
     short = run.slice(None, 3.0)
     assert history(short, structure) == (0.0, 0.25, 0.5, 0.75, 1.0, 2.0)
@@ -261,10 +263,10 @@ def test_runs_of_one_fit_have_one_rule(halves):
 
 def test_started_leaves_stated_terms_alone(halves):
     (_, run), (_, found) = halves
-    assert isinstance(started(found.model, run).structure.initial, History)
+    assert isinstance(with_initial_conditions(found.model, run).structure.initial, History)
     for stated in ("rest", "caputo", (0.0, 0.5)):
         model = replace(found.model, structure=replace(found.model.structure, initial=stated))
-        assert started(model, run).structure.initial == stated
+        assert with_initial_conditions(model, run).structure.initial == stated
 
 
 @pytest.mark.parametrize("method", ["least-squares", "instrumental-variables", "multi-innovation"])

@@ -19,13 +19,13 @@ import oracles
 import plants
 from ftlm.cli.main import app
 from ftlm.estimation.free_parameters import FreeProblem
-from ftlm.estimation.output_error import fit_output_error, freedom, freedom_of
-from ftlm.experiment_design.design_input import multisine, square
-from ftlm.experiment_design.exchange import exchanged, judged
+from ftlm.estimation.output_error import fit_output_error, parameter_set, parameter_set_of
+from ftlm.experiment_design.design_input import multisine, square_wave
+from ftlm.experiment_design.exchange import exchange_holds, scaled_design
 from ftlm.experiment_design.problem import Bounds, Criterion
-from ftlm.experiment_design.sensitivity import Laid, Sensitivities
-from ftlm.experiment_design.spectrum import Lines, best_spectrum, lines_of
-from ftlm.model.model import Freedom
+from ftlm.experiment_design.sensitivity import ModelFit, Sensitivities
+from ftlm.experiment_design.spectrum import SpectralLines, best_spectrum, spectral_lines
+from ftlm.model.model import FitParameters
 from ftlm.reproduction.simulated_arm import demo_plant
 
 STEP, NOISE, ROWS = 0.05, 0.01, 201
@@ -50,7 +50,7 @@ def fitted(words: str, free: str, start: dict[str, float], **options: object) ->
     values = dict(zip(joint.names, joint.values.tolist(), strict=True))
     solved = structure.with_orders(joint.orders).with_coefficients(joint.coefficients).with_inputs(joint.inputs)
     estimate = ftlm.Estimate(
-        "output-error", ("first",), values, free=structs.replace(freedom(joint, structure), refinement=8)
+        "output-error", ("first",), values, free=structs.replace(parameter_set(joint, structure), refinement=8)
     )
     return ftlm.Model(solved, joint.orders, estimate=estimate)
 
@@ -122,28 +122,30 @@ STRUCTURES = {
     "late": (PLANT, FREE, TRUTH, {"delay": {"u": 0.07}}),
     "delay": (PLANT, FREE, TRUTH | {"delay_u": 0.01}, {"free_delays": {"u": (0.0, 0.3)}}),
     "inputs": (
-        "D^1.6 y = -0.8 D^0.6 y - 4 y + 3 u + 2 v", "D^alpha y = a1 D^0.6 y + a0 y + b0 u + b1 v",
-        TRUTH | {"b1": 2.0}, {},
+        "D^1.6 y = -0.8 D^0.6 y - 4 y + 3 u + 2 v",
+        "D^alpha y = a1 D^0.6 y + a0 y + b0 u + b1 v",
+        TRUTH | {"b1": 2.0},
+        {},
     ),
     "two": (*COUPLED, {"coupling": "simulated"}),
     "measured": (*COUPLED, {"coupling": "measured"}),
-}  # fmt: skip
+}
 
 
 @pytest.fixture(scope="module", params=STRUCTURES)
-def laid(request: pytest.FixtureRequest) -> Laid:
+def laid(request: pytest.FixtureRequest) -> ModelFit:
     words, free, start, options = STRUCTURES[request.param]
     model = fitted(words, free, start, **options)
-    return Laid.of(model, freedom_of(model).noise)
+    return ModelFit.of(model, parameter_set_of(model).noise)
 
 
-def test_any_input_follows_from_what_one_sample_does(laid: Laid) -> None:
+def test_any_input_follows_from_what_one_sample_does(laid: ModelFit) -> None:
     rows, rng = 120, np.random.default_rng(3)
     for ramp in (1, 3):
         known = Sensitivities.of(laid, STEP, rows, ramp)
         commands = rng.standard_normal((len(laid.inputs), rows))
-        run = laid.run(known.written(commands), STEP, "any")
-        for name, row in zip(laid.outputs, known.moved(commands), strict=True):
+        run = laid.run(known.rig_commands(commands), STEP, "any")
+        for name, row in zip(laid.outputs, known.outputs(commands), strict=True):
             assert row == pytest.approx(run[name][:-1], abs=1e-5 * np.max(np.abs(run[name])))
         told = known.information(known.derivatives(commands))
         # The core compares neither the first sample nor the last, and projects offsets out by itself.
@@ -153,12 +155,12 @@ def test_any_input_follows_from_what_one_sample_does(laid: Laid) -> None:
         assert told / np.outer(size, size) == pytest.approx(exact / np.outer(size, size), abs=2e-4)
 
 
-def test_lines_are_what_a_period_says_that_was_there_long_before(laid: Laid) -> None:
+def test_lines_are_what_a_period_says_that_was_there_long_before(laid: ModelFit) -> None:
     rows, periods = 64, 12
     bounds = Bounds(
         dict.fromkeys(laid.inputs, 0.7), dict.fromkeys(laid.inputs, math.inf), dict.fromkeys(laid.outputs, 1.0)
     )
-    lines = lines_of(laid, bounds, STEP, rows)
+    lines = spectral_lines(laid, bounds, STEP, rows)
     count = len(laid.inputs)
     for k in range(count):
         at = int(np.flatnonzero(lines.costs[k] > 0)[2])
@@ -171,7 +173,7 @@ def test_lines_are_what_a_period_says_that_was_there_long_before(laid: Laid) -> 
         size = np.sqrt(np.maximum(np.diag(told), 1e-12 * np.max(np.diag(told))))
         close = pytest.approx(told / np.outer(size, size), abs=0.03)
         assert lines.information[at] / np.outer(size, size) == close
-        swings = known.moved(wave)[:, -rows:]
+        swings = known.outputs(wave)[:, -rows:]
         assert lines.costs[count:, at] == pytest.approx(np.mean(swings**2, axis=1), rel=0.03, abs=1e-4)
 
 
@@ -181,7 +183,7 @@ def test_the_errors_now_are_those_of_the_model_and_both_is_less_than_either(
     for name in designed.values:
         assert designed.errors["now"][name] == pytest.approx(found.standard_errors[name], rel=1e-9)
         assert designed.errors["both"][name] < min(designed.errors["now"][name], designed.errors["designed"][name])
-    assert designed.chosen == ("alpha",)
+    assert designed.parameters == ("alpha",)
     ratio = designed.errors["square"]["alpha"] / designed.errors["designed"]["alpha"]
     assert designed.gain == pytest.approx(ratio, rel=1e-9)
     assert designed.gain > 1.5
@@ -210,10 +212,12 @@ def test_fits_of_the_designed_run_scatter_as_foretold(designed: ftlm.DesignedInp
 # ------------------------------------------------------------------------------------------------- the best spectrum
 
 
-def regression(power: int, points: np.ndarray) -> Lines:
+def regression(power: int, points: np.ndarray) -> SpectralLines:
     """A polynomial seen at points: designs of it are in every book."""
     rows = np.stack([points**k for k in range(power + 1)], axis=1)
-    return Lines(np.arange(1.0, len(points) + 1), rows[:, :, None] * rows[:, None, :], np.ones((1, len(points))))
+    return SpectralLines(
+        np.arange(1.0, len(points) + 1), rows[:, :, None] * rows[:, None, :], np.ones((1, len(points)))
+    )
 
 
 def test_a_parabola_is_seen_best_at_its_ends_and_its_middle() -> None:
@@ -229,7 +233,7 @@ def test_a_parabola_is_seen_best_at_its_ends_and_its_middle() -> None:
 def test_no_share_of_power_says_more_than_the_bound_and_scipy_finds_no_better(kind: str) -> None:
     rng = np.random.default_rng(5)
     rows = rng.standard_normal((9, 2, 3))
-    lines = Lines(
+    lines = SpectralLines(
         np.arange(1.0, 10.0), np.einsum("krp,krq->kpq", rows, rows), np.abs(rng.standard_normal((3, 9))) + 0.2
     )
     goal = Criterion(kind, (0, 2), (1.0, 2.0))
@@ -240,10 +244,13 @@ def test_no_share_of_power_says_more_than_the_bound_and_scipy_finds_no_better(ki
         drawn /= np.max(lines.costs @ drawn)
         assert goal.score(np.tensordot(drawn, lines.information, 1)) <= best.bound + 1e-12
     other = minimize(
-        lambda w: -goal.mean(np.tensordot(np.maximum(w, 1e-12), lines.information, 1)), np.full(9, 0.05),
-        bounds=[(0, None)] * 9, constraints=[{"type": "ineq", "fun": lambda w: 1 - lines.costs @ w}], method="SLSQP",
+        lambda w: -goal.smooth_score(np.tensordot(np.maximum(w, 1e-12), lines.information, 1)),
+        np.full(9, 0.05),
+        bounds=[(0, None)] * 9,
+        constraints=[{"type": "ineq", "fun": lambda w: 1 - lines.costs @ w}],
+        method="SLSQP",
         options={"maxiter": 500, "ftol": 1e-12},
-    )  # fmt: skip
+    )
     assert -other.fun <= best.bound + 1e-6
     # Of the widest axis the mean that has a derivative is within 2^(1/32) of it.
     assert best.score == pytest.approx(-other.fun, abs=5e-3 if kind == "D" else 0.03)
@@ -255,9 +262,9 @@ def test_slopes_are_those_of_differences_and_one_along_the_information(kind: str
     rows, more = rng.standard_normal((2, 30, 4))
     information, step = rows.T @ rows, more.T @ more
     goal = Criterion(kind, (1, 3), (1.0, 0.1))
-    slope = goal.slope(information)
+    slope = goal.gradient(information)
     assert np.sum(slope * information) == pytest.approx(1.0, rel=1e-9)
-    moved = (goal.mean(information + 1e-6 * step) - goal.mean(information - 1e-6 * step)) / 1e-6
+    moved = (goal.smooth_score(information + 1e-6 * step) - goal.smooth_score(information - 1e-6 * step)) / 1e-6
     assert np.sum(slope * step) == pytest.approx(moved, rel=1e-5)
     naive = np.linalg.inv(information)[np.ix_([1, 3], [1, 3])] / np.outer([1, 0.1], [1, 0.1])
     score = -0.25 * np.log(np.linalg.det(naive)) if kind == "D" else -0.5 * np.log(np.linalg.eigvalsh(naive)[-1])
@@ -266,8 +273,8 @@ def test_slopes_are_those_of_differences_and_one_along_the_information(kind: str
 
 
 def test_a_sum_of_sines_keeps_its_spectrum_and_has_a_low_crest(found: ftlm.Identification) -> None:
-    laid = Laid.of(found.model, freedom_of(found.model).noise)
-    lines = lines_of(laid, Bounds({"u": 1.0}, {"u": math.inf}, {"y": math.inf}), STEP, 200)
+    laid = ModelFit.of(found.model, parameter_set_of(found.model).noise)
+    lines = spectral_lines(laid, Bounds({"u": 1.0}, {"u": math.inf}, {"y": math.inf}), STEP, 200)
     spectrum = replace(
         best_spectrum(lines, Criterion("D", (0,), (1.0,))), power=np.where(lines.frequencies < 3, 1.0, 0.0)
     )
@@ -287,19 +294,19 @@ def test_a_sum_of_sines_keeps_its_spectrum_and_has_a_low_crest(found: ftlm.Ident
 def test_no_exchange_of_one_hold_or_of_two_tells_more(name: str) -> None:
     words, free, start, options = STRUCTURES[name]
     model = fitted(words, free, start, **options)
-    laid = Laid.of(model, freedom_of(model).noise)
+    laid = ModelFit.of(model, parameter_set_of(model).noise)
     rows, hold = 90, 6
     known = Sensitivities.of(laid, STEP, rows, 1)
     bounds = Bounds(dict.fromkeys(laid.inputs, 0.8), dict.fromkeys(laid.inputs, math.inf), {"y": 0.5})
     goal = Criterion("D", (0, 1), (1.0, 1.0))
-    begin = judged("square", 0.8 * np.stack([square(rows, 24)] * len(laid.inputs)), known, goal, bounds)
-    best = exchanged(begin, hold, known, goal, bounds)
+    begin = scaled_design("square", 0.8 * np.stack([square_wave(rows, 24)] * len(laid.inputs)), known, goal, bounds)
+    best = exchange_holds(begin, hold, known, goal, bounds)
     assert best.exchanges > 0
     assert best.score > begin.score
 
     def naive(commands: np.ndarray) -> float:
         """What commands say, written out: from the core, made small enough for the limits."""
-        run = laid.run(known.written(commands), STEP, "naive")
+        run = laid.run(known.rig_commands(commands), STEP, "naive")
         scale = min(1.0, 0.5 / float(np.max(np.abs(run["y"]))))
         rows_of = laid.jacobian(run)
         block = np.linalg.inv(rows_of @ rows_of.T)[:2, :2]
@@ -313,8 +320,11 @@ def test_no_exchange_of_one_hold_or_of_two_tells_more(name: str) -> None:
         [(k, at, d)] for k in range(len(laid.inputs)) for at in range(level.shape[1]) for d in (-2, -1, 1, 2)
     ] + [
         [(k, at, d), (k, at + gap, -d)]
-        for k in range(len(laid.inputs)) for gap in (1, 4) for at in range(level.shape[1] - gap) for d in (-1, 2)
-    ]  # fmt: skip
+        for k in range(len(laid.inputs))
+        for gap in (1, 4)
+        for at in range(level.shape[1] - gap)
+        for d in (-1, 2)
+    ]
     top = naive(0.8 * np.repeat(level, hold, axis=1))
     for change in changes[:: max(1, len(changes) // 60)]:
         other = level.copy()
@@ -330,19 +340,19 @@ def test_no_exchange_of_one_hold_or_of_two_tells_more(name: str) -> None:
 def test_peak_swing_and_slew_are_kept_and_said(found: ftlm.Identification, designed: ftlm.DesignedInput) -> None:
     assert np.max(np.abs(designed.run["u"])) <= 1.0
     assert np.max(np.abs(designed.run["y"])) <= 0.9
-    assert "y" in designed.binding or "u" in designed.binding
+    assert "y" in designed.active_constraints or "u" in designed.active_constraints
     assert set(np.round(np.unique(designed.run["u"][:-1] / np.max(np.abs(designed.run["u"]))), 9)) <= {-1.0, 0.0, 1.0}
     slow = ftlm.design_input(found, duration=5.0, limits={"y": 0.9}, slew=8.0)
     change = np.abs(np.diff(slow.run["u"][:-1], prepend=0.0)) / STEP
     assert np.max(change) <= 8.0 * (1 + 1e-9)
-    assert {r.name for r in slow.reached} == {"u", "slew of u", "y"}
+    assert {r.name for r in slow.predicted_extremes} == {"u", "slew of u", "y"}
     assert slow.gain < designed.gain * 1.05
 
 
 def test_the_widest_axis_is_shorter_by_its_own_criterion(found: ftlm.Identification) -> None:
     options = {"names": ["alpha", "a1"], "limits": {"y": 0.9}, "duration": 4.0}
     both = {c: ftlm.design_input(found, criterion=c, **options) for c in ("D", "E")}
-    laid = Laid.of(found.model, freedom_of(found.model).noise)
+    laid = ModelFit.of(found.model, parameter_set_of(found.model).noise)
     widest, all_of_it = Criterion("E", (0, 1), (1.0, abs(laid.values[1]))), Criterion("D", (0, 1), (1.0, 1.0))
     told = {}
     for kind, made in both.items():
@@ -370,15 +380,19 @@ def test_laws_of_orders_and_coefficients_come_back_from_a_file(tmp_path: Path) -
     problem, model = FreeProblem.of(structure), demo_plant(1, form="published")
     orders = [str(o) for e in structure.equations for o in (e.order, *(t.order for t in e.terms))]
     noise = {o: 0.01 * float(np.std(clean[o])) for o in clean.outputs}
-    free = Freedom(
-        names=tuple(problem.names), orders=tuple(orders), noise=noise, products=dict(problem.products),
-        covariance=tuple(map(tuple, np.eye(10).tolist())), refinement=2,
-    )  # fmt: skip
+    free = FitParameters(
+        names=tuple(problem.names),
+        orders=tuple(orders),
+        noise=noise,
+        products=dict(problem.products),
+        covariance=tuple(map(tuple, np.eye(10).tolist())),
+        refinement=2,
+    )
     estimate = ftlm.Estimate("output-error", ("A",), {**values, **model.coefficients}, free=free)
     named = structure.with_orders(model.orders).with_coefficients(model.coefficients)
     ftlm.Model(replace(named, initial="rest"), model.orders, estimate=estimate).save(tmp_path / "a.json")
-    laid = Laid.of(ftlm.load_model(tmp_path / "a.json"), noise)
-    errors = dict(zip(laid.names, np.sqrt(np.diag(laid.predicted(clean))).tolist(), strict=True))
+    laid = ModelFit.of(ftlm.load_model(tmp_path / "a.json"), noise)
+    errors = dict(zip(laid.names, np.sqrt(np.diag(laid.predicted_covariance(clean))).tolist(), strict=True))
     assert errors == pytest.approx(plants.CRAMER_RAO_40_DB["A"], rel=0.15)
 
 
@@ -424,7 +438,7 @@ BAD = {
     "seed": ({"seed": -1}, None, "seed = -1"),
     "period": ({"period": 0.01}, None, "period = 0.01 s is not between"),
     "like": ({"like": 7}, None, "like is int, not a Run"),
-}  # fmt: skip
+}
 
 
 @pytest.mark.parametrize("name", BAD)

@@ -139,7 +139,7 @@ def test_a_motor_whose_tachometer_has_a_zero_of_its_own():
     assert low <= 0.035 <= high
     assert found.delays["u"] == pytest.approx(0.035, abs=1e-3)
     a, b = found.coefficients["a"], found.coefficients["b"]
-    covariance = found.joint.covariance[:2, :2]
+    covariance = found.fit.covariance[:2, :2]
     slope = np.array([-b / a**2, 1.0 / a])
     assert abs(b / a - 8.0) < 3 * np.sqrt(slope @ covariance @ slope)
     assert found.comparison.offsets[0]["w"]["constant"] / a == pytest.approx(5.0, rel=0.02)
@@ -309,9 +309,12 @@ def test_detrending_refuses_in_words():
 @needs_data
 def test_the_hub_of_the_arm_runs_free_with_an_offset_of_the_current():
     run = ftlm.load(
-        DATA / "two_link_lqr" / "lqr.csv", time="t_s", inputs={"I1": "Im1_cmd_A"},
-        outputs={"theta11": "th11_deg", "theta12": "th12_deg"}, units={"theta11": "deg", "theta12": "deg"},
-    )  # fmt: skip
+        DATA / "two_link_lqr" / "lqr.csv",
+        time="t_s",
+        inputs={"I1": "Im1_cmd_A"},
+        outputs={"theta11": "th11_deg", "theta12": "th12_deg"},
+        units={"theta11": "deg", "theta12": "deg"},
+    )
     structure = ftlm.equation("D^2 theta11 = -d D theta11 + b I1 + k theta12")
     without, found = ftlm.identify(run, structure), ftlm.identify(run, structure, offset="constant")
     assert without.fit_percent["theta11"] < 70
@@ -331,7 +334,7 @@ def test_auto_estimates_an_offset_where_the_runs_ask_for_one_and_says_so(tmp_pat
         for name, value in truth.items():
             low, high = found.intervals[name]
             # Three standard errors: 95 % would fail one number in twenty.
-            assert abs(found.joint_values[name] - value) < 3 * (high - low) / 3.92
+            assert abs(found.parameter_values[name] - value) < 3 * (high - low) / 3.92
         assert "offset found by test: constant, since the runs ask for one" in found.details()
         # Estimated anew on the run that the model is judged on, and said.
         other, _, _ = loops.offset_run(kind, -2.0, 2)
@@ -355,7 +358,7 @@ def test_auto_leaves_a_record_without_an_offset_as_it_was():
     plain, found = ftlm.identify(run, structure), ftlm.identify(run, structure, offset="auto")
     assert found.settings["offset_test"].startswith("none, since the runs ask for none (chi-squared")
     assert found.comparison.offsets == ()
-    assert found.joint_values == plain.joint_values
+    assert found.parameter_values == plain.parameter_values
     assert found.standard_errors == plain.standard_errors
 
 
@@ -440,10 +443,13 @@ def test_auto_says_where_an_offset_cannot_be_told():
 def test_the_offset_of_the_hub_ends_in_the_global_optimum(name, within):
     # The oracle: with d given, the state-space free run is linear in everything else, so a scan of d alone finds it.
     run = ftlm.load(
-        DATA / f"two_link_{name}" / f"{name}.csv", time="t_s", inputs={"I1": "Im1_meas_A"},
-        outputs={"theta11": "th11_deg", "theta12": "th12_deg"}, units={"theta11": "deg", "theta12": "deg"},
-    )  # fmt: skip
-    run = run if within is None else run.slice(*within)
+        DATA / f"two_link_{name}" / f"{name}.csv",
+        time="t_s",
+        inputs={"I1": "Im1_meas_A"},
+        outputs={"theta11": "th11_deg", "theta12": "th12_deg"},
+        units={"theta11": "deg", "theta12": "deg"},
+    )
+    run = run if within is None else run.window(*within)
     step = 4 * run.step
     thin = ftlm.Run.from_arrays(
         step=step, inputs={"I1": run["I1"][::4]}, outputs={n: run[n][::4] for n in ("theta11", "theta12")}

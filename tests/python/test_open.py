@@ -7,9 +7,9 @@ import numpy as np
 import pytest
 
 import ftlm
-from ftlm.data.units import UNITS, spelled_unit
-from ftlm.io.cell_parsing import stated_unit
-from ftlm.io.preview import guessed_roles, known_unit, signal_names
+from ftlm.data.units import SIGNAL_UNITS, parse_unit
+from ftlm.io.cell_parsing import split_unit
+from ftlm.io.preview import guess_roles, known_unit, signal_names
 from test_files import messages, rows, write
 from test_strangers import command
 
@@ -36,13 +36,20 @@ from test_strangers import command
     ],
 )
 def test_roles_by_names(columns, roles):
-    assert guessed_roles(columns) == roles
+    assert guess_roles(columns) == roles
 
 
 def test_names_and_units_that_equations_and_runs_can_hold():
     named = signal_names({"Strom (A)": "u", "2nd": "u", "D": "y", "größe": "y", "a b": "u", "a  b": "u", "g/x": "y"})
-    assert named == {"Strom (A)": "Strom", "2nd": "u", "D": "y", "größe": "größe", "a b": "a_b", "a  b": "a_b_2",
-                     "g/x": "x"}  # fmt: skip
+    assert named == {
+        "Strom (A)": "Strom",
+        "2nd": "u",
+        "D": "y",
+        "größe": "größe",
+        "a b": "a_b",
+        "a  b": "a_b_2",
+        "g/x": "x",
+    }
     for name in named.values():
         assert ftlm.equation(f"D^alpha {name} = a0 {name} + b0 drive").equations
     units = {"Volt": "V", "deg": "deg", "degrees": "deg", "furlong": "", "U/min": "rpm", "": ""}
@@ -51,29 +58,60 @@ def test_names_and_units_that_equations_and_runs_can_hold():
 
 def test_units_as_people_spell_them():
     spelled = {
-        "grd": "deg", "Grad": "deg", "°": "°", "º": "°", "deg.": "deg", "Degrees": "deg", "°/s": "deg/s",
-        "Grad/s": "deg/s", "mA": "mA", "MA": "", "Amps": "A", "Vdc": "V", "VAC": "", "Nm": "Nm", "N m": "Nm", "nm": "",
-        "U/min": "rpm", "1/min": "rpm", "RPM": "rpm", "rev/min": "rpm", "min⁻¹": "rpm", "m/s²": "m/s²",
-        "m/s2": "m/s^2", "μm": "µm", "um": "µm", "℃": "", "° C": "°C", "Sek.": "", "%": "", "Ω": "",
-    }  # fmt: skip
+        "grd": "deg",
+        "Grad": "deg",
+        "°": "°",
+        "º": "°",
+        "deg.": "deg",
+        "Degrees": "deg",
+        "°/s": "deg/s",
+        "Grad/s": "deg/s",
+        "mA": "mA",
+        "MA": "",
+        "Amps": "A",
+        "Vdc": "V",
+        "VAC": "",
+        "Nm": "Nm",
+        "N m": "Nm",
+        "nm": "",
+        "U/min": "rpm",
+        "1/min": "rpm",
+        "RPM": "rpm",
+        "rev/min": "rpm",
+        "min⁻¹": "rpm",
+        "m/s²": "m/s²",
+        "m/s2": "m/s^2",
+        "μm": "µm",
+        "um": "µm",
+        "℃": "",
+        "° C": "°C",
+        "Sek.": "",
+        "%": "",
+        "Ω": "",
+    }
     assert {stated: known_unit(stated) for stated in spelled} == spelled
     assert [known_unit(unit, "Oil Temperature") for unit in ("°", "Grad", "°C", "K")] == ["", "", "°C", "K"]
     for word in ("furlong", "Zeit", "x" * 10**6, "U", "Motor"):
-        assert spelled_unit(word) is None
+        assert parse_unit(word) is None
     # What a file spells is converted as what ftlm knows.
-    assert all(known_unit(unit) in UNITS for unit in spelled)
+    assert all(known_unit(unit) in SIGNAL_UNITS for unit in spelled)
 
 
 @pytest.mark.parametrize(
     ("header", "unit"),
     [
-        ("Zeit;Strom;Winkel\ns;A;grd", "deg"), ("Zeit;Strom;Winkel\nSek.;mA;°", "°"), ("Zeit;i;M\n[s];[A];[N m]", "Nm"),
-        ('"Zeit";"Strom";"Drehzahl"\n"s";"A";"U/min"', "rpm"), ("Zeit / s;Strom / A;Winkel / Grad", "deg"),
-        ("Zeit, s;Strom, A;Winkel, deg.", "deg"), ("Zeit in s;Strom in A;Winkel in °", "°"),
-        ("Zeit ; Strom ; Weg\ns ; A ; mm", "mm"), ("t / (s);Strom / (A);v / (m/s)", "m/s"),
+        ("Zeit;Strom;Winkel\ns;A;grd", "deg"),
+        ("Zeit;Strom;Winkel\nSek.;mA;°", "°"),
+        ("Zeit;i;M\n[s];[A];[N m]", "Nm"),
+        ('"Zeit";"Strom";"Drehzahl"\n"s";"A";"U/min"', "rpm"),
+        ("Zeit / s;Strom / A;Winkel / Grad", "deg"),
+        ("Zeit, s;Strom, A;Winkel, deg.", "deg"),
+        ("Zeit in s;Strom in A;Winkel in °", "°"),
+        ("Zeit ; Strom ; Weg\ns ; A ; mm", "mm"),
+        ("t / (s);Strom / (A);v / (m/s)", "m/s"),
         ("Motor;;Geber\nZeit;Strom;Winkel\ns;A;Grad", "deg"),
     ],
-)  # fmt: skip
+)
 def test_units_are_no_names(tmp_path, header, unit):
     path = write(tmp_path, header + "\n" + rows().replace(",", ";"))
     opened = ftlm.open_file(path, inputs={"u": 1}, outputs={"y": 2})
@@ -81,10 +119,10 @@ def test_units_are_no_names(tmp_path, header, unit):
     time, drive, answer = opened.columns
     assert (time.role, known_unit(drive.unit)) == ("time", "mA" if "mA" in header else "A")
     assert (known_unit(answer.unit), opened.options["units"]["y"]) == (unit, unit)
-    names = (stated_unit(c.name)[0] for c in (time, drive, answer))
-    assert all(name[0].isalpha() and spelled_unit(name) is None for name in names)
+    names = (split_unit(c.name)[0] for c in (time, drive, answer))
+    assert all(name[0].isalpha() and parse_unit(name) is None for name in names)
     run = opened.load()
-    si, scale = UNITS[unit]
+    si, scale = SIGNAL_UNITS[unit]
     assert (run.units["y"], run.step) == (si, pytest.approx(0.01))
     np.testing.assert_allclose(run["y"], scale * ftlm.load(path, **{**opened.options, "units": {}})["y"])
 

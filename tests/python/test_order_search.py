@@ -118,7 +118,9 @@ def assert_is_table(found, expected, *, rtol=1e-7):
 
 
 def search(runs, **options):
-    return ftlm.search_orders(runs, ftlm.equation(EQUATION, initial="rest"), ftlm.Lattice(orders=GRID), m=M, **options)
+    return ftlm.search_orders(
+        runs, ftlm.equation(EQUATION, initial="rest"), ftlm.OrderGrid(orders=GRID), m=M, **options
+    )
 
 
 @pytest.mark.parametrize("criterion", ["output-error", "equation-error"])
@@ -157,7 +159,7 @@ def test_initial_terms_belong_to_each_run(run, second):
     moved = [r.slice(2.0, None) for r in (run, second)]
     options = {"criterion": "output-error", "norm": "l2", "coefficients": "least-squares"}
     structure = ftlm.equation(EQUATION, initial=(0.0, 1.0))
-    found = ftlm.search_orders(moved, structure, ftlm.Lattice(orders=GRID), m=M, **options)
+    found = ftlm.search_orders(moved, structure, ftlm.OrderGrid(orders=GRID), m=M, **options)
     expected = enumerate_all([Record(r) for r in moved], rows="time", exponents=(0.0, 1.0), **options)
     assert_is_table(found, expected, rtol=1e-6)
 
@@ -174,23 +176,23 @@ def exactly(found):
 @pytest.mark.parametrize("coefficients", ["least-squares", "multi-innovation"])
 def test_threads_and_early_stopping_change_no_bit_of_the_table(run, second, criterion, coefficients):
     structure = ftlm.equation(EQUATION)
-    lattice = ftlm.lattice(step=0.1, alpha=(1.3, 1.9), nu=(0, 0.3))
+    lattice = ftlm.order_grid(step=0.1, alpha=(1.3, 1.9), nu=(0, 0.3))
     options = {"criterion": criterion, "coefficients": coefficients, "m": 128, "keep": 7}
     brute = ftlm.search_orders([run, second], structure, lattice, threads=1, early_stopping=False, **options)
     assert brute.candidates == sum(n * (n - 1) // 2 * 4 for n in range(13, 20))
-    assert brute.pruned["stopped early"] == 0
+    assert brute.exclusion_counts["stopped early"] == 0
     counts = set()
     for threads, stopping in itertools.product((1, 2, 3, 8), (True, False)):
         found = ftlm.search_orders(
             [run, second], structure, lattice, threads=threads, early_stopping=stopping, **options
         )
         assert exactly(found) == exactly(brute), (threads, stopping)
-        assert sum(found.pruned.values()) + len(found.table) == found.candidates
+        assert sum(found.exclusion_counts.values()) + len(found.table) == found.candidates
         if stopping:
-            counts.add(tuple(found.pruned.items()))
-            assert found.pruned["stopped early"] > 0
+            counts.add(tuple(found.exclusion_counts.items()))
+            assert found.exclusion_counts["stopped early"] > 0
         else:
-            assert found.pruned == brute.pruned
+            assert found.exclusion_counts == brute.exclusion_counts
     assert len(counts) == 1  # what became of the candidates does not depend on threads either
 
 
@@ -200,7 +202,7 @@ def test_threads_and_early_stopping_change_no_bit_of_a_stage(drive, plant, with_
     found = stage_search(drive, plant, with_noise, threads=threads, early_stopping=stopping)
     alone = stage_search(drive, plant, with_noise, threads=1, early_stopping=False)
     assert exactly(found) == exactly(alone)
-    assert sum(found.pruned.values()) + len(found.table) == found.candidates == alone.candidates
+    assert sum(found.exclusion_counts.values()) + len(found.table) == found.candidates == alone.candidates
 
 
 def test_keeping_more_rows_only_makes_the_table_longer(run):
@@ -208,7 +210,7 @@ def test_keeping_more_rows_only_makes_the_table_longer(run):
     assert exactly(many)[:1] == exactly(few)
     assert exactly(all_rows)[:10] == exactly(many)
     assert len(all_rows.table) == all_rows.candidates == 36
-    assert sum(all_rows.pruned.values()) == 0
+    assert sum(all_rows.exclusion_counts.values()) == 0
 
 
 # ----------------------------------------------------------------------------------------------------------------------
@@ -227,7 +229,7 @@ def stage_search(drive, plant, with_noise, **options):
     made = plant("A").simulate(drive("A", samples=601), tolerance=1e-5)
     noisy = with_noise(made, 1e-5, 3)
     settings = {"coefficients": "least-squares", "m": M, "keep": 12} | options
-    return ftlm.search_orders(noisy, ftlm.flexible_link(form="published"), ftlm.Lattice(orders=STAGE), **settings)
+    return ftlm.search_orders(noisy, ftlm.flexible_link(form="published"), ftlm.OrderGrid(orders=STAGE), **settings)
 
 
 def makes_equations(orders):
@@ -292,12 +294,12 @@ def test_failures_under_a_law_are_listed_with_their_reason(run):
     # The same current twice: where the law gives both terms one order they cannot be told apart.
     twice = ftlm.Run.from_arrays(step=run.step, inputs={"u": run["u"], "v": run["u"]}, outputs={"y": run["y"]})
     structure = ftlm.equation("D^alpha y = a D^(alpha-1) y + b u + c D^(alpha-1.5) v", initial="rest")
-    lattice = ftlm.lattice(step=0.1, alpha=(1.3, 1.7))
+    lattice = ftlm.order_grid(step=0.1, alpha=(1.3, 1.7))
     for threads in (1, 2):
         found = ftlm.search_orders(twice, structure, lattice, m=M, coefficients="least-squares", threads=threads)
         assert found.failures == [({"alpha": 1.5}, "singular")]
-        assert found.pruned["singular"] == 1
-        assert sum(found.pruned.values()) + len(found.table) == found.candidates == 5
+        assert found.exclusion_counts["singular"] == 1
+        assert sum(found.exclusion_counts.values()) + len(found.table) == found.candidates == 5
 
 
 def test_an_empty_lattice_names_its_signal(run):
@@ -306,7 +308,7 @@ def test_an_empty_lattice_names_its_signal(run):
 
 
 def search_empty(run):
-    lattice = ftlm.Lattice(orders={"alpha": [0.5], "beta": [1.0], "mu": [1.1]})
+    lattice = ftlm.OrderGrid(orders={"alpha": [0.5], "beta": [1.0], "mu": [1.1]})
     return ftlm.search_orders(run, ftlm.equation(EQUATION), lattice, m=M)
 
 
@@ -314,7 +316,7 @@ def test_progress_shows_rate_share_pruned_and_time_left(monkeypatch, run):
     shown = io.StringIO()
     shown.isatty = lambda: True
     monkeypatch.setattr(sys, "stderr", shown)
-    monkeypatch.setattr("ftlm.progress.PATIENCE", 0.0)
+    monkeypatch.setattr("ftlm.progress.BAR_DELAY_S", 0.0)
     monkeypatch.setenv("TERM", "xterm")
     monkeypatch.setenv("COLUMNS", "120")
     with ftlm.progress.Progress("searching") as bar:
@@ -335,7 +337,7 @@ def test_one_equation_under_a_law_is_searched_too(run):
     # D^(alpha - 1) in place of a free order: the same scores as the free search at those orders.
     structure = ftlm.equation("D^alpha y = a D^(alpha-1) y + c y + b u", initial="rest")
     found = ftlm.search_orders(
-        run, structure, ftlm.lattice(step=0.2, alpha=(1.2, 2.0)), m=M, coefficients="least-squares"
+        run, structure, ftlm.order_grid(step=0.2, alpha=(1.2, 2.0)), m=M, coefficients="least-squares"
     )
     assert found.candidates == 5
     for row in found.table:
@@ -354,11 +356,11 @@ def values(lattice, text=EQUATION, **options):
 
 
 def test_default_lattice_is_the_papers():
-    found = values(ftlm.lattice())
+    found = values(ftlm.order_grid())
     assert found["alpha"] == tuple(round(1.05 + 0.05 * i, 9) for i in range(20))
     assert found["beta"] == found["mu"] == found["nu"] == tuple(round(0.05 * i, 9) for i in range(41))
     assert list(found) == ["alpha", "beta", "mu", "nu"]
-    assert ftlm.Lattice() == ftlm.lattice()
+    assert ftlm.OrderGrid() == ftlm.order_grid()
 
 
 @pytest.mark.parametrize(
@@ -375,28 +377,28 @@ def test_default_lattice_is_the_papers():
     ],
 )
 def test_axes_of_a_lattice(spec, expected):
-    assert values(ftlm.lattice(step=0.2, beta=spec))["beta"] == expected
+    assert values(ftlm.order_grid(step=0.2, beta=spec))["beta"] == expected
 
 
 def test_values_of_the_structure_come_before_the_defaults_and_those_of_the_lattice_before_both():
     options = {"orders": {"alpha": "1:2:0.5", "beta": [0.1, 0.2]}}
-    found = values(ftlm.lattice(step=0.5), **options)
+    found = values(ftlm.order_grid(step=0.5), **options)
     assert found["alpha"] == (1.0, 1.5, 2.0)
     assert found["beta"] == (0.1, 0.2)
     assert found["mu"] == (0.0, 0.5, 1.0, 1.5, 2.0)
-    found = values(ftlm.lattice(step=0.5, beta=0.7), **options)
+    found = values(ftlm.order_grid(step=0.5, beta=0.7), **options)
     assert found["beta"] == (0.7,)
-    assert values(ftlm.Lattice(0.5, orders={"alpha": "1:1.5:0.25"}))["alpha"] == (1.0, 1.25, 1.5)
+    assert values(ftlm.OrderGrid(0.5, orders={"alpha": "1:1.5:0.25"}))["alpha"] == (1.0, 1.25, 1.5)
 
 
 def test_other_orders_end_at_the_largest_alpha():
-    assert values(ftlm.lattice(step=0.1, alpha=(0.3, 0.6)))["beta"] == (0.0, 0.1, 0.2, 0.3, 0.4, 0.5, 0.6)
-    assert values(ftlm.lattice(step=0.5), "D^1.2 y = a D^beta y + b u")["beta"] == (0.0, 0.5, 1.0)
+    assert values(ftlm.order_grid(step=0.1, alpha=(0.3, 0.6)))["beta"] == (0.0, 0.1, 0.2, 0.3, 0.4, 0.5, 0.6)
+    assert values(ftlm.order_grid(step=0.5), "D^1.2 y = a D^beta y + b u")["beta"] == (0.0, 0.5, 1.0)
 
 
 def test_candidates_obey_the_ranges_and_are_counted_once(run):
     structure = ftlm.equation("D^alpha y = a D^beta y + c D^mu y + b D^nu u", initial="rest")
-    lattice = ftlm.Lattice(
+    lattice = ftlm.OrderGrid(
         orders={"alpha": [0.5, 1.0], "beta": [0.0, 0.4, 0.5, 0.9, 1.5], "mu": [0.0, 0.4], "nu": [0.7, -0.2, 1.0]}
     )
     found = ftlm.search_orders(run, structure, lattice, m=M, coefficients="least-squares", keep=1000)
@@ -413,7 +415,7 @@ def test_candidates_obey_the_ranges_and_are_counted_once(run):
 
 def test_fixed_coefficients_make_own_orders_distinguishable(run):
     orders = {"beta": [0.0, 0.6], "mu": [0.0, 0.6]}
-    lattice = ftlm.Lattice(orders=orders)
+    lattice = ftlm.OrderGrid(orders=orders)
     free, tied = (
         ftlm.search_orders(
             run,
@@ -435,9 +437,9 @@ def test_orders_on_the_edge_of_their_interval_are_named(run):
     structure = ftlm.equation("D^alpha y = a D^beta y + c y + b u", initial="rest")
 
     def edges(**orders):
-        lattice = ftlm.lattice(step=0.1, **orders)
+        lattice = ftlm.order_grid(step=0.1, **orders)
         found = ftlm.search_orders(run, structure, lattice, m=256, coefficients="least-squares")
-        return found.edges, str(found)
+        return found.at_grid_edge, str(found)
 
     assert edges(alpha=(1.4, 1.8), beta=(0.3, 0.9))[0] == {}
     found, text = edges(alpha=(1.2, 1.6), beta=(0.3, 0.9))
@@ -452,12 +454,12 @@ def test_alpha_of_two_is_no_edge(clean_a):
     found = ftlm.search_orders(
         clean_a,
         ftlm.flexible_link(form="published").equation("theta12"),
-        ftlm.lattice(step=0.1, alpha=(1.5, 2.0), gamma2=1.05, mu2=[0.1, 0.85], beta2=[0.1, 0.85]),
+        ftlm.order_grid(step=0.1, alpha=(1.5, 2.0), gamma2=1.05, mu2=[0.1, 0.85], beta2=[0.1, 0.85]),
         m=512,
         coefficients="least-squares",
     )
     assert found.orders["alpha2"] == 2.0
-    assert found.edges == {}
+    assert found.at_grid_edge == {}
 
 
 # ----------------------------------------------------------------------------------------------------------------------
@@ -469,19 +471,19 @@ def test_dependent_regressors_are_a_reason_on_the_row(run):
         step=run.step, inputs={"u": run["u"], "v": 2 * run["u"]}, outputs={"y": run["y"]}, name="twice"
     )
     structure = ftlm.equation("D^1.6 y = a D^beta y + c y + b u + d D^nu v", initial="rest")
-    lattice = ftlm.Lattice(orders={"beta": [0.4, 0.6], "nu": [0.0, 0.3]})
+    lattice = ftlm.OrderGrid(orders={"beta": [0.4, 0.6], "nu": [0.0, 0.3]})
     found = ftlm.search_orders(twice, structure, lattice, m=M, coefficients="least-squares")
     assert found.candidates == 4
-    assert found.pruned["singular"] == 2
+    assert found.exclusion_counts["singular"] == 2
     assert found.failures == [({"beta": b, "nu": 0.0}, "singular") for b in (0.6, 0.4)]
     assert {r.orders["nu"] for r in found.table} == {0.3}
     # A prior tells them apart.
-    assert ftlm.search_orders(twice, structure, lattice, m=M).pruned["singular"] == 0
+    assert ftlm.search_orders(twice, structure, lattice, m=M).exclusion_counts["singular"] == 0
     with pytest.raises(ftlm.ModelError, match="none of 2 candidates has a finite score"):
         ftlm.search_orders(
             twice,
             structure.with_orders({"nu": 0.0}),
-            ftlm.Lattice(orders={"beta": [0.4, 0.6]}),
+            ftlm.OrderGrid(orders={"beta": [0.4, 0.6]}),
             m=M,
             coefficients="least-squares",
         )
@@ -493,9 +495,9 @@ def test_diverging_candidates_are_a_reason_on_the_row():
     u = np.where(np.arange(n) % 80 < 40, 1.0, -1.0)
     growing = ftlm.Run.from_arrays(step=0.1, inputs={"u": u}, outputs={"y": np.cumsum(u)})
     structure = ftlm.equation("D^alpha y = 5 y + b u", initial="rest")
-    lattice = ftlm.Lattice(orders={"alpha": [0.8, 1.0, 3.0]})
+    lattice = ftlm.OrderGrid(orders={"alpha": [0.8, 1.0, 3.0]})
     brute = ftlm.search_orders(growing, structure, lattice, m=2000, coefficients="least-squares", early_stopping=False)
-    assert brute.pruned["diverged"] == 2
+    assert brute.exclusion_counts["diverged"] == 2
     assert brute.failures == [({"alpha": 0.8}, "diverged"), ({"alpha": 1.0}, "diverged")]
     assert [r.orders["alpha"] for r in brute.table] == [3.0]
 
@@ -569,9 +571,13 @@ def test_an_error_in_progress_ends_a_long_search(clean_a):
 
 def long_search(run, **options):
     return ftlm.search_orders(
-        run, ftlm.flexible_link(form="published").equation("theta12"), ftlm.lattice(alpha=(1.05, 2.0)),
-        early_stopping=False, coefficients="least-squares", **options,
-    )  # fmt: skip
+        run,
+        ftlm.flexible_link(form="published").equation("theta12"),
+        ftlm.order_grid(alpha=(1.05, 2.0)),
+        early_stopping=False,
+        coefficients="least-squares",
+        **options,
+    )
 
 
 INTERRUPTED = """
@@ -611,8 +617,10 @@ def test_control_c_ends_a_search(large):
     environment = {**os.environ, "PYTHONUNBUFFERED": "1"}
     with subprocess.Popen(
         [sys.executable, "-c", INTERRUPTED.replace("{large!r}", repr(large))],
-        stdout=subprocess.PIPE, text=True, env=environment,
-    ) as child:  # fmt: skip
+        stdout=subprocess.PIPE,
+        text=True,
+        env=environment,
+    ) as child:
         try:
             for line in child.stdout:
                 if line.startswith("started") and line.split()[2] != "0":
@@ -658,32 +666,38 @@ def test_control_c_ends_a_search(large):
         ({"m": 100}, "m = 100 is no power of two, which Haar rows need; take m = 64 or 128, or rows='time'"),
         ({"m": 0}, "m = 0 is no number of pulses"),
     ],
-)  # fmt: skip
+)
 def test_settings_that_mean_nothing_are_refused(run, options, message):
     with pytest.raises(ftlm.ModelError) as refused:
-        ftlm.search_orders(run, ftlm.equation(EQUATION), ftlm.Lattice(orders=GRID), **options)
+        ftlm.search_orders(run, ftlm.equation(EQUATION), ftlm.OrderGrid(orders=GRID), **options)
     assert message in str(refused.value)
 
 
 @pytest.mark.parametrize(
     ("make", "message"),
     [
-        (lambda: ftlm.lattice(step=0), "order alpha: step 0 is not positive; the paper's is 0.05"),
-        (lambda: ftlm.lattice(step=-0.1), "step -0.1 is not positive"),
-        (lambda: ftlm.lattice(step="0.1"), "= '0.1' is not a number"),
-        (lambda: ftlm.lattice(alpha=(0, 2)), "alpha interval 0:2 starts outside (0, 10]"),
-        (lambda: ftlm.lattice(alpha=(1, 11)), "order alpha = 11 is outside [-3, 10]"),
-        (lambda: ftlm.lattice(alpha=(2, 1)), "order alpha: interval 2:1 is empty"),
-        (lambda: ftlm.lattice(alpha=2.0), "alpha = 2.0 is no interval; write (low, high)"),
-        (lambda: ftlm.lattice(alpha=(1, 2, 3)), "alpha = (1, 2, 3) is no interval"),
-        (lambda: ftlm.lattice(alpha=("1", 2)), "alpha = '1' is not a number"),
-        (lambda: values(ftlm.lattice(beta="x")), "order beta: 'x' is no interval"),
-        (lambda: values(ftlm.lattice(beta=(2, 1))), "order beta: interval 2:1 is empty"),
-        (lambda: values(ftlm.lattice(gama=1)), "lattice order 'gama' is no free order; free are alpha, beta, mu, nu"),
-        (lambda: values(ftlm.lattice(beta=1), "D^1.5 y = a y"), "lattice order 'beta' is no free order; free are none"),
-        (lambda: values(ftlm.Lattice(step=1e-7)), "has 9.5e+06 values, more than 1000000"),
+        (lambda: ftlm.order_grid(step=0), "order alpha: step 0 is not positive; the paper's is 0.05"),
+        (lambda: ftlm.order_grid(step=-0.1), "step -0.1 is not positive"),
+        (lambda: ftlm.order_grid(step="0.1"), "= '0.1' is not a number"),
+        (lambda: ftlm.order_grid(alpha=(0, 2)), "alpha interval 0:2 starts outside (0, 10]"),
+        (lambda: ftlm.order_grid(alpha=(1, 11)), "order alpha = 11 is outside [-3, 10]"),
+        (lambda: ftlm.order_grid(alpha=(2, 1)), "order alpha: interval 2:1 is empty"),
+        (lambda: ftlm.order_grid(alpha=2.0), "alpha = 2.0 is no interval; write (low, high)"),
+        (lambda: ftlm.order_grid(alpha=(1, 2, 3)), "alpha = (1, 2, 3) is no interval"),
+        (lambda: ftlm.order_grid(alpha=("1", 2)), "alpha = '1' is not a number"),
+        (lambda: values(ftlm.order_grid(beta="x")), "order beta: 'x' is no interval"),
+        (lambda: values(ftlm.order_grid(beta=(2, 1))), "order beta: interval 2:1 is empty"),
+        (
+            lambda: values(ftlm.order_grid(gama=1)),
+            "lattice order 'gama' is no free order; free are alpha, beta, mu, nu",
+        ),
+        (
+            lambda: values(ftlm.order_grid(beta=1), "D^1.5 y = a y"),
+            "lattice order 'beta' is no free order; free are none",
+        ),
+        (lambda: values(ftlm.OrderGrid(increment=1e-7)), "has 9.5e+06 values, more than 1000000"),
     ],
-)  # fmt: skip
+)
 def test_lattices_that_are_none_are_refused(make, message):
     with pytest.raises(ftlm.ModelError) as refused:
         make()
@@ -707,10 +721,10 @@ TOO_MANY = "candidates, more than the limit of"
         ("D^1.5 y = a y + b u", {}, "every order is a number, so there is nothing to search"),
         ("D^alpha y = a y + b u; D^beta z = c z", {}, "one by one: pass .equation('y') or use identify"),
     ],
-)  # fmt: skip
+)
 def test_nothing_or_too_much_to_search_is_refused(run, text, lattice, message):
     with pytest.raises(ftlm.ModelError) as refused:
-        ftlm.search_orders(run, ftlm.equation(text), ftlm.Lattice(**lattice), m=M, threads=1)
+        ftlm.search_orders(run, ftlm.equation(text), ftlm.OrderGrid(**lattice), m=M, threads=1)
     assert message in str(refused.value)
 
 
@@ -742,13 +756,17 @@ def test_settings_state_what_matters_and_nothing_else():
     made = Settings.check("output-error", "l1", "multi-innovation", 7, 1.0, "haar", 20, 1)
     assert made.needs_haar
     assert made.to_dict() == {
-        "criterion": "output-error", "norm": "l1", "coefficients": "multi-innovation",
-        "innovation_length": 7, "prior_covariance": 1.0, "rows": "haar",
-    }  # fmt: skip
+        "criterion": "output-error",
+        "norm": "l1",
+        "coefficients": "multi-innovation",
+        "innovation_length": 7,
+        "prior_covariance": 1.0,
+        "rows": "haar",
+    }
     plain = replace(made, coefficients="least-squares")
     assert not plain.needs_haar
     assert plain.to_dict() == {"criterion": "output-error", "norm": "l1", "coefficients": "least-squares"}
-    assert plain.core()[2] == 0
+    assert plain.core_arguments()[2] == 0
 
 
 def test_power_means_of_the_oracle_are_those_of_a_power():
@@ -766,7 +784,7 @@ def test_a_share_of_candidates_that_fail_are_rows_with_a_reason(run, tmp_path, s
         step=run.step, inputs={"u": run["u"], "v": run["u"]}, outputs={"y": run["y"]}, name="twin"
     )
     structure = ftlm.equation("D^1.6 y = a D^0.6 y + b D^nu u + c D^mu v", initial="rest")
-    lattice = ftlm.Lattice(orders={"nu": [k / 100 for k in range(orders)], "mu": [0.0]})
+    lattice = ftlm.OrderGrid(orders={"nu": [k / 100 for k in range(orders)], "mu": [0.0]})
     options = {"coefficients": "least-squares", "m": M, "early_stopping": early_stopping}
     if share == 100:
         for more in ({}, {"store": tmp_path / "s.ftlm"}):
@@ -777,8 +795,8 @@ def test_a_share_of_candidates_that_fail_are_rows_with_a_reason(run, tmp_path, s
     kept = ftlm.search_orders(twin, structure, lattice, **options, store=tmp_path / "s.ftlm")
     assert kept.to_dict() == found.to_dict()
     assert found.candidates == orders
-    assert len(found.table) + sum(found.pruned.values()) == found.candidates
-    assert 100 * found.pruned["singular"] == share * found.candidates
+    assert len(found.table) + sum(found.exclusion_counts.values()) == found.candidates
+    assert 100 * found.exclusion_counts["singular"] == share * found.candidates
     assert found.failures == [({"nu": 0.0, "mu": 0.0}, "singular")]
     assert all(row.orders["nu"] > 0 for row in found.table)
 
@@ -790,7 +808,7 @@ def test_a_share_of_candidates_that_diverge_are_rows_with_a_reason(tmp_path, sha
     growing = ftlm.Run.from_arrays(step=0.1, inputs={"u": u}, outputs={"y": np.cumsum(u)})
     structure = ftlm.equation("D^alpha y = 5 y + b u", initial="rest")
     diverging = [0.6 + k / 200 for k in range(share)]
-    lattice = ftlm.Lattice(orders={"alpha": diverging + [2.0 + k / 100 for k in range(100 - share)]})
+    lattice = ftlm.OrderGrid(orders={"alpha": diverging + [2.0 + k / 100 for k in range(100 - share)]})
     for early_stopping in (False, True):
         options = {"m": 2000, "coefficients": "least-squares", "early_stopping": early_stopping}
         for more in ({}, {"store": tmp_path / f"{early_stopping}.ftlm"}):
@@ -799,11 +817,11 @@ def test_a_share_of_candidates_that_diverge_are_rows_with_a_reason(tmp_path, sha
                     ftlm.search_orders(growing, structure, lattice, **options, **more)
                 continue
             found = ftlm.search_orders(growing, structure, lattice, **options, **more)
-            assert len(found.table) + sum(found.pruned.values()) == found.candidates == 100
+            assert len(found.table) + sum(found.exclusion_counts.values()) == found.candidates == 100
             assert all(row.orders["alpha"] >= 2 for row in found.table)
             assert all(reason == "diverged" and orders["alpha"] < 1.27 for orders, reason in found.failures)
             if not early_stopping:
-                assert found.pruned["diverged"] == share
+                assert found.exclusion_counts["diverged"] == share
                 assert [orders["alpha"] for orders, _ in found.failures] == pytest.approx(diverging)
 
 
@@ -817,14 +835,14 @@ def test_a_share_of_candidates_that_diverge_are_rows_with_a_reason(tmp_path, sha
         {},
         {"norm": "l2"},
         {"criterion": "equation-error", "norm": "l2", "coefficients": "least-squares"},
-        {"coefficients": "instrumental-variables", "lattice": ftlm.lattice(step=0.2)},
-        {"early_stopping": False, "lattice": ftlm.lattice(step=0.2)},
+        {"coefficients": "instrumental-variables", "lattice": ftlm.order_grid(step=0.2)},
+        {"early_stopping": False, "lattice": ftlm.order_grid(step=0.2)},
     ],
 )
 def test_the_oldest_machine_ranks_as_the_newest(run, with_noise, options):
     """R4: the whole table and all counts, from kernels compiled for the machine at hand and for any."""
     noisy = with_noise(run, 0.003, 1)
-    options = {"lattice": ftlm.lattice(step=0.1), "m": 256, "threads": 2, **options}
+    options = {"lattice": ftlm.order_grid(step=0.1), "m": 256, "threads": 2, **options}
     words = ftlm.equation("D^alpha y = a D^beta y + c D^mu y + b D^nu u", initial="rest")
     tables = []
     for portable in (False, True):
@@ -858,7 +876,7 @@ def test_instruments_of_an_equation_whose_coefficients_are_all_known_estimate_no
     found, plain = (
         [
             (row.orders, row.score)
-            for row in ftlm.search_orders(run, words, ftlm.lattice(step=0.1), coefficients=c).table
+            for row in ftlm.search_orders(run, words, ftlm.order_grid(step=0.1), coefficients=c).table
         ]
         for c in ("instrumental-variables", "least-squares")
     )

@@ -10,8 +10,8 @@ from scipy.optimize import least_squares
 
 import ftlm
 from ftlm import _core
-from ftlm.estimation.free_parameters import FreeProblem, twin_words
-from ftlm.estimation.objective import experiment
+from ftlm.estimation.free_parameters import FreeProblem, describe_collinear_inputs
+from ftlm.estimation.objective import sample_run
 from ftlm.estimation.output_error import fit_output_error
 from ftlm.reproduction.simulated_arm import demo_plant
 from ftlm.utils.statistics import is_white
@@ -52,9 +52,18 @@ def arm_run(stage: int, rows: int, noise: float, seed: int) -> ftlm.Run:
 def residuals_at(problem: FreeProblem, prepared: list, initial: object, orders: list, coefficients: list) -> dict:
     """One evaluation, no step."""
     return _core.output_error(
-        prepared, laws(problem), [(0.01, 3.0)] * len(orders), ["plain"] * len(coefficients),
-        problem.structure.coupling == "simulated", initial, orders, coefficients, [], 1, 1e-12,
-    )  # fmt: skip
+        prepared,
+        laws(problem),
+        [(0.01, 3.0)] * len(orders),
+        ["plain"] * len(coefficients),
+        problem.structure.coupling == "simulated",
+        initial,
+        orders,
+        coefficients,
+        [],
+        1,
+        1e-12,
+    )
 
 
 @pytest.mark.parametrize("coupling", ["simulated", "measured"])
@@ -63,7 +72,7 @@ def test_the_analytic_jacobian_is_that_of_finite_differences(coupling: str, init
     run = arm_run(1, 301, 1e-3, 0)
     words = "caputo" if initial[0] else "rest"
     problem = FreeProblem.of(replace(ftlm.flexible_link(form="published", stage=1, coupling=coupling), initial=words))
-    prepared = [experiment(run, problem, [1.0, 10.0], every=2)]
+    prepared = [sample_run(run, problem, [1.0, 10.0], every=2)]
     # Away from whole differences of orders, where initial terms merge.
     named = {"alpha1": 1.93, "alpha2": 1.91, "gamma1": 0.9, "beta2": 0.13, "mu2": 0.8}
     named |= {"a1": 500.0, "b1": -50.0, "d1": 8.0, "g1": 120.0, "r1": 1.5}
@@ -93,7 +102,7 @@ def test_the_analytic_jacobian_is_that_of_finite_differences(coupling: str, init
 def test_the_optimum_is_scipys() -> None:
     run = three_terms(30, 5, rows=513)
     problem = FreeProblem.of(structure())
-    prepared = [experiment(run, problem, [20.0])]
+    prepared = [sample_run(run, problem, [20.0])]
     start = np.array([2.1, 1.0, -0.7, -1.1, 1.1])
 
     def residuals(x: np.ndarray) -> np.ndarray:
@@ -101,9 +110,18 @@ def test_the_optimum_is_scipys() -> None:
 
     theirs = least_squares(residuals, start, x_scale="jac", xtol=1e-12, ftol=1e-12, gtol=1e-12)
     ours = _core.output_error(
-        prepared, laws(problem), [(0.01, 3.0)] * 2, ["logarithm"] * 3, False, (False, []),
-        list(start[:2]), list(start[2:]), [], 100, 1e-12,
-    )  # fmt: skip
+        prepared,
+        laws(problem),
+        [(0.01, 3.0)] * 2,
+        ["logarithm"] * 3,
+        False,
+        (False, []),
+        list(start[:2]),
+        list(start[2:]),
+        [],
+        100,
+        1e-12,
+    )
     assert ours["status"] == "converged"
     assert ours["cost"] == pytest.approx(theirs.cost, rel=1e-8)
     assert np.array(ours["orders"] + ours["coefficients"]) == pytest.approx(theirs.x, rel=1e-4)
@@ -130,18 +148,18 @@ def test_the_arm_is_recovered_from_an_automatic_start_under_both_laws(stage: int
     found = ftlm.identify(run, ftlm.flexible_link(form="published", stage=stage), method="output-error")
     plant = demo_plant(stage, form="published")
     truth = {n: v for n, v in plant.orders.items()} | plant.coefficients
-    assert found.joint is not None
-    for name, value in {**found.orders, **found.joint.coefficients}.items():
+    assert found.fit is not None
+    for name, value in {**found.orders, **found.fit.coefficients}.items():
         if name in truth:
             assert abs(value - truth[name]) < 5 * found.standard_errors[name], name
     for name, (low, high) in found.intervals.items():
         assert low < high, name
-    for output, noise_found in found.joint.noise.items():
+    for output, noise_found in found.fit.noise.items():
         assert noise_found == pytest.approx(noise * np.std(run[output]), rel=0.06)
     coefficients = found.coefficients
     d, h = 2 * stage, 2 * stage - 1
     assert coefficients[f"b{d}"] == -coefficients[f"b{h}"]
-    assert coefficients[f"a{d}"] == pytest.approx(-coefficients[f"a{h}"] * found.joint.coefficients[f"r{stage}"])
+    assert coefficients[f"a{d}"] == pytest.approx(-coefficients[f"a{h}"] * found.fit.coefficients[f"r{stage}"])
 
 
 def test_printed_figures_are_those_of_compare_and_the_model_saves(tmp_path) -> None:
@@ -189,7 +207,7 @@ def test_what_the_run_cannot_tell_is_said_in_words() -> None:
     truth = ftlm.Model(ftlm.equation("D^2.2 y = -0.625 D^0.9 y - 1.25 y + 1.25 u"))
     clean = truth.simulate(ftlm.Run.from_arrays(step=0.02, inputs={"u": u}, outputs={"y": 0 * t}))["y"]
     noisy = clean + 0.05 * np.std(clean) * np.random.default_rng(4).standard_normal(t.size)
-    run = ftlm.Run.from_arrays(step=0.02, inputs={"u": u}, outputs={"y": noisy}).slice(8.0, None)
+    run = ftlm.Run.from_arrays(step=0.02, inputs={"u": u}, outputs={"y": noisy}).window(8.0, None)
     found = ftlm.identify(run, ftlm.equation("D^alpha y = a1 D^nu y + a0 y + b0 u"))
     assert any("cannot be told" in w or "not different from 0" in w or "bound" in w for w in found.warnings)
 
@@ -211,7 +229,7 @@ def test_the_search_is_the_same_for_any_number_of_threads() -> None:
 
 def test_the_choice_of_an_optimum_is_given_in_words() -> None:
     found = ftlm.identify(three_terms(40, 0), structure())
-    joint = found.joint
+    joint = found.fit
     level = joint.starts[0][0]
     same = sum(v <= 1.001 * level for v, _ in joint.starts)
     assert joint.choice.startswith(f"{same} of {len(joint.starts)} starts ended in the lowest optimum, first that of: ")
@@ -237,5 +255,5 @@ def test_two_signals_that_drive_alike_are_named() -> None:
     apart = ftlm.Run.from_arrays(
         step=run.step, inputs={"u": u, "v": u + 1e-6 * np.cos(run.time)}, outputs={"y": run["y"]}
     )
-    assert twin_words([apart], ftlm.equation("D^alpha y = a0 y + b u + c v")) is None
-    assert twin_words([twice], ftlm.equation("D^alpha y = a0 y + b u + c D^gamma v")) is None
+    assert describe_collinear_inputs([apart], ftlm.equation("D^alpha y = a0 y + b u + c v")) is None
+    assert describe_collinear_inputs([twice], ftlm.equation("D^alpha y = a0 y + b u + c D^gamma v")) is None

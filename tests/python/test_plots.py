@@ -201,12 +201,17 @@ def test_every_picture_draws_into_axes_that_are_given(joint, small_run):
 
     plot, model = ftlm.plot, joint.model
     pictures = [
-        (lambda ax: plot.fit(joint, ax=ax), 2), (lambda ax: plot.residuals(joint, ax=ax), 2),
-        (lambda ax: plot.bode(model, ax=ax), 2), (lambda ax: plot.poles(model, ax=ax), 1),
-        (lambda ax: plot.step(model, ax=ax), 1), (lambda ax: plot.impulse(model, ax=ax), 1),
-        (lambda ax: plot.run(small_run, ax=ax), 2), (lambda ax: plot.correlation(joint, ax=ax), 1),
-        (lambda ax: plot.residual_series(joint, ax=ax), 2), (lambda ax: plot.models({"a": joint.comparison}, ax=ax), 1),
-    ]  # fmt: skip
+        (lambda ax: plot.fit(joint, ax=ax), 2),
+        (lambda ax: plot.residuals(joint, ax=ax), 2),
+        (lambda ax: plot.bode(model, ax=ax), 2),
+        (lambda ax: plot.poles(model, ax=ax), 1),
+        (lambda ax: plot.step(model, ax=ax), 1),
+        (lambda ax: plot.impulse(model, ax=ax), 1),
+        (lambda ax: plot.run(small_run, ax=ax), 2),
+        (lambda ax: plot.correlation(joint, ax=ax), 1),
+        (lambda ax: plot.residual_series(joint, ax=ax), 2),
+        (lambda ax: plot.models({"a": joint.comparison}, ax=ax), 1),
+    ]
     for draw, count in pictures:
         figure = Figure()
         axes = figure.subplots(1, count)
@@ -221,8 +226,18 @@ def test_every_picture_draws_into_axes_that_are_given(joint, small_run):
 @pytest.mark.parametrize("bad", [None, 3, "model", []])
 def test_what_is_nothing_to_draw_is_refused(bad):
     plot = ftlm.plot
-    for draw in (plot.fit, plot.residuals, plot.bode, plot.poles, plot.step, plot.impulse, plot.run, plot.correlation,
-                 plot.residual_series, plot.models):  # fmt: skip
+    for draw in (
+        plot.fit,
+        plot.residuals,
+        plot.bode,
+        plot.poles,
+        plot.step,
+        plot.impulse,
+        plot.run,
+        plot.correlation,
+        plot.residual_series,
+        plot.models,
+    ):
         with pytest.raises(ftlm.errors.ModelError):
             draw(bad)
 

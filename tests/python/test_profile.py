@@ -17,9 +17,15 @@ from scipy.signal import lfilter, lsim
 
 import ftlm
 from ftlm.estimation import confidence_intervals as profiling
-from ftlm.estimation.confidence_intervals import Valley, bent_numbers, half_width, profiled, valley_of
-from ftlm.estimation.model_checks import uncertain
-from ftlm.estimation.objective import Attempt
+from ftlm.estimation.confidence_intervals import (
+    ProfileLikelihood,
+    half_width,
+    likelihood_of,
+    nonlinear_parameters,
+    profile_intervals,
+)
+from ftlm.estimation.model_checks import identifiability_warnings
+from ftlm.estimation.objective import Iterate
 from ftlm.report.html_report import model_page
 from measured import DATA, needs_data
 
@@ -62,10 +68,8 @@ def test_the_profile_of_a_linear_problem_is_the_quadratic_interval(colour: float
         assert len(own.points) == 2
     # At another level, and the test by two evaluations says nothing against the picture.
     (wide,) = found.profile("b", level=0.99).values()
-    assert wide.high - wide.low == pytest.approx(
-        2 * 2.5758293 * found.standard_errors["b"], rel=1e-3
-    )  # fmt: skip
-    assert bent_numbers(valley_of(found), 0.95) == []
+    assert wide.high - wide.low == pytest.approx(2 * 2.5758293 * found.standard_errors["b"], rel=1e-3)
+    assert nonlinear_parameters(likelihood_of(found), 0.95) == []
 
 
 def test_the_profile_of_one_number_is_its_likelihood() -> None:
@@ -139,10 +143,10 @@ def test_at_its_ends_the_cost_has_risen_by_the_threshold(
     u = switched(300, 15)
     run = record(answer(*truth.values(), u), u, noise, 4)
     found = quadratic(run, words)
-    values = np.array([found.joint_values[n] for n in truth])
-    valley = valley_of(found)
+    values = np.array([found.parameter_values[n] for n in truth])
+    valley = likelihood_of(found)
     asked = {n: valley.names.index(n) for n in truth}
-    bent = bent_numbers(valley, 0.95)
+    bent = nonlinear_parameters(valley, 0.95)
     assert bent
     for i, (name, own) in enumerate(found.profile(*truth).items()):
         quadratic_ends = found.intervals[name]
@@ -151,7 +155,7 @@ def test_at_its_ends_the_cost_has_risen_by_the_threshold(
             assert off > 0.02 * (quadratic_ends[1] - quadratic_ends[0])
         for end in (own.low, own.high):
             assert math.isfinite(end)
-            near = valley.refitted(asked[name], end, valley.best)
+            near = valley.refit(asked[name], end, valley.best)
             assert near is not None
             start = np.array([near.values[k] for k in asked.values()])
             rise = naive_rise(answer, run, values, i, end, start)
@@ -192,8 +196,8 @@ def test_an_open_end_is_infinite_and_so_is_the_naive_cost_below_the_threshold(
 def test_terminal_json_frame_page_and_file_say_the_same(found: ftlm.Identification, tmp_path: Path) -> None:
     own = found.profiles["c"]
     assert found.intervals["c"] == (own.low, own.high)
-    assert found.joint is not None
-    assert found.joint.intervals["c"] == (own.low, own.high)
+    assert found.fit is not None
+    assert found.fit.intervals["c"] == (own.low, own.high)
     text = found.details()
     assert f"−∞ to {own.high:.6g}" in text
     assert "but those written out: by profile likelihood" in text
@@ -256,7 +260,7 @@ def test_progress_counts_ends_and_stops_the_work(found: ftlm.Identification) -> 
         found.profile(threads=2, progress=interrupt)
     stop = threading.Event()
     stop.set()
-    search = valley_of(found).end(0, 1.0, half_width(0.95), stop)
+    search = likelihood_of(found).search_bound(0, 1.0, half_width(0.95), stop)
     next(search)
     with pytest.raises(KeyboardInterrupt):
         search.send(1000)
@@ -278,8 +282,8 @@ def test_numbers_that_are_known_well_are_not_profiled(bent: ftlm.Run) -> None:
 def test_a_profile_that_nobody_asked_for_is_left_where_it_takes_long(
     bent: ftlm.Run, found: ftlm.Identification, monkeypatch: pytest.MonkeyPatch
 ) -> None:
-    monkeypatch.setattr("ftlm.estimation.confidence_intervals.UNASKED", 0)
-    monkeypatch.setattr("ftlm.estimation.confidence_intervals.FEWEST", 6)
+    monkeypatch.setattr("ftlm.estimation.confidence_intervals.MAX_AUTO_PULSES", 0)
+    monkeypatch.setattr("ftlm.estimation.confidence_intervals.MIN_INITIAL_BUDGET_PER_BOUND", 6)
     structure = found.task.structure
     short = ftlm.identify(bent, structure)
     assert "c" not in short.profiles
@@ -293,18 +297,21 @@ def test_a_profile_that_nobody_asked_for_is_left_where_it_takes_long(
 
 
 def test_what_one_end_does_not_need_goes_to_the_others(found: ftlm.Identification) -> None:
-    valley = valley_of(found)
-    free = profiled(valley, valley.names, 0.95)
+    valley = likelihood_of(found)
+    free = profile_intervals(valley, valley.names, 0.95)
     took = {n: i.evaluations for n, i in free.intervals.items()}
     # Dealt out evenly alone, this budget would not do for the number that takes most.
     scarce = sum(took.values()) + 8 * len(took)
     assert max(took.values()) > scarce / len(took)
-    dealt = profiled(valley, valley.names, 0.95, most=scarce)
-    assert dealt.left == ()
+    dealt = profile_intervals(valley, valley.names, 0.95, most=scarce)
+    assert dealt.incomplete_names == ()
     for name, interval in dealt.intervals.items():
         # A refit that was cut short goes on from where it was, by other steps.
         assert (interval.low, interval.high) == pytest.approx((free.intervals[name].low, free.intervals[name].high))
-    assert max(took, key=took.__getitem__) in profiled(valley, valley.names, 0.95, most=max(took.values())).left
+    assert (
+        max(took, key=took.__getitem__)
+        in profile_intervals(valley, valley.names, 0.95, most=max(took.values())).incomplete_names
+    )
 
 
 def test_a_number_that_is_not_seen_has_the_whole_line() -> None:
@@ -313,14 +320,16 @@ def test_a_number_that_is_not_seen_has_the_whole_line() -> None:
     twice = ftlm.Run.from_arrays(inputs={"u": u, "v": u}, outputs={"y": run["y"]}, step=STEP)
     structure = ftlm.equation("D^2 y = -0.8 D y + a y + b u + e v", initial="rest")
     plain = quadratic(run, "D^2 y = -0.8 D y + a y + b u")
-    assert plain.joint is not None
+    assert plain.fit is not None
     assert plain.task is not None
     task = replace(plain.task, runs=(twice,), structure=structure)
     values = np.array([plain.coefficients["a"], 1.0, plain.coefficients["b"] - 1.0])
     joint = replace(
-        plain.joint, coefficients=dict(zip("abe", values.tolist(), strict=True)), on_grid=values,
+        plain.fit,
+        coefficients=dict(zip("abe", values.tolist(), strict=True)),
+        on_grid=values,
         covariance=np.diag([1.0, np.inf, np.inf]),
-    )  # fmt: skip
+    )
     seen = replace(plain, task=task, joint=joint).profile(threads=1)
     assert (seen["b"].low, seen["e"].high) == (-math.inf, math.inf)
     assert -4.0 in seen["a"]
@@ -330,15 +339,15 @@ def test_a_number_that_is_not_seen_has_the_whole_line() -> None:
 def test_a_lower_optimum_on_the_way_is_gone_on_from(bent: ftlm.Run) -> None:
     u = bent["u"]
     plain = quadratic(record(fast_pole(-0.8, -4.0, 4.0, u), u, 0.05, 9), "D^2 y = c D y + a y + b u")
-    valley = valley_of(plain)
-    names = list(plain.joint_values)
-    right = profiled(valley, names, 0.95).intervals
+    valley = likelihood_of(plain)
+    names = list(plain.parameter_values)
+    right = profile_intervals(valley, names, 0.95).intervals
     # As if the fit had ended a standard error beside the optimum.
     orders, coefficients, delays = valley.grid.problem.split((valley.best.values + valley.errors).tolist())
-    beside = valley.grid.descend(Attempt(orders, coefficients, "beside", {}, delays), 1, plain=True)
-    there = profiled(replace(valley, best=beside, shift=valley.shift), names, 0.95)
-    assert there.lower is not None
-    np.testing.assert_allclose(there.lower, valley.best.values, rtol=1e-3)
+    beside = valley.grid.minimize(Iterate(orders, coefficients, "beside", {}, delays), 1, plain=True)
+    there = profile_intervals(replace(valley, best=beside, shift=valley.shift), names, 0.95)
+    assert there.lower_optimum is not None
+    np.testing.assert_allclose(there.lower_optimum, valley.best.values, rtol=1e-3)
     for name, own in there.intervals.items():
         i = valley.names.index(name)
         shifted = (right[name].low - valley.shift[i], right[name].high - valley.shift[i])
@@ -348,53 +357,53 @@ def test_a_lower_optimum_on_the_way_is_gone_on_from(bent: ftlm.Run) -> None:
 def test_a_budget_holds_for_every_optimum_on_the_way(bent: ftlm.Run) -> None:
     u = bent["u"]
     plain = quadratic(record(fast_pole(-0.8, -4.0, 4.0, u), u, 0.05, 9), "D^2 y = c D y + a y + b u")
-    valley = valley_of(plain)
-    names = list(plain.joint_values)
+    valley = likelihood_of(plain)
+    names = list(plain.parameter_values)
     orders, coefficients, delays = valley.grid.problem.split((valley.best.values + valley.errors).tolist())
-    beside = valley.grid.descend(Attempt(orders, coefficients, "beside", {}, delays), 1, plain=True)
+    beside = valley.grid.minimize(Iterate(orders, coefficients, "beside", {}, delays), 1, plain=True)
     apart = replace(valley, best=beside)
-    free = profiled(apart, names, 0.95)
+    free = profile_intervals(apart, names, 0.95)
     # It went on from a lower optimum; what it took until there counts.
-    assert free.lower is not None
+    assert free.lower_optimum is not None
     assert free.evaluations > sum(i.evaluations for i in free.intervals.values())
     # As many as all ends are begun with: the way down leaves too few of them for the ends around the lower optimum.
-    least = profiling.LEAST_SHARE * 2 * len(names)
-    scarce = profiled(apart, names, 0.95, most=least)
+    least = profiling.MIN_BUDGET_PER_BOUND * 2 * len(names)
+    scarce = profile_intervals(apart, names, 0.95, most=least)
     assert 0 < scarce.evaluations <= least
-    assert scarce.lower is not None
-    assert scarce.left == tuple(names)
-    assert profiled(valley, names, 0.95, most=least).left == ()
+    assert scarce.lower_optimum is not None
+    assert scarce.incomplete_names == tuple(names)
+    assert profile_intervals(valley, names, 0.95, most=least).incomplete_names == ()
     # The first way down is the last that is followed, whatever the threads.
-    assert profiled(apart, names, 0.95, threads=3).evaluations == free.evaluations
+    assert profile_intervals(apart, names, 0.95, threads=3).evaluations == free.evaluations
 
 
 def test_identify_goes_on_from_a_lower_optimum_and_says_so(bent: ftlm.Run, monkeypatch: pytest.MonkeyPatch) -> None:
     u = bent["u"]
     run = record(fast_pole(-0.8, -4.0, 4.0, u), u, 0.05, 9)
     right = quadratic(run, "D^2 y = c D y + a y + b u")
-    at, calls = Valley.at.__func__, []
+    at, calls = ProfileLikelihood.at.__func__, []
 
-    def beside(cls: type[Valley], grid: object, values: np.ndarray, shift: np.ndarray) -> Valley:
+    def beside(cls: type[ProfileLikelihood], grid: object, values: np.ndarray, shift: np.ndarray) -> ProfileLikelihood:
         valley = at(cls, grid, values, shift)
         calls.append(values)
         # The first is on a coarser grid, which is not taken here.
         if len(calls) > 2:
             return valley
         orders, coefficients, delays = valley.grid.problem.split((valley.best.values + valley.errors).tolist())
-        off = valley.grid.descend(Attempt(orders, coefficients, "beside", {}, delays), 1, plain=True)
+        off = valley.grid.descend(Iterate(orders, coefficients, "beside", {}, delays), 1, plain=True)
         return replace(valley, best=off)
 
-    monkeypatch.setattr(profiling.Valley, "at", classmethod(beside))
-    monkeypatch.setattr(profiling, "NEARBY", -1.0)
+    monkeypatch.setattr(profiling.ProfileLikelihood, "at", classmethod(beside))
+    monkeypatch.setattr(profiling, "MAX_OPTIMUM_SHIFT_ERRORS", -1.0)
     structure = ftlm.equation("D^2 y = c D y + a y + b u", initial="rest")
     same = ftlm.identify(run, structure, threads=1, intervals="profile")
     # The fit was right all the while: its residuals do not fall, and its starts stay told.
     assert not [w for w in same.warnings if "the search for intervals did" in w]
-    assert same.joint.starts == right.joint.starts
+    assert same.fit.starts == right.fit.starts
     calls.clear()
     # As if it had been lower: of one optimum found twice rounding decides which is.
-    monkeypatch.setattr("ftlm.estimation.confidence_intervals.TOLD", -1.0)
-    monkeypatch.setattr("ftlm.estimation.confidence_intervals.is_lower", lambda *_: True)
+    monkeypatch.setattr("ftlm.estimation.confidence_intervals.MIN_NOISE_REDUCTION", -1.0)
+    monkeypatch.setattr("ftlm.estimation.confidence_intervals.is_lower_on_finer_grid", lambda *_: True)
     again = ftlm.identify(run, structure, threads=1, intervals="profile")
     assert [w for w in again.warnings if "led to this optimum, but the search for intervals did" in w]
     assert "from a lower optimum" in again.details()
@@ -412,10 +421,10 @@ def test_delays_and_orders_are_held_where_they_are_profiled() -> None:
         own = found.profiles[name]
         assert value in own
         assert own.high - own.low < 10 * found.standard_errors[name]
-    valley = valley_of(found)
+    valley = likelihood_of(found)
     for i, name in enumerate(valley.names):
         moved = float(valley.best.values[i]) + float(valley.errors[i])
-        refit = valley.refitted(i, moved, valley.best)
+        refit = valley.refit(i, moved, valley.best)
         assert refit is not None
         assert refit.values[i] == moved, name
 
@@ -445,10 +454,10 @@ def test_what_has_no_profile_says_so(bent: ftlm.Run, found: ftlm.Identification)
 
 
 def test_warnings_follow_the_profile(found: ftlm.Identification) -> None:
-    assert found.joint is not None
-    problem = valley_of(found).grid.problem
-    before = uncertain(replace(found.joint, profiles={}), problem)
-    after = uncertain(found.joint, problem)
+    assert found.fit is not None
+    problem = likelihood_of(found).grid.problem
+    before = identifiability_warnings(replace(found.fit, profiles={}), problem)
+    after = identifiability_warnings(found.fit, problem)
     assert [w for w in before if w.startswith("coefficient c")]
     assert not [w for w in after if w.startswith("coefficient c")]
 
@@ -461,13 +470,20 @@ def test_warnings_follow_the_profile(found: ftlm.Identification) -> None:
 def test_the_link_of_the_real_arm_is_bounded_from_one_side_alone() -> None:
     """The deflection driven by the hub: D^mu near 0 and the spring trade for each other without end."""
     run = ftlm.load(
-        DATA / "two_link_psf" / "psf.csv", time="t_s", inputs={"theta11": "th11_deg"}, outputs={"theta12": "th12_deg"},
-        units={"theta11": "deg", "theta12": "deg"}, intersample={"theta11": "foh"},
-    ).slice(1.1, 10.3)  # fmt: skip
+        DATA / "two_link_psf" / "psf.csv",
+        time="t_s",
+        inputs={"theta11": "th11_deg"},
+        outputs={"theta12": "th12_deg"},
+        units={"theta11": "deg", "theta12": "deg"},
+        intersample={"theta11": "foh"},
+    ).window(1.1, 10.3)
     thin = ftlm.Run.from_arrays(
-        step=4 * run.step, inputs={"theta11": run["theta11"][::4]}, outputs={"theta12": run["theta12"][::4]},
-        units=run.units, intersample={"theta11": "foh"},
-    )  # fmt: skip
+        step=4 * run.step,
+        inputs={"theta11": run["theta11"][::4]},
+        outputs={"theta12": run["theta12"][::4]},
+        units=run.units,
+        intersample={"theta11": "foh"},
+    )
     words = "D^2 theta12 = d D^mu theta12 + a theta12 + b D^2 theta11"
     # Asked for: along a valley without end the default says that its profile takes long, and leaves it.
     link = ftlm.identify(thin, ftlm.equation(words, initial="caputo"), threads=1, intervals="profile")

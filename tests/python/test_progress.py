@@ -17,11 +17,11 @@ from ftlm import progress
 from ftlm.cli import framework as wait
 from ftlm.cli.main import app
 from ftlm.order_search.checkpoint import Store
-from ftlm.order_search.schedule import EquationWork
-from ftlm.order_search.search import announce, expected_seconds, make_job, run_job
-from ftlm.progress import PARTS, Course, Progress, Stoppable, expected_in_words, left_in_words
+from ftlm.order_search.schedule import EquationProblem
+from ftlm.order_search.search import announce_time, expected_seconds, make_job, run_job
+from ftlm.progress import TOTAL_PARTS, Progress, ShareTracker, Stoppable, format_duration_estimate, format_time_left
 from ftlm.reproduction import cross_validation as unseen
-from ftlm.utils.resources import by_output_error, expected, pace
+from ftlm.utils.resources import estimate_duration, machine_slowdown, output_error_cost
 
 
 class Terminal(io.StringIO):
@@ -32,7 +32,7 @@ class Terminal(io.StringIO):
 
 
 def shown(monkeypatch, columns, **environment):
-    monkeypatch.setattr(progress, "PATIENCE", 0.0)
+    monkeypatch.setattr(progress, "BAR_DELAY_S", 0.0)
     for name, value in {"COLUMNS": str(columns), "TERM": "xterm-256color", **environment}.items():
         monkeypatch.setenv(name, value)
     terminal = Terminal()
@@ -59,7 +59,7 @@ def test_no_color_means_no_colour(monkeypatch):
 
 
 def test_a_pipe_gets_nothing(monkeypatch, capsys):
-    monkeypatch.setattr(progress, "PATIENCE", 0.0)
+    monkeypatch.setattr(progress, "BAR_DELAY_S", 0.0)
     assert not sys.stderr.isatty()
     with Progress("searching") as bar:
         bar.say("next search")
@@ -68,7 +68,7 @@ def test_a_pipe_gets_nothing(monkeypatch, capsys):
 
 
 def test_quiet_says_nothing(monkeypatch):
-    monkeypatch.setattr(progress, "PATIENCE", 0.0)
+    monkeypatch.setattr(progress, "BAR_DELAY_S", 0.0)
     terminal = Terminal()
     monkeypatch.setattr(sys, "stderr", terminal)
     with Progress("searching", quiet=True) as bar:
@@ -78,12 +78,12 @@ def test_quiet_says_nothing(monkeypatch):
 
 
 def test_two_bars_share_one_display(monkeypatch):
-    monkeypatch.setattr(progress, "PATIENCE", 0.0)
+    monkeypatch.setattr(progress, "BAR_DELAY_S", 0.0)
     for name, value in {"COLUMNS": "80", "TERM": "xterm-256color"}.items():
         monkeypatch.setenv(name, value)
     terminal = Terminal()
     monkeypatch.setattr(sys, "stderr", terminal)
-    with Progress("whole") as bar, bar.beside() as first, bar.beside() as second:
+    with Progress("whole") as bar, bar.add_bar() as first, bar.add_bar() as second:
         first.name("stage 1")
         second.name("stage 2")
         for done in (1, 50, 100):
@@ -108,24 +108,24 @@ def test_stopping_ends_what_another_thread_reports():
 
 def test_a_course_never_goes_back_whatever_its_parts_count():
     told = []
-    course = Course(lambda done, total: told.append((done, total)))
-    part = course.until(0.5, 0.5)
+    course = ShareTracker(lambda done, total: told.append((done, total)))
+    part = course.subtask(0.5, 0.5)
     for total in (4, 9, 2):
         for done in range(total + 1):
             part(done, total)
     assert course.reached < 0.5
-    course.at(0.5)
-    course.at(0.2)
-    last = course.until(1.0)
+    course.advance_to(0.5)
+    course.advance_to(0.2)
+    last = course.subtask(1.0)
     last(1, 1)
-    course.at(1.0)
+    course.advance_to(1.0)
     shares = [done for done, _ in told]
     assert shares == sorted(set(shares))
-    assert told[-1] == (PARTS, PARTS)
+    assert told[-1] == (TOTAL_PARTS, TOTAL_PARTS)
     # A sweep takes its share of what is left, and the next one of the rest.
     assert 250 in shares
     assert 375 in shares
-    Course(None).at(1.0)
+    ShareTracker(None).advance_to(1.0)
 
 
 def test_a_fit_tells_how_far_it_is_to_its_end():
@@ -145,15 +145,23 @@ def test_a_fit_tells_how_far_it_is_to_its_end():
 
 @pytest.mark.parametrize(
     ("seconds", "words"),
-    [(0.2, "about 1 s left"), (12.4, "about 10 s left"), (17, "about 20 s left"), (44, "about 50 s left"),
-     (100, "about 2 min left"), (5000, "about 70 min left"), (9900, "about 3 h left"), (1e6, "about 300 h left")],
-)  # fmt: skip
+    [
+        (0.2, "about 1 s left"),
+        (12.4, "about 10 s left"),
+        (17, "about 20 s left"),
+        (44, "about 50 s left"),
+        (100, "about 2 min left"),
+        (5000, "about 70 min left"),
+        (9900, "about 3 h left"),
+        (1e6, "about 300 h left"),
+    ],
+)
 def test_time_is_told_to_a_digit(seconds, words):
-    assert left_in_words(seconds) == words
+    assert format_time_left(seconds) == words
 
 
 def test_time_left_follows_what_is_behind(monkeypatch):
-    monkeypatch.setattr(progress, "PATIENCE", 0.0)
+    monkeypatch.setattr(progress, "BAR_DELAY_S", 0.0)
     for name, value in {"COLUMNS": "100", "TERM": "xterm-256color"}.items():
         monkeypatch.setenv(name, value)
     terminal = Terminal()
@@ -163,7 +171,7 @@ def test_time_left_follows_what_is_behind(monkeypatch):
     with Progress("fitting") as bar:
         bar.expect("the fit", 31.0)
         bar.expect("nothing to wonder at", 1.0)
-        bar(100, PARTS)
+        bar(100, TOTAL_PARTS)
         time.sleep(0.15)
     written = terminal.getvalue()
     assert "the fit takes about 30 s; Ctrl-C ends it" in written
@@ -205,17 +213,21 @@ def folder(tmp_path):
 ASKED = {
     "identify": ("the fit", "run.csv -u u -y y --structure", "D y = a0 y + b0 u"),
     "identify --method multi-innovation": (
-        "the search", "run.csv -u u -y y --step 0.1 --structure", "D^alpha y = a D^beta y + b0 u",
+        "the search",
+        "run.csv -u u -y y --step 0.1 --structure",
+        "D^alpha y = a D^beta y + b0 u",
     ),
     "identify --method genetic --evaluations 400": (
-        "the genetic algorithm on y", "run.csv -u u -y y --step 0.1 --structure", "D^alpha y = a0 y + b0 u",
+        "the genetic algorithm on y",
+        "run.csv -u u -y y --step 0.1 --structure",
+        "D^alpha y = a0 y + b0 u",
     ),
     "agreement": ("fitting all parts", "run.csv -u u -y y --structure", "D y = a0 y + b0 u"),
     "select": ("choosing", "run.csv -u u -y y --structure", "D y = a0 y + b0 u"),
     "search": ("the search", "run.csv -u u -y y --step 0.1 --structure", "D^alpha y = a D^beta y + b0 u"),
     "identify-frequency": ("the fit", "bode.csv -u u -y y --structure", "D^alpha y = a0 y + b0 u"),
     "design-input": ("the design", "model.json --peak 1 --duration 5 --sampling", "0.05"),
-}  # fmt: skip
+}
 
 
 @pytest.mark.parametrize("command", ASKED)
@@ -235,10 +247,14 @@ def test_large_files_and_long_records_are_announced_and_small_ones_are_not(folde
     assert CliRunner().invoke(app, asked).exit_code == 0
     assert told == []
     size = (folder / "run.csv").stat().st_size
-    monkeypatch.setattr(wait, "OF_BYTE", 1.0 / size)
-    monkeypatch.setattr(wait, "OF_SAMPLE", 1.0 / 320)
-    for command in (asked, ["resid", *asked[1:]], ["simulate", *asked[1:], "-o", "out.csv"],
-                    ["report", "model.json", "--validation", *asked[2:], "-o", "out.html"]):  # fmt: skip
+    monkeypatch.setattr(wait, "READ_TIME_PER_BYTE_S", 1.0 / size)
+    monkeypatch.setattr(wait, "SIMULATION_TIME_PER_SAMPLE_S", 1.0 / 320)
+    for command in (
+        asked,
+        ["resid", *asked[1:]],
+        ["simulate", *asked[1:], "-o", "out.csv"],
+        ["report", "model.json", "--validation", *asked[2:], "-o", "out.html"],
+    ):
         told.clear()
         assert CliRunner().invoke(app, command).exit_code in (0, 4)
         assert [words for words, *_ in told] == ["reading", "running the model"], command
@@ -249,9 +265,9 @@ def test_large_files_and_long_records_are_announced_and_small_ones_are_not(folde
 
 
 def test_designs_are_announced_by_the_samples_that_their_loops_are_judged_on(monkeypatch, told):
-    monkeypatch.setattr(wait, "expected", lambda seconds, threads: seconds)
+    monkeypatch.setattr(wait, "estimate_duration", lambda seconds, threads: seconds)
     for design, samples in (("pid", 100), ("lqg", 100), ("lqg", 1000)):
-        wait.expect_designing(design, samples)
+        wait.announce_design(design, samples)
     assert [words for words, *_ in told] == ["designing"] * 3
     times = [(least, most) for _, least, most in told]
     assert times == sorted(times)
@@ -276,27 +292,27 @@ def job(step=0.1, **settings):
     u = np.sign(np.sin(2 * t))
     run = ftlm.Run.from_arrays(step=0.05, inputs={"u": u}, outputs={"y": np.cumsum(u) * 0.05})
     return make_job(
-        run, ftlm.equation("D^alpha y = a D^beta y + c D^mu y + b D^nu u"), ftlm.lattice(step=step), **settings
+        run, ftlm.equation("D^alpha y = a D^beta y + c D^mu y + b D^nu u"), ftlm.order_grid(step=step), **settings
     )
 
 
 def test_a_search_is_announced_by_what_coarse_lattices_of_it_take(monkeypatch):
     """A core that takes a millisecond a candidate, so that the whole search is known: within what is said."""
     asked = job(threads=1)
-    whole = asked.equation_work().plan()[0]
+    whole = asked.equation_problem().plan()[0]
     now, seen = [0.0], []
 
     def search(self, progress):
         seen.append(self.plan()[0])
         now[0] += 1e-3 * seen[-1]
 
-    monkeypatch.setattr(EquationWork, "search", search)
+    monkeypatch.setattr(EquationProblem, "search", search)
     least, most = expected_seconds(asked, clock=lambda: now[0])
     assert least < 1e-3 * whole < most
     assert seen == sorted(set(seen))
     assert max(seen) <= whole / 12
     # Twice as slow a machine takes twice as long.
-    monkeypatch.setattr(EquationWork, "search", lambda self, _: now.__setitem__(0, now[0] + 2e-3 * self.plan()[0]))
+    monkeypatch.setattr(EquationProblem, "search", lambda self, _: now.__setitem__(0, now[0] + 2e-3 * self.plan()[0]))
     assert expected_seconds(asked, clock=lambda: now[0])[0] == pytest.approx(2 * least, rel=0.5)
 
 
@@ -304,31 +320,36 @@ def test_of_a_store_only_what_is_left_is_announced(tmp_path, told):
     asked = job(0.2)
     path = tmp_path / "search.ftlm"
     with Store(path, [asked.request("y")]) as kept:
-        announce(Progress(""), [asked], kept)
+        announce_time(Progress(""), [asked], kept)
         run_job(asked, store=kept)
-        announce(Progress(""), [asked], kept)
+        announce_time(Progress(""), [asked], kept)
     (_, least, most), (_, *nothing) = told
     assert 0 < least < most
     assert nothing == [0.0, 0.0]
 
 
 def test_nobody_waits_for_an_announcement_that_nobody_sees(monkeypatch):
-    monkeypatch.setattr(EquationWork, "plan", lambda *_: pytest.fail("measured for nobody"))
-    announce(Progress("", quiet=True), [job()])
-    announce(lambda done, total: None, [job()])
+    monkeypatch.setattr(EquationProblem, "plan", lambda *_: pytest.fail("measured for nobody"))
+    announce_time(Progress("", quiet=True), [job()])
+    announce_time(lambda done, total: None, [job()])
 
 
 @pytest.mark.parametrize(
     ("least", "most", "words"),
-    [(12.0, 12.0, "about 10 s"), (0.4, 5.0, "up to 5 s"), (5.0, 18.0, "5 to 20 s"), (30.0, 200.0, "30 s to 3 min"),
-     (4e3, 1e5, "70 min to 30 h")],
-)  # fmt: skip
+    [
+        (12.0, 12.0, "about 10 s"),
+        (0.4, 5.0, "up to 5 s"),
+        (5.0, 18.0, "5 to 20 s"),
+        (30.0, 200.0, "30 s to 3 min"),
+        (4e3, 1e5, "70 min to 30 h"),
+    ],
+)
 def test_times_beforehand_are_told_as_what_they_are_known_to(least, most, words):
-    assert expected_in_words(least, most) == words
+    assert format_duration_estimate(least, most) == words
 
 
 def test_work_that_grows_is_counted_and_no_end_is_made_up(monkeypatch):
-    monkeypatch.setattr(progress, "PATIENCE", 0.0)
+    monkeypatch.setattr(progress, "BAR_DELAY_S", 0.0)
     for name, value in {"COLUMNS": "80", "TERM": "xterm-256color"}.items():
         monkeypatch.setenv(name, value)
     terminal = Terminal()
@@ -345,14 +366,14 @@ def test_work_that_grows_is_counted_and_no_end_is_made_up(monkeypatch):
 
 @pytest.mark.parametrize("columns", [40, 80, 120])
 def test_a_long_label_leaves_bar_and_figures_their_room(monkeypatch, columns):
-    monkeypatch.setattr(progress, "PATIENCE", 0.0)
+    monkeypatch.setattr(progress, "BAR_DELAY_S", 0.0)
     for name, value in {"COLUMNS": str(columns), "TERM": "xterm-256color"}.items():
         monkeypatch.setenv(name, value)
     terminal = Terminal()
     monkeypatch.setattr(sys, "stderr", terminal)
     with Progress("stage 1: all orders and coefficients together by output error, from the current alone") as bar:
         for done in (300, 400):
-            bar(done, PARTS)
+            bar(done, TOTAL_PARTS)
             time.sleep(0.12)
     plain = re.sub(r"\x1b\[[0-9;?]*[A-Za-z]", "", terminal.getvalue())
     assert re.search(r"━+.* 40 %.*about 1 s left", plain)
@@ -360,6 +381,11 @@ def test_a_long_label_leaves_bar_and_figures_their_room(monkeypatch, columns):
 
 
 def test_expectation_is_a_number_of_this_machine():
-    assert 0.1 <= pace() < 1e4
-    assert expected(10.0, 4) < expected(10.0, 1)
-    assert by_output_error(40_000, 5) > by_output_error(4000, 5) > by_output_error(400, 5) > by_output_error(400, 2)
+    assert 0.1 <= machine_slowdown() < 1e4
+    assert estimate_duration(10.0, 4) < estimate_duration(10.0, 1)
+    assert (
+        output_error_cost(40_000, 5)
+        > output_error_cost(4000, 5)
+        > output_error_cost(400, 5)
+        > output_error_cost(400, 2)
+    )

@@ -200,7 +200,7 @@ def test_its_response_is_that_of_what_runs():
 
 def test_the_first_sample_kicks_nothing_and_the_limit_winds_nothing_up():
     design = designed(samples=0)
-    controller = design.controlled(0.9)
+    controller = design.with_limit(0.9)
     assert controller([0.7, 0.0], 0.7) == pytest.approx(0.0, abs=1e-9)
     controller.reset()
     assert abs(controller([0.7, 1e-3], 0.7)) < 0.2
@@ -208,7 +208,7 @@ def test_the_first_sample_kicks_nothing_and_the_limit_winds_nothing_up():
     # A hub that stands still whatever is asked for, for two seconds; then it is where it should be.
     assert {controller([0.0, 0.0], 1.0) for _ in range(1000)} == {0.9}
     assert controller.memory == len(design.realisation.a) + 2
-    free = design.controlled(math.inf)
+    free = design.with_limit(math.inf)
     for _ in range(1000):
         free([0.0, 0.0], 1.0)
     told = [abs(c.estimate[control.kalman.UNKNOWN]) for c in (controller, free)]
@@ -221,8 +221,8 @@ def test_designs_are_made_over_the_intervals_or_refused_in_words():
     options = {"allowed": {"y": 0.02}, "effort": 1.0, "noise": {"y": 3e-4}, "samples": 40}
     good = control.lqg(uncertain(text, {4: 0.01, 2: 3.0}), **options)
     assert len(good.samples) == 40
-    assert good.kept == 1.0
-    low, high = good.within("phase")
+    assert good.stable_share == 1.0
+    low, high = good.margin_interval("phase")
     assert low < good.nominal.phase < high
     assert "over the intervals (40 samples, 100 % stable)" in str(good)
     with pytest.raises(ftlm.ModelError, match=r"too wide to design on: in [0-9]+ of 40 .*known least is the coeff"):
@@ -232,26 +232,32 @@ def test_designs_are_made_over_the_intervals_or_refused_in_words():
 def test_a_tip_comes_to_rest_on_the_virtual_arm_without_any_shaper():
     """Designed on the arm's linear fractional law; run with friction, coupling, offset and noise."""
     arm = ftlm.rig.ArmParameters.of("linear").model()
-    design = control.lqg(arm, input="I1", allowed={"theta11": 0.02, "theta12": 0.02}, effort=1.0, drift=0.5,
-                         noise={"theta11": 3e-4, "theta12": 2e-4})  # fmt: skip
-    path = control.smooth_move(math.radians(20.0), 0.5, before=0.2, after=0.8)
-    planned = control.inverse(design, path, of="theta11 + theta12", limit=0.93)
-    hold = control.Realised(control.FractionalPid(20.0, 50.0, 0.5, 1.0, 1.0), RATE, limit=1.19)
+    design = control.lqg(
+        arm,
+        input="I1",
+        allowed={"theta11": 0.02, "theta12": 0.02},
+        effort=1.0,
+        drift=0.5,
+        noise={"theta11": 3e-4, "theta12": 2e-4},
+    )
+    path = control.point_to_point(math.radians(20.0), 0.5, before=0.2, after=0.8)
+    planned = control.inverse_dynamics(design, path, of="theta11 + theta12", limit=0.93)
+    hold = control.DiscretePid(control.FractionalPid(20.0, 50.0, 0.5, 1.0, 1.0), RATE, limit=1.19)
     left = {}
     for name, reference in (("plain", path), ("inverse", planned.reference)):
-        loops = control.HubLoops(design.controlled(0.93), hold)
+        loops = control.JointControllers(design.with_limit(0.93), hold)
         run = ftlm.rig.control(loops, np.column_stack([reference, 0 * reference]), offset=(0.02, -0.02))
-        assert run.about["faults"] == []
+        assert run.metadata["faults"] == []
         tip = (run["theta11"] + run["theta12"])[-400:]
         left[name] = float(np.std(tip))
         assert abs(np.mean(tip[-100:]) - path[-1]) < 2e-3
     assert left["inverse"] < 1.2e-3
     assert left["inverse"] < 0.1 * left["plain"]
-    told = run.about["control"]["controller"]["settings"]["hub1"]
+    told = run.metadata["control"]["controller"]["settings"]["hub1"]
     assert told["kind"] == "lqg"
     assert 0 < told["gain_error_db"] < 0.2
     with pytest.raises(ftlm.ModelError, match="reads hub, bend; the arm measures theta11"):
-        control.HubLoops(designed(samples=0).controller)
+        control.JointControllers(designed(samples=0).controller)
 
 
 REFUSED = [
@@ -297,7 +303,7 @@ REFUSED = [
     ({"text": WHOLE.replace("- 30 D hub", "+ 30 D hub")}, "not stable .[12] of its poles"),
     ({"text": "D hub = -hub + sat(I, 0.5)"}, "I passes a saturation"),
     ({"text": "D^2 hub = -hub - D hub - fc*sign(D hub) + I", "fixed": {"fc": 0.1}}, "has friction"),
-]  # fmt: skip
+]
 
 
 @pytest.mark.parametrize("case", range(len(REFUSED)))
@@ -317,7 +323,7 @@ def test_what_is_no_model_or_no_loop_is_refused_by_name():
         with pytest.raises(ftlm.ModelError, match=r"model is .*, not a Model"):
             control.observer(wrong, drift=1.0)
         with pytest.raises(ftlm.ModelError, match=r"design is a .*, no PidDesign or LqgDesign"):
-            control.inverse(wrong, control.smooth_move(0.3, 0.5))
+            control.inverse_dynamics(wrong, control.point_to_point(0.3, 0.5))
 
 
 def test_a_controller_answers_no_command_that_is_no_number():
@@ -354,8 +360,8 @@ def test_an_observer_reads_a_run_that_fits_it():
 
 def test_a_planned_command_moves_the_exact_model_along_the_path():
     """The command alone, through the free run of fractional orders."""
-    path = control.smooth_move(0.3, 0.5)
-    planned = control.inverse(designed(samples=0), path, of="hub + bend")
+    path = control.point_to_point(0.3, 0.5)
+    planned = control.inverse_dynamics(designed(samples=0), path, of="hub + bend")
     rest = {"hub": 0 * path, "bend": 0 * path}
     # What is answered acts a sample later.
     run = ftlm.Run.from_arrays(step=1 / RATE, inputs={"I": np.append(0.0, planned.command[:-1])}, outputs=rest)
@@ -363,14 +369,14 @@ def test_a_planned_command_moves_the_exact_model_along_the_path():
     assert np.max(np.abs(moved["hub"] + moved["bend"] - path)) < 1e-3 * 0.3
     assert np.max(np.abs(moved["bend"] - planned.outputs["bend"])) < 1e-3 * 0.3
     assert planned.plain > 5e-3
-    assert planned.left is None
+    assert planned.residual_vibration is None
 
 
 def test_a_planned_reference_moves_the_loop_along_the_path():
     """Sample by sample: SciPy's plant under the controller."""
     design = designed(WHOLE, samples=0)
-    path = control.smooth_move(0.3, 0.5)
-    planned = control.inverse(design, path, of="hub + bend")
+    path = control.point_to_point(0.3, 0.5)
+    planned = control.inverse_dynamics(design, path, of="hub + bend")
     a, b, c = whole_system()
     state, acting, tip = np.zeros((4, 1)), 0.0, []
     design.controller.reset()
@@ -386,17 +392,18 @@ def test_a_planned_reference_moves_the_loop_along_the_path():
 def test_a_fractional_pid_moves_a_hub_along_the_path():
     hub = ftlm.Model(ftlm.equation("D^2 theta = -63 D^0.95 theta + 140 I"))
     design = control.fractional_pid(hub, crossover=60.0)
-    path = control.smooth_move(0.3, 0.4)
-    planned = control.inverse(design, path)
-    run = ftlm.Run.from_arrays(step=1 / RATE, inputs={"I": np.append(0.0, planned.command[:-1])},
-                               outputs={"theta": 0 * path})  # fmt: skip
+    path = control.point_to_point(0.3, 0.4)
+    planned = control.inverse_dynamics(design, path)
+    run = ftlm.Run.from_arrays(
+        step=1 / RATE, inputs={"I": np.append(0.0, planned.command[:-1])}, outputs={"theta": 0 * path}
+    )
     assert np.max(np.abs(hub.simulate(run)["theta"] - path)) < 1e-3 * 0.3
     # What is off behind the path without it is a loop's lag, and its integral's.
     assert planned.plain > 5e-4
 
 
 def test_a_move_begins_and_ends_at_rest():
-    path = control.smooth_move(-0.5, 0.4, 1000.0, before=0.1, after=0.2)
+    path = control.point_to_point(-0.5, 0.4, 1000.0, before=0.1, after=0.2)
     assert path.size == 701
     assert path[0] == 0.0
     assert path[-1] == -0.5
@@ -420,7 +427,7 @@ PATHS = [
     ({"of": None}, ftlm.ModelError, "of = None is not a sum"),
     ({"samples": 1.5}, ftlm.ModelError, "samples = 1.5"),
     ({"seed": -1}, ftlm.ModelError, "seed = -1"),
-    ({"path": control.smooth_move(0.3, 0.2, before=0.0)}, ftlm.ModelError, "rest longer before its move"),
+    ({"path": control.point_to_point(0.3, 0.2, before=0.0)}, ftlm.ModelError, "rest longer before its move"),
 ]
 
 
@@ -433,17 +440,17 @@ def ready():
 def test_what_cannot_be_followed_is_refused(case, ready):
     options, kind, words = PATHS[case]
     with pytest.raises(kind, match=words):
-        control.inverse(ready, **{"path": control.smooth_move(0.3, 0.5), "of": "hub + bend", **options})
+        control.inverse_dynamics(ready, **{"path": control.point_to_point(0.3, 0.5), "of": "hub + bend", **options})
 
 
 def test_intervals_too_wide_for_a_path_are_refused_in_words():
     text = "D^2 y = -63 D^0.95 y + 140 I"
     options = {"crossover": 40.0, "samples": 0}
-    path = control.smooth_move(0.3, 0.5)
-    good = control.inverse(control.fractional_pid(uncertain(text, {4: 0.002, 2: 0.2}), **options), path)
-    assert 0 < good.left < good.plain
+    path = control.point_to_point(0.3, 0.5)
+    good = control.inverse_dynamics(control.fractional_pid(uncertain(text, {4: 0.002, 2: 0.2}), **options), path)
+    assert 0 < good.residual_vibration < good.plain
     with pytest.raises(ftlm.ModelError, match=r"too wide to design on: within them .* longer or richer run"):
-        control.inverse(control.fractional_pid(uncertain(text, {2: 20.0}), **options), path)
+        control.inverse_dynamics(control.fractional_pid(uncertain(text, {2: 20.0}), **options), path)
 
 
 @pytest.mark.parametrize(
@@ -461,4 +468,4 @@ def test_intervals_too_wide_for_a_path_are_refused_in_words():
 )
 def test_what_is_no_move_is_refused(options, words):
     with pytest.raises(ftlm.ModelError, match=words):
-        control.smooth_move(**{"size": 0.3, "duration": 0.5, **options})
+        control.point_to_point(**{"size": 0.3, "duration": 0.5, **options})

@@ -12,7 +12,7 @@ from hypothesis import strategies as st
 import ftlm
 import oracles
 from ftlm import _core
-from ftlm.data.run import MOST_KEPT, as_runs
+from ftlm.data.run import MAX_CACHED_RESULTS, as_runs
 from ftlm.simulation.discretization import (
     default_m,
     equation_tuple,
@@ -398,8 +398,8 @@ def test_what_is_kept_with_runs_goes_with_them():
     runs = as_runs(run)
     for m in range(1, 20):
         records(runs, ftlm.equation("D^1.5 y = a y + b u", initial="rest"), m)
-    assert len(runs._kept) == MOST_KEPT
-    kept = weakref.ref(next(iter(runs._kept.values()))[0])
+    assert len(runs._cache) == MAX_CACHED_RESULTS
+    kept = weakref.ref(next(iter(runs._cache.values()))[0])
     assert kept() is not None
     del runs
     assert kept() is None

@@ -25,9 +25,9 @@ from ftlm.reproduction.tables import PaperRow, paper_row, paper_table, paper_tab
 from ftlm.svg import figure as axes
 from ftlm.svg.bar_chart import bar_chart, histogram
 from ftlm.svg.complex_plane import plane_chart
-from ftlm.svg.figure import LINE
+from ftlm.svg.figure import LINE_HEIGHT_PX
 from ftlm.svg.heat_map import correlation_map, heat_map
-from ftlm.svg.html_page import Reported
+from ftlm.svg.html_page import ReportMixin
 from ftlm.svg.line_chart import line_chart
 from ftlm.utils import formatting as words
 from ftlm.utils.formatting import number
@@ -62,7 +62,7 @@ def sine():
 
 @pytest.fixture(scope="module")
 def identified(square):
-    lattice = ftlm.lattice(0.05, alpha1=2.0, alpha2=2.0, gamma1=(0.9, 1.0), beta2=(0.05, 0.15), mu2=(0.8, 0.9))
+    lattice = ftlm.order_grid(0.05, alpha1=2.0, alpha2=2.0, gamma1=(0.9, 1.0), beta2=(0.05, 0.15), mu2=(0.8, 0.9))
     # Initial terms although the run starts at rest, so that the page has them to show.
     structure = replace(ftlm.flexible_link(form="published", stage=1), initial="caputo")
     return ftlm.identify(square, structure, method="least-squares", lattice=lattice)
@@ -197,9 +197,12 @@ def test_a_validation_that_validates_nothing_is_said(tmp_path, identified, squar
 
 def test_a_lost_fit_is_said(tmp_path, identified, sine):
     other = ftlm.Run.from_arrays(
-        step=sine.step, inputs={"I1": sine["I1"]}, name="other",
-        outputs={"theta11": -sine["theta11"], "theta12": -sine["theta12"]}, units=sine.units,
-    )  # fmt: skip
+        step=sine.step,
+        inputs={"I1": sine["I1"]},
+        name="other",
+        outputs={"theta11": -sine["theta11"], "theta12": -sine["theta12"]},
+        units=sine.units,
+    )
     text = report.identification_page(identified, tmp_path / "p.html", validation=other).read_text("utf-8")
     assert "validation run other: the fit of theta12 falls from" in text
 
@@ -242,12 +245,12 @@ def test_a_folder_that_cannot_be_written_is_said_before_any_work(tmp_path, ident
 
 def test_intervals_that_are_none_are_said(tmp_path, small_run, with_noise):
     found = ftlm.identify(with_noise(small_run, 0.02, 1), ftlm.equation("D^alpha y = a D^0.6 y + c y + b u"))
-    broken = replace(found.joint, covariance=np.full_like(found.joint.covariance, np.nan))
+    broken = replace(found.fit, covariance=np.full_like(found.fit.covariance, np.nan))
     result = replace(found, joint=broken)
     text = " ".join(Page(result.report(tmp_path / "p.html").read_text("utf-8")).text)
     assert text.count("undefined") >= 3 * 4
     assert "the standard errors of alpha, a, c, b are not defined" in text
-    table = parameter_table(found.model, found.joint)
+    table = parameter_table(found.model, found.fit)
     low, high = found.intervals["alpha"]
     assert table.rows[0][1:5] == [found.orders["alpha"], found.standard_errors["alpha"], low, high]
 
@@ -272,7 +275,7 @@ def test_a_saved_model_has_a_report_of_its_own(tmp_path, small_run, small_model,
 
 def test_the_landscape_is_the_search(small_run, with_noise):
     run = with_noise(small_run, 0.02, 1)
-    lattice = ftlm.lattice(0.1, alpha=(1.2, 2.0), nu="0.0:1.0:0.1")
+    lattice = ftlm.order_grid(0.1, alpha=(1.2, 2.0), nu="0.0:1.0:0.1")
     structure = ftlm.equation("D^alpha y = a D^nu y + c y + b u")
     found = ftlm.search_orders(run, structure, lattice, keep=10_000)
     drawn = landscape(run, structure, found, lattice)
@@ -299,8 +302,11 @@ def test_charts_of_residuals_and_frequencies_are_their_numbers(small_model, smal
     assert len(stems) == 51
     heights = np.array([int(zero) - int(y) for _, zero, y in stems], dtype=float)
     values = tests.outputs["y"].inputs["u"].values
-    np.testing.assert_allclose(heights / heights[np.argmax(np.abs(values))] * values[np.argmax(np.abs(values))], values,
-                               atol=0.02 * np.max(np.abs(values)))  # fmt: skip
+    np.testing.assert_allclose(
+        heights / heights[np.argmax(np.abs(values))] * values[np.argmax(np.abs(values))],
+        values,
+        atol=0.02 * np.max(np.abs(values)),
+    )
     w = np.geomspace(0.1, 100, 50)
     gain, phase = bode_charts(small_model, w)
     (strokes,) = paths_of(gain.svg)
@@ -354,11 +360,15 @@ def test_many_runs_stay_within_two_megabytes(tmp_path, identified, square):
     c = identified.comparison
     runs = 120
     many = ftlm.Comparison(
-        c.output_error, c.equation_error, [(f"run {k}", c.per_run[0][1], c.per_run[0][2]) for k in range(runs)],
+        c.output_error,
+        c.equation_error,
+        [(f"run {k}", c.per_run[0][1], c.per_run[0][2]) for k in range(runs)],
         {o: [rng.standard_normal(c.m)] * runs for o in c.simulated},
         {o: [rng.standard_normal(c.m)] * runs for o in c.measured},
-        c.step * runs, c.m, [{}] * runs,
-    )  # fmt: skip
+        c.step * runs,
+        c.m,
+        [{}] * runs,
+    )
     result = ftlm.Identification(identified.model, identified.method, many, {}, identified.settings)
     text = report.identification_page(result, tmp_path / "p.html").read_text("utf-8")
     assert len(text.encode()) < 2_000_000
@@ -529,7 +539,7 @@ def test_decimation_keeps_extremes_and_ends():
     y = rng.standard_normal(100_000)
     y[[12_345, 54_321, 77_777]] = [40.0, -50.0, np.nan]
     kept = axes.decimate(y)
-    assert kept.size <= axes.POINTS
+    assert kept.size <= axes.MAX_LINE_POINTS
     assert np.all(np.diff(kept) > 0)
     assert {0, 12_345, 54_321, y.size - 1} <= set(kept.tolist())
     assert np.all(np.isfinite(y[kept]))
@@ -608,8 +618,9 @@ def test_a_slider_has_samples_and_the_largest_difference_among_them(n):
     rng = np.random.default_rng(n)
     x = 3.0 + np.arange(n) * 0.0017
     y, z = 1e-6 * rng.standard_normal(n), 1e-6 * rng.standard_normal(n)
-    chart = line_chart(x, [("measured", y), ("simulated", z)], title="t", x_label="time [s]", y_label="y [m]",
-                              slider=True)  # fmt: skip
+    chart = line_chart(
+        x, [("measured", y), ("simulated", z)], title="t", x_label="time [s]", y_label="y [m]", slider=True
+    )
     assert "data-readings" not in chart.narrow
     at, lines, told = read_out(chart)
     assert 1 <= at.size <= 753
@@ -672,7 +683,7 @@ def test_lines_are_told_apart_without_colour():
     heights = [
         float(y) for y in re.findall(r'<text x="[\d.]+" y="([\d.]+)" text-anchor="start">(?:measured|p = )', chart.svg)
     ]
-    assert np.min(np.diff(np.sort(heights))) >= LINE - 0.11
+    assert np.min(np.diff(np.sort(heights))) >= LINE_HEIGHT_PX - 0.11
 
 
 def test_extreme_data_still_draw():
@@ -805,7 +816,7 @@ def test_residuals_over_time_are_those_of_the_comparison(identified):
 def test_coefficients_have_units_and_an_offset_its_number():
     model = ftlm.Model(
         ftlm.equation("D^2 y = a y + b u").with_coefficients({"a": -4.0, "b": 2.0}), units={"y": "rad", "u": "A"}
-    )  # fmt: skip
+    )
     table = parameter_table(model)
     at = table.columns.index("unit")
     assert [str(row[at]) for row in table.rows] == ["s<sup>−2</sup>", "s<sup>−2</sup> rad/A"]
@@ -817,4 +828,4 @@ def test_coefficients_have_units_and_an_offset_its_number():
 
 def test_a_result_without_a_page_cannot_be_made():
     with pytest.raises(TypeError, match=r"abstract method '?_page"):
-        type("Bare", (Reported,), {})()
+        type("Bare", (ReportMixin,), {})()

@@ -14,10 +14,10 @@ from ftlm import DataError
 from ftlm.report.html_report import grouped_warnings
 from ftlm.reproduction import published_values as printed
 from ftlm.reproduction.claims import claims, table_3_coefficients
-from ftlm.reproduction.optimizer_comparison import Panel, like_for_like
+from ftlm.reproduction.optimizer_comparison import Panel, compare_optimizers
 from ftlm.reproduction.report import reproduction_text
 from ftlm.reproduction.reproduction import stages_of
-from ftlm.reproduction.simulated_arm import demo_plant, demo_run, thinned, truth_of
+from ftlm.reproduction.simulated_arm import decimate_run, demo_plant, demo_run, truth_of
 from ftlm.validation.comparison import compare_means
 from lagrange import truth
 from test_cli import ftlm_command
@@ -38,14 +38,14 @@ def saved(reproduction, tmp_path_factory):
 
 def test_printed_numbers_are_those_of_the_other_transcription():
     for angle, rows in PRINTED_CRITERIA.items():
-        ours = [printed.INTEGER[angle], *printed.FRACTIONAL[angle].values()]
+        ours = [printed.INTEGER_ROWS[angle], *printed.FRACTIONAL_ROWS[angle].values()]
         assert [(r.error, r.rmse, r.nr) for r in ours] == [tuple(map(float, row)) for row in rows]
     for angle, rows in PRINTED_RIVALS.items():
-        assert list(printed.RIVALS[angle]) == [tuple(map(float, row)) for row in rows]
+        assert list(printed.TABLE_7_CRITERIA[angle]) == [tuple(map(float, row)) for row in rows]
     for stage, table in ((1, "table 4"), (2, "table 5")):
-        pairs = zip(*(printed.FRACTIONAL[f"theta{stage}{k}"].values() for k in (1, 2)), strict=True)
+        pairs = zip(*(printed.FRACTIONAL_ROWS[f"theta{stage}{k}"].values() for k in (1, 2)), strict=True)
         assert [(a.coefficients["a"], b.coefficients["a"]) for a, b in pairs] == STIFFNESS_PAIRS[table]
-        pair = tuple(printed.GENETIC[f"theta{stage}{k}"].coefficients["a"] for k in (1, 2))
+        pair = tuple(printed.GENETIC_ROWS[f"theta{stage}{k}"].coefficients["a"] for k in (1, 2))
         assert pair == STIFFNESS_PAIRS["table 6"][stage - 1]
         names = {"Ks": f"K_s{stage}", "Kt": f"K_τ{stage}", "J1": f"J_{stage}1", "J2": f"J_{stage}2"}
         names |= {"B1": f"B_{stage}1", "B2": f"B_{stage}2"}
@@ -56,7 +56,7 @@ def test_printed_numbers_are_those_of_the_other_transcription():
 def test_printed_orders_obey_the_order_law(stage):
     h, d = 2 * stage - 1, 2 * stage
     law = ftlm.order_law(stage, form="published")
-    for rows in (lambda a: printed.FRACTIONAL[a][7], printed.GENETIC.__getitem__):
+    for rows in (lambda a: printed.FRACTIONAL_ROWS[a][7], printed.GENETIC_ROWS.__getitem__):
         orders = {f"{n}{h}": v for n, v in rows(f"theta{stage}1").orders.items()}
         orders |= {f"{n}{d}": v for n, v in rows(f"theta{stage}2").orders.items()}
         for name, order in law.items():
@@ -75,7 +75,12 @@ def test_tables_4_and_5_follow_from_the_saved_run(saved, table, stage):
     structure = ftlm.flexible_link(form="published", stage=stage, coupling="measured", laws=())
     for p in printed.INNOVATION_LENGTHS:
         found = ftlm.identify(
-            run, structure, method="multi-innovation", innovation_length=p, lattice=ftlm.Lattice(step=0.25), keep=1
+            run,
+            structure,
+            method="multi-innovation",
+            innovation_length=p,
+            lattice=ftlm.OrderGrid(increment=0.25),
+            keep=1,
         )
         row = written[f"p = {p}"]
         assert found.orders == row["orders"]
@@ -111,7 +116,7 @@ def test_table_7_follows_from_the_saved_run(saved):
     run = ftlm.load(saved / "square.csv").select(["I1", "theta11", "theta12"])
     single = ftlm.flexible_link(form="published", stage=1, coupling="measured", laws=()).equation("theta12")
     settings = ftlm.Genetic(seeds=(0, 1), evaluations=800)
-    found = like_for_like(run, single, ftlm.Lattice(step=0.25, alpha=(1.95, 2.0)), settings)
+    found = compare_optimizers(run, single, ftlm.OrderGrid(increment=0.25, alpha=(1.95, 2.0)), settings)
     both = {"genetic": found.genetic, "differential evolution": found.evolution}
     for label, rival in both.items():
         assert {str(seed): error for seed, error in rival.errors.items()} == written["errors"][label]
@@ -141,11 +146,18 @@ def by_words(found, words):
 def test_verdicts_follow_the_numbers(reproduction):
     found = claims(reproduction)
     for words in (
-        "p itself improves", "Table 3 gives", "Table 7 compares", "leaves the current",
-        "integer row of θ₂₂", "find the orders of an arm", "printed models, under the paper's current",
-        "printed models are stable", "returns its coefficients", "printed orders are the best",
+        "p itself improves",
+        "Table 3 gives",
+        "Table 7 compares",
+        "leaves the current",
+        "integer row of θ₂₂",
+        "find the orders of an arm",
+        "printed models, under the paper's current",
+        "printed models are stable",
+        "returns its coefficients",
+        "printed orders are the best",
         "can be computed again",
-    ):  # fmt: skip
+    ):
         assert by_words(found, words).verdict == "does not hold", words
     # One simulated arm says nothing of the paper's.
     assert by_words(found, "orders of Tables 4 and 5").verdict == "cannot be told from a simulated truth"
@@ -235,28 +247,44 @@ def test_verdicts_turn_when_the_numbers_do(reproduction):
     falling = {1: 4.0, 3: 3.0, 5: 2.0, 7: 1.0}
     trials = tuple(replace(t, errors=falling, arrived=falling, nr=0.1, manual=0.2) for t in panel.trials)
     contests = tuple(replace(c, lattice=dict.fromkeys(c.lattice, 1e-9)) for c in panel.contests)
-    freed = tuple(replace(f, free={o: 0.1 * v for o, v in f.whole.items()}, orders={"gamma1": (0.9, 0.8, 0.95)})
-                  for f in panel.freed)  # fmt: skip
+    freed = tuple(
+        replace(f, free={o: 0.1 * v for o, v in f.whole.items()}, orders={"gamma1": (0.9, 0.8, 0.95)})
+        for f in panel.freed
+    )
     stage = reproduction.stages[1]
     swapped = {**stage.candidates, "published, output error": stage.candidates["output error"]}
     other = replace(stage, candidates=swapped, near=stage.candidates["output error"])
-    ran = tuple(
-        replace(r, moved=r.implied, stability=replace(r.stability, stable=True)) for r in reproduction.ran
-    )  # fmt: skip
-    tables = {o: replace(t, rank=1, rows={p: replace(row, coefficients=dict(printed.FRACTIONAL[o][p].coefficients),
-                                                       equation=replace(row.equation, nr=printed.FRACTIONAL[o][p].nr))
-                                          for p, row in t.rows.items()})
-              for o, t in reproduction.as_printed.items()}  # fmt: skip
-    made = replace(
-        reproduction, stages={1: other}, panel=Panel(trials, contests, freed), ran=ran, as_printed=tables
-    )  # fmt: skip
+    ran = tuple(replace(r, moved=r.implied, stability=replace(r.stability, stable=True)) for r in reproduction.ran)
+    tables = {
+        o: replace(
+            t,
+            rank=1,
+            rows={
+                p: replace(
+                    row,
+                    coefficients=dict(printed.FRACTIONAL_ROWS[o][p].coefficients),
+                    equation=replace(row.equation, nr=printed.FRACTIONAL_ROWS[o][p].nr),
+                )
+                for p, row in t.rows.items()
+            },
+        )
+        for o, t in reproduction.as_printed.items()
+    }
+    made = replace(reproduction, stages={1: other}, panel=Panel(trials, contests, freed), ran=ran, as_printed=tables)
     found = claims(made)
     for words in (
-        "larger innovation length", "larger p converges faster", "than the genetic algorithm", "closer to the run than",
-        "better than whole ones", "p itself improves", "find the orders of an arm",
-        "printed models, under the paper's current", "printed models are stable", "printed orders are the best",
+        "larger innovation length",
+        "larger p converges faster",
+        "than the genetic algorithm",
+        "closer to the run than",
+        "better than whole ones",
+        "p itself improves",
+        "find the orders of an arm",
+        "printed models, under the paper's current",
+        "printed models are stable",
+        "printed orders are the best",
         "can be computed again",
-    ):  # fmt: skip
+    ):
         assert by_words(found, words).verdict == "holds", words
     near = by_words(claims(replace(made, simulated=False)), "orders of Tables 4 and 5")
     assert near.verdict == "holds"
@@ -274,7 +302,7 @@ def test_p_itself_is_judged_by_errors_not_by_coefficients_that_differ(reproducti
 
 def test_both_readings_are_saved(saved):
     written = json.loads((saved / "tables.json").read_text())
-    assert set(written["as printed"]) == set(printed.OUTPUTS)
+    assert set(written["as printed"]) == set(printed.ANGLE_NAMES)
     assert set(written["as it should be"]) == {"1", "2"}
     row = written["as printed"]["theta22"]["rows"]["7"]
     assert row["coefficients"]["a"] / -0.7787 == pytest.approx(1.0, abs=0.1)
@@ -369,9 +397,24 @@ def test_measured_runs_of_one_stage(reproduction, tmp_path):
     run.to_csv(tmp_path / "mine.csv")
     other.to_csv(tmp_path / "other.csv")
     ran = ftlm_command(
-        "reproduce", "--square", "mine.csv", "--sine", "other.csv", "--step", "0.25", "--seed", "5",
-        "--evaluations", "400", "-o", "mine.html", "--save", "kept", "--json", cwd=tmp_path,
-    )  # fmt: skip
+        "reproduce",
+        "--square",
+        "mine.csv",
+        "--sine",
+        "other.csv",
+        "--step",
+        "0.25",
+        "--seed",
+        "5",
+        "--evaluations",
+        "400",
+        "-o",
+        "mine.html",
+        "--save",
+        "kept",
+        "--json",
+        cwd=tmp_path,
+    )
     assert ran.returncode == 0, ran.stderr
     assert ran.stderr == ""
     document = json.loads(ran.stdout)
@@ -391,7 +434,7 @@ def test_a_long_run_that_does_not_start_at_rest(reproduction, tmp_path, monkeypa
     own = ["I2", "theta21", "theta22"]
     moving = reproduction.square.select(own).slice(1.3, 4.3)
     other = reproduction.sine.select(own).slice(0.7, 3.7)
-    monkeypatch.setattr("ftlm.reproduction.stage_models.MOST_ROWS", 1000)
+    monkeypatch.setattr("ftlm.reproduction.stage_models.MAX_REGRESSION_SAMPLES", 1000)
     monkeypatch.setattr("ftlm.reproduction.stage_models.JOINT_ROWS", 500)
     told = []
     found = ftlm.reproduce(moving, other, step=0.5, progress=lambda *share: told.append(share))
@@ -422,7 +465,7 @@ def test_thinning_keeps_the_means_of_held_currents_and_the_rows_of_the_rest():
     run = ftlm.Run.from_arrays(
         step=0.5, inputs={"u": n, "v": n * n}, outputs={"y": -n}, intersample={"v": "foh"}, units={"y": "deg"}
     )
-    found = thinned(run, 4)
+    found = decimate_run(run, 4)
     assert found["u"].tolist() == [1.5, 5.5, 9.5]
     assert found["v"].tolist() == [0.0, 16.0, 64.0]
     assert found["y"].tolist() == pytest.approx(np.deg2rad([0.0, -4.0, -8.0]))

@@ -11,7 +11,7 @@ import pytest
 import ftlm
 from ftlm import _core
 from ftlm.plot.comparison_charts import residual_charts
-from ftlm.utils.statistics import autoregression, chi_squared_99, is_white, whitened
+from ftlm.utils.statistics import autoregression, chi_squared_99, is_white, whiten_series
 from ftlm.validation.residual_tests import residual_warnings
 
 WORDS = "D^1.6 y = a D^0.6 y + c y + b u"
@@ -311,7 +311,7 @@ def test_the_whitening_filter_is_that_of_yule_and_walker():
     assert 3 <= found.size <= 5
     np.testing.assert_allclose(found, levinson_oracle(x, found.size - 1), rtol=1e-9)
     np.testing.assert_allclose(found[:3], [1.0, -1.4, 0.7], atol=0.05)
-    assert is_white(whitened([x], found)[0])
+    assert is_white(whiten_series([x], found)[0])
     assert not is_white(x)
     assert autoregression([white], 25).size == 1
     assert autoregression([np.zeros(100)], 25).tolist() == [1.0]

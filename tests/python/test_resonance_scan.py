@@ -29,9 +29,14 @@ def records(*, filtered: bool) -> list[tuple[float, np.ndarray, np.ndarray | Non
 
 
 def naive(
-    runs: list[tuple[float, np.ndarray, np.ndarray | None]], order: float, terms: list[tuple[int, float]],
-    fixed: list[float | None], powers: list[float], own: list[float], point: list[float],
-) -> tuple[float, np.ndarray]:  # fmt: skip
+    runs: list[tuple[float, np.ndarray, np.ndarray | None]],
+    order: float,
+    terms: list[tuple[int, float]],
+    fixed: list[float | None],
+    powers: list[float],
+    own: list[float],
+    point: list[float],
+) -> tuple[float, np.ndarray]:
     """The same by dense matrices: own terms are divided by, all else is regressed upon."""
     targets, blocks, starts = [], [], []
     for step, means, low_pass in runs:
@@ -69,9 +74,7 @@ def naive(
 @pytest.mark.parametrize("filtered", [False, True])
 @pytest.mark.parametrize("powers", [[], [0.0, 0.8]])
 @pytest.mark.parametrize("fixed", [[None, None], [0.7, None]])
-def test_projection_is_that_of_dense_systems(
-    *, filtered: bool, powers: list[float], fixed: list[float | None]
-) -> None:  # fmt: skip
+def test_projection_is_that_of_dense_systems(*, filtered: bool, powers: list[float], fixed: list[float | None]) -> None:
     runs, order, terms, own = records(filtered=filtered), 1.8, [(1, 0.0), (2, 0.5)], [1.8, 1.0]
     points = [[-9.0, -1.0], [-400.0, -0.3], [-30.0, -12.0]]
     found = _core.projected_errors(runs, (0, order, terms), INPUTS, fixed, (False, powers), own, points)
@@ -119,8 +122,13 @@ def test_what_no_step_carries_and_twins_are_none() -> None:
 )
 def test_what_does_not_fit_is_refused(change: dict[str, object], word: str) -> None:
     given: dict[str, object] = {
-        "runs": records(filtered=False), "equation": (0, 1.0, [(1, 0.0)]), "inputs": INPUTS, "fixed": [None],
-        "terms": (False, []), "own": [1.0], "points": [[-1.0]],
-    }  # fmt: skip
+        "runs": records(filtered=False),
+        "equation": (0, 1.0, [(1, 0.0)]),
+        "inputs": INPUTS,
+        "fixed": [None],
+        "terms": (False, []),
+        "own": [1.0],
+        "points": [[-1.0]],
+    }
     with pytest.raises(FtlmError, match=word):
         _core.projected_errors(**(given | change))  # type: ignore[arg-type]

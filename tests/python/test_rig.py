@@ -176,8 +176,8 @@ def test_a_record_says_everything_and_loads_bit_for_bit(tmp_path):
     assert loaded.outputs == ("theta11", "theta12", "theta21", "theta22", "I1_measured", "I2_measured")
     assert all(np.array_equal(loaded[n], run[n]) for n in run.signals)
     assert loaded.units == run.units
-    assert loaded.about == run.about
-    about = loaded.about
+    assert loaded.metadata == run.metadata
+    about = loaded.metadata
     assert (about["rig"], about["seed"], about["faults"], about["missed_deadlines"]) == ("virtual rig", 7, [], 0)
     assert about["parameters"]["stage1"]["a"] == 628.89
     assert about["input"]["shape"] == "square"
@@ -188,18 +188,31 @@ def test_a_record_says_everything_and_loads_bit_for_bit(tmp_path):
 def test_numbers_of_numpy_are_numbers(tmp_path):
     """A seed from an array of seeds, a time from a table: the run and what is told of it are those of Python's own."""
     with_numpy = rig.record(
-        input="chirp", duration=np.int64(1), limit=np.float32(2), rate=np.int32(200), seed=np.int64(3),
-        amplitude=(np.float64(0.25), np.int8(0)), band=(np.float64(1), np.int16(5)), ramp=np.float64(0.5),
+        input="chirp",
+        duration=np.int64(1),
+        limit=np.float32(2),
+        rate=np.int32(200),
+        seed=np.int64(3),
+        amplitude=(np.float64(0.25), np.int8(0)),
+        band=(np.float64(1), np.int16(5)),
+        ramp=np.float64(0.5),
         out=tmp_path / "a.csv",
-    )  # fmt: skip
+    )
     plain = rig.record(
-        input="chirp", duration=1, limit=2, rate=200, seed=3, amplitude=(0.25, 0), band=(1, 5), ramp=0.5,
+        input="chirp",
+        duration=1,
+        limit=2,
+        rate=200,
+        seed=3,
+        amplitude=(0.25, 0),
+        band=(1, 5),
+        ramp=0.5,
         out=tmp_path / "b.csv",
-    )  # fmt: skip
+    )
     assert np.array_equal(with_numpy["theta12"], plain["theta12"])
-    assert with_numpy.about["seed"] == 3
-    assert type(with_numpy.about["seed"]) is int
-    assert with_numpy.about["input"] == plain.about["input"]
+    assert with_numpy.metadata["seed"] == 3
+    assert type(with_numpy.metadata["seed"]) is int
+    assert with_numpy.metadata["input"] == plain.metadata["input"]
     assert VirtualBoard(seed=np.uint8(3)).seed == 3
     with pytest.raises(ftlm.ModelError, match=r"seed = 0\.5 is not a whole number from 0"):
         VirtualBoard(seed=0.5)
@@ -270,7 +283,7 @@ def test_parameters_come_from_a_toml_file(tmp_path):
     assert (found.coupling, found.stage1.a, found.stage1.coulomb, found.stage1.b) == (0.5, 600.0, 0.05, -62.956)
     assert found.strain_noise == (0.01, 0.02)
     run = rig.record(duration=0.5, parameters=path)
-    assert run.about["parameters"]["name"] == "arm.toml"
+    assert run.metadata["parameters"]["name"] == "arm.toml"
 
 
 @pytest.mark.parametrize(
@@ -397,7 +410,7 @@ def test_live_estimates_are_shown(tmp_path, capsys):
             *("-o", path, "--json"),
         )
         == 0
-    )  # fmt: skip
+    )
     shown = capsys.readouterr()
     told = json.loads(shown.out)
     assert told["rows"] == 1001

@@ -79,7 +79,7 @@ def test_each_sample_is_answered_at_the_next_and_recorded(bench, tmp_path):
     loaded = ftlm.load(tmp_path / "run.csv")
     assert loaded.inputs == ("I1", "I2", "reference1", "reference2")
     assert np.array_equal(loaded["reference2"], reference[:, 1])
-    assert loaded.about["control"] == {"controller": {"name": "spy"}}
+    assert loaded.metadata["control"] == {"controller": {"name": "spy"}}
 
 
 def test_the_loop_closes_the_same_way_on_both_rigs_and_in_real_time(tmp_path, monkeypatch):
@@ -159,7 +159,7 @@ def test_a_bad_answer_is_0_v_at_once_with_its_cause_and_its_run(bench, tmp_path,
     loaded = ftlm.load(path)
     assert loaded.length == fault.value.run.length == 51
     assert np.array_equal(loaded["I1"], [0.0] + [0.2] * 50)
-    assert re.search(words, loaded.about["faults"][0])
+    assert re.search(words, loaded.metadata["faults"][0])
     caused = {"exception": ZeroDivisionError, "mute": MuteError}
     raised = ValueError if words.startswith((r"failed \(V", "returned cannot")) else type(None)
     assert isinstance(fault.value.__cause__, caused.get(what, raised))
@@ -209,7 +209,7 @@ def test_a_controller_that_freezes_is_stopped_by_the_watchdog(tmp_path, monkeypa
         assert page.volts != (0.0, 0.0)
         while page.volts != (0.0, 0.0) and time.monotonic() < until:
             time.sleep(0.01)
-        seen.append((page.volts, page.expired, page.get("enabled")))
+        seen.append((page.volts, page.has_expired, page.get("enabled")))
         return (0.2, 0.1)
 
     with pytest.raises(ftlm.RigFault, match=r"the watchdog expired.*the controller took .* s to answer") as fault:
@@ -234,7 +234,7 @@ def test_what_ends_a_program_while_it_waits_for_an_answer_ends_the_run(bench, tm
     bench.assert_safe(within=153)
     loaded = ftlm.load(tmp_path / "run.csv")
     assert loaded.length == 51
-    assert "the controller had not answered to the sample at 0.1 s" in loaded.about["faults"][0]
+    assert "the controller had not answered to the sample at 0.1 s" in loaded.metadata["faults"][0]
 
 
 def test_a_controller_is_reset_and_told_of():
@@ -256,8 +256,8 @@ def test_a_controller_is_reset_and_told_of():
     for _ in range(2):
         run = rig.control(held, (0, 0), duration=0.1, parameters="linear")
     assert held.calls == 49
-    assert run.about["control"] == {"controller": {"name": "Held", "settings": {"gain": 2.0}}}
-    assert run.about["faults"] == []
+    assert run.metadata["control"] == {"controller": {"name": "Held", "settings": {"gain": 2.0}}}
+    assert run.metadata["faults"] == []
 
 
 REFUSED = [
@@ -337,7 +337,7 @@ def test_a_controller_that_cannot_be_told_of_is_refused(told, words):
 def test_whatever_a_controller_says_is_read_again(tmp_path):
     told = {"half a pair \ud800": "\udfff", "mark\n# ftlm-run 9 {}": "\x1b]0;x\x07\0</script>"}
     rig.control(Telling(told), (0, 0), duration=0.02, out=tmp_path / "run.csv")
-    assert ftlm.load(tmp_path / "run.csv").about["control"]["controller"]["settings"] == told
+    assert ftlm.load(tmp_path / "run.csv").metadata["control"]["controller"]["settings"] == told
 
 
 def test_the_board_needs_arm(monkeypatch):

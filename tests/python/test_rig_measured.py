@@ -23,7 +23,7 @@ def measured(request):
 @pytest.mark.parametrize(("name", "motion"), [("own", 4.5), ("effective", 13.0)])
 def test_spectra_and_noise_are_within_the_stated_factors(measured, name, motion):
     run = beside(measured, UNITS[measured.name] if name == "own" else name)
-    assert run.about["faults"] == []
+    assert run.metadata["faults"] == []
     assert factor(run, measured, ANGLES, MOTION) < motion
     assert factor(run, measured, ("theta12", "theta22", "I1_measured", "I2_measured"), NOISE) < 3.0
     assert factor(run, measured, ("I1_measured", "I2_measured"), MOTION) < 2.0

@@ -38,12 +38,12 @@ class Watched(rig.VirtualBoard):
         at = len(self.log) - 1
         if self.hook is not None:
             self.hook(self, at)
-        found = super()._put(volts1, volts2)
+        found = super()._output_volts(volts1, volts2)
         self.log.append((at, (volts1, volts2)))
         return found
 
     def write(self, volts):
-        if volts == (0.0, 0.0) and self._page is not None and self._page.expired:
+        if volts == (0.0, 0.0) and self._page is not None and self._page.has_expired:
             self.log.append((len(self.log) - 1, volts))
         super().write(volts)
 
@@ -117,7 +117,7 @@ class Bench:
     @property
     def enabled(self):
         if self.kind == "virtual":
-            page = watchdog.Page(self.page)
+            page = watchdog.RegisterPage(self.page)
             found = bool(page.get("enabled"))
             page.close()
             return found
@@ -163,7 +163,7 @@ def recorded(bench, tmp_path, **options):
         rig.record(bench.board, arm=True, rate=bench.rate, out=path, **{"duration": 2.0, **options})
     loaded = ftlm.load(path)
     assert np.array_equal(loaded["theta11"], fault.value.run["theta11"])
-    assert loaded.about["faults"]
+    assert loaded.metadata["faults"]
     assert any("the rig stopped the run" in w for w in loaded.warnings)
     assert str(path) in str(fault.value)
     assert sorted(p.name for p in tmp_path.iterdir() if p.name != "page") == ["run.csv"]
@@ -301,7 +301,7 @@ def test_ctrl_c_in_a_record_keeps_what_was_recorded(bench, tmp_path):
         rig.record(bench.board, arm=True, duration=2.0, out=tmp_path / "run.csv")
     loaded = ftlm.load(tmp_path / "run.csv")
     assert 199 <= loaded.length <= 202
-    assert loaded.about["faults"] == ["stopped by Ctrl-C"]
+    assert loaded.metadata["faults"] == ["stopped by Ctrl-C"]
     bench.assert_safe(within=303)
 
 
@@ -336,9 +336,9 @@ def child(kind, tmp_path):
         assert process.poll() is None, process.stderr.read()
         assert time.monotonic() < until
         time.sleep(0.02)
-        if found is None and page.exists() and page.stat().st_size == watchdog.SIZE:
+        if found is None and page.exists() and page.stat().st_size == watchdog.PAGE_SIZE_BYTES:
             with contextlib.suppress(ValueError):
-                found = watchdog.Page(page)
+                found = watchdog.RegisterPage(page)
     return process, found, out
 
 
@@ -378,7 +378,7 @@ def test_a_frozen_program_leaves_the_motors_off_and_wakes_to_a_fault(kind, tmp_p
     page.close()
     loaded = ftlm.load(out)
     assert loaded.length > 300
-    assert loaded.about["faults"]
+    assert loaded.metadata["faults"]
 
 
 COMMAND = """
@@ -409,7 +409,7 @@ def test_a_command_that_is_stopped_says_where_its_run_is(number, code, tmp_path)
     _, said = process.communicate(timeout=60)
     assert process.returncode == code
     assert f"what was recorded is in {out}" in said
-    assert ftlm.load(out).about["faults"] == ["stopped by " + ("Ctrl-C" if code == 130 else "SIGTERM")]
+    assert ftlm.load(out).metadata["faults"] == ["stopped by " + ("Ctrl-C" if code == 130 else "SIGTERM")]
     assert not partial.exists()
 
 
@@ -442,7 +442,7 @@ def test_an_expiry_is_named_whichever_call_meets_it_first(tmp_path, monkeypatch,
     assert "error -600" not in words
     assert bench.hardware.volts == (0.0, 0.0)
     assert not bench.hardware.enabled
-    assert "the watchdog expired" in run.about["faults"][0]
+    assert "the watchdog expired" in run.metadata["faults"][0]
 
 
 @pytest.mark.parametrize("missing", ["both", "analog", "digital", "one line"])
@@ -486,13 +486,13 @@ def test_it_does_not_start_without_expiration_states(bench, missing, monkeypatch
 
 
 def test_by_the_boards_rule_outputs_stay_where_they_were_without_tristate(tmp_path):
-    page = watchdog.Page(tmp_path / "page", create=True)
+    page = watchdog.RegisterPage(tmp_path / "page", create=True)
     for tristate, left in ((0, (1.0, -1.0)), (1, (0.0, 0.0))):
-        page.put(1, 1.0, -1.0)
+        page.write_heartbeat(1, 1.0, -1.0)
         for name, value in (("state1", 0.0), ("state2", 0.0), ("tristate", tristate), ("expired", 0)):
             page.set(name, value)
         watchdog.trip(page, 1.0)
-        assert page.expired
+        assert page.has_expired
         assert page.volts == left
     page.close()
 
@@ -595,7 +595,7 @@ def test_faults_stop_the_motors_and_keep_the_record(bench, tmp_path, what, chann
     said, run = recorded(bench, tmp_path)
     assert words in said
     assert abs(run.length - rows) <= 3
-    assert words in run.about["faults"][0]
+    assert words in run.metadata["faults"][0]
     driven = [at for at, volts in bench.writes if volts != (0.0, 0.0)]
     assert driven[-1] - 100 <= run.length
 
@@ -611,7 +611,7 @@ def test_missed_deadlines_in_a_row_are_a_fault(tmp_path, monkeypatch):
     bench.hardware.hooks["reading"] = slow
     words, run = recorded(bench, tmp_path)
     assert "21 deadlines in a row were missed" in words
-    assert run.about["missed_deadlines"] == 21
+    assert run.metadata["missed_deadlines"] == 21
 
 
 def test_missed_deadlines_in_a_row_are_a_fault_on_the_virtual_rig(tmp_path, monkeypatch):
@@ -620,14 +620,14 @@ def test_missed_deadlines_in_a_row_are_a_fault_on_the_virtual_rig(tmp_path, monk
         bench.inject("late", sample, number=0.003)
     words, run = recorded(bench, tmp_path)
     assert "21 deadlines in a row were missed" in words
-    assert run.about["missed_deadlines"] == 21
+    assert run.metadata["missed_deadlines"] == 21
 
 
 def test_single_missed_deadlines_are_counted_and_borne(bench, tmp_path):
     bench.inject("late", 100, number=0.003)
     run = rig.record(bench.board, arm=True, duration=1.0, out=tmp_path / "run.csv")
-    assert run.about["missed_deadlines"] >= 1
-    assert run.about["faults"] == []
+    assert run.metadata["missed_deadlines"] >= 1
+    assert run.metadata["faults"] == []
     bench.assert_safe()
 
 
@@ -697,7 +697,7 @@ def test_a_run_on_the_board_is_that_of_the_simulated_arm(hardware, tmp_path):
     run = rig.record(board, arm=True, duration=2.0, out=tmp_path / "run.csv")
     same = rig.record("virtual", parameters="linear", duration=2.0)
     assert hardware.violations == []
-    assert run.about["rig"] == "Q8-USB"
+    assert run.metadata["rig"] == "Q8-USB"
     assert np.array_equal(run["I1"], same["I1"])
     for name in ("theta11", "theta21"):
         assert np.abs(run[name] - same[name]).max() <= 1e-4

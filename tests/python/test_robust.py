@@ -12,23 +12,23 @@ from scipy.signal import lfilter, lsim
 
 import ftlm
 from ftlm import _core
-from ftlm.data.sampling import Readings, bridged, places_on_grid
+from ftlm.data.sampling import NonuniformSamples, grid_positions, interpolate_gaps
 from ftlm.estimation.free_parameters import FreeProblem
-from ftlm.estimation.model_checks import quantum
-from ftlm.estimation.objective import Attempt, Grid, covariance_of
+from ftlm.estimation.model_checks import quantization_step
+from ftlm.estimation.objective import Iterate, Objective, covariance_of
 from ftlm.estimation.output_error import fit_output_error
-from ftlm.simulation.output_samples import sampled
+from ftlm.simulation.output_samples import simulate_samples
 from ftlm.utils.statistics import (
-    BEND,
-    MAD,
+    HUBER_THRESHOLD,
+    MAD_OVER_SIGMA,
     NORMAL_95,
     autocovariances,
-    colour_covariances,
-    coloured,
+    colored_noise_covariances,
+    fit_whitening_filter,
     huber_excess,
     is_white,
 )
-from ftlm.validation.comparison import free_runs
+from ftlm.validation.comparison import simulate_runs
 
 STEP, ROWS, FINE = 0.1, 400, 20
 WORDS = "D^2 y = -0.8 D y - 4 y + 4 u"
@@ -112,13 +112,14 @@ def test_what_was_not_read_is_nan_and_said() -> None:
     u, y = noisy(1)
     run = run_of(u, holes(y), missing="weight")
     assert np.array_equal(run["y"], holes(y), equal_nan=True)
-    assert np.array_equal(run.missing["y"], np.isnan(holes(y)))
-    assert run_of(u, y).missing == {}
+    assert np.array_equal(run.missing_samples["y"], np.isnan(holes(y)))
+    assert run_of(u, y).missing_samples == {}
     (said,) = run.warnings
     assert said.startswith(f"output y: {np.isnan(holes(y)).sum()} of 400 rows hold no value")
-    assert np.array_equal(run.slice(3.0, 9.0)["y"], holes(y)[30:90], equal_nan=True)
-    assert len(run.advice()) == len(ftlm.Run.from_arrays(inputs={"u": u}, outputs={"y": bridged(run["y"])}, step=STEP)
-                                    .advice())  # fmt: skip
+    assert np.array_equal(run.window(3.0, 9.0)["y"], holes(y)[30:90], equal_nan=True)
+    assert len(run.advice()) == len(
+        ftlm.Run.from_arrays(inputs={"u": u}, outputs={"y": interpolate_gaps(run["y"])}, step=STEP).advice()
+    )
 
 
 def test_missing_samples_weigh_nothing() -> None:
@@ -127,8 +128,8 @@ def test_missing_samples_weigh_nothing() -> None:
     run = run_of(u, holes(y), missing="weight")
     problem = FreeProblem.of(ftlm.equation(FREE, initial="rest"))
     kept = ~np.isnan(run["y"])[1:-1]
-    point = Attempt([], [-0.7, -3.9, 4.1], "here", {})
-    part, whole = (Grid(problem, [r], [50.0]).descend(point, 1) for r in (run, run_of(u, y)))
+    point = Iterate([], [-0.7, -3.9, 4.1], "here", {})
+    part, whole = (Objective(problem, [r], [50.0]).minimize(point, 1) for r in (run, run_of(u, y)))
     known, every = np.asarray(part.outcome["residuals"]), np.asarray(whole.outcome["residuals"])
     np.testing.assert_allclose(known[kept], every[kept], rtol=0, atol=1e-12)
     assert np.all(known[~kept] == 0.0)
@@ -146,14 +147,14 @@ def test_what_stood_in_a_gap_changes_nothing_and_all_figures_count_what_is_there
     count = int(np.sum(~gaps[1:-1]))
     assert found.information is not None
     assert found.information.samples == count
-    assert found.joint is not None
-    assert found.joint.samples == count
+    assert found.fit is not None
+    assert found.fit.samples == count
     # The figures of the free run by hand, on what was read.
     simulated = found.model.simulate(run_of(u, y))["y"]
     read = y[~gaps]
     fit = 100 * (1 - np.linalg.norm(read - simulated[~gaps]) / np.linalg.norm(read - read.mean()))
     assert found.fit_percent["y"] == pytest.approx(fit, abs=1e-4)
-    assert found.joint.noise["y"] == pytest.approx(np.sqrt(np.mean((read - simulated[~gaps]) ** 2)), rel=0.01)
+    assert found.fit.noise["y"] == pytest.approx(np.sqrt(np.mean((read - simulated[~gaps]) ** 2)), rel=0.01)
     assert found.residuals is not None
     assert found.residuals.passed
     assert np.isnan(found.equation_error["y"].nr)
@@ -205,7 +206,7 @@ def test_rows_that_a_regular_time_lacks_are_missing(tmp_path) -> None:
         ftlm.Run.from_arrays(inputs={"u": u[kept]}, missing="weight", **given)
     run = ftlm.Run.from_arrays(inputs={"u": u[kept]}, missing="hold", **given)
     assert (run.length, run.step) == (ROWS, STEP)
-    assert np.flatnonzero(run.missing["y"]).tolist() == [30, 31, 90, 200]
+    assert np.flatnonzero(run.missing_samples["y"]).tolist() == [30, 31, 90, 200]
     assert run["u"][30] == run["u"][31] == u[29]
     assert any("its last value was held, which is a guess" in w for w in run.warnings)
     # Written and read again, what is missing is still missing.
@@ -216,11 +217,11 @@ def test_rows_that_a_regular_time_lacks_are_missing(tmp_path) -> None:
 
 def test_places_on_a_grid_with_holes() -> None:
     places = np.array([0, 1, 2, 5, 6, 9, 400, 401])
-    found = places_on_grid(3.0 + 0.0033333 * places)
+    found = grid_positions(3.0 + 0.0033333 * places)
     assert found is not None
     assert found[0].tolist() == places.tolist()
     assert found[1] == pytest.approx(0.0033333, rel=1e-9)
-    assert places_on_grid(np.array([0.0, 0.1, 0.25, 0.3])) is None
+    assert grid_positions(np.array([0.0, 0.1, 0.25, 0.3])) is None
 
 
 def test_empty_cells_may_be_missing(tmp_path) -> None:
@@ -253,34 +254,34 @@ def irregular(seed: int, share: float = 0.0, **options: object) -> tuple[ftlm.Ru
 def test_readings_keep_what_was_read() -> None:
     run, y = irregular(1)
     t, u, _ = record(1, 0.3)
-    assert run.readings is not None
-    assert np.array_equal(run.readings.times, t)
-    assert np.array_equal(run.readings.data["y"], y)
-    assert np.array_equal(run.readings.data["u"], u)
+    assert run.sample_times is not None
+    assert np.array_equal(run.sample_times.times, t)
+    assert np.array_equal(run.sample_times.data["y"], y)
+    assert np.array_equal(run.sample_times.data["u"], u)
     assert "outputs keep their own times in output-error fits" in run.warnings[0]
     regular = ftlm.Run.from_arrays(inputs={"u": u}, outputs={"y": y}, step=STEP, resample=0.2)
-    assert regular.readings is None
-    part = run.slice(5.0, 20.0)
-    assert part.readings is not None
+    assert regular.sample_times is None
+    part = run.window(5.0, 20.0)
+    assert part.sample_times is not None
     inside = (t >= 5.0) & (t <= 20.0)
-    np.testing.assert_allclose(part.readings.data["y"][1:][: inside.sum()], y[inside])
-    assert part.readings.data["u"][0] == u[np.searchsorted(t, 5.0) - 1]
-    assert run.rename({"y": "z"}).readings.data.keys() == {"u", "z"}
-    assert np.array_equal(run.resample(0.05).readings.data["y"], y)
-    np.testing.assert_allclose(run.detrend().readings.data["y"], y - run["y"].mean(), atol=1e-12)
+    np.testing.assert_allclose(part.sample_times.data["y"][1:][: inside.sum()], y[inside])
+    assert part.sample_times.data["u"][0] == u[np.searchsorted(t, 5.0) - 1]
+    assert run.rename({"y": "z"}).sample_times.data.keys() == {"u", "z"}
+    assert np.array_equal(run.resample(0.05).sample_times.data["y"], y)
+    np.testing.assert_allclose(run.detrend().sample_times.data["y"], y - run["y"].mean(), atol=1e-12)
 
 
 @pytest.mark.parametrize(("every", "error"), [(2, 8e-3), (8, 5e-4), (16, 1.2e-4)])
 def test_readings_of_a_free_run_are_those_of_the_state_space(every: int, error: float) -> None:
     run, y = irregular(2)
-    times = run.readings.times[run.readings.compared(run.duration)]
-    found, _ = sampled(ftlm.Model(ftlm.equation(WORDS)), run, every, {}, times)
+    times = run.sample_times.times[run.sample_times.indices_within(run.duration)]
+    found, _ = simulate_samples(ftlm.Model(ftlm.equation(WORDS)), run, every, {}, times)
     assert np.abs(found[0] - y[: times.size]).max() < error * np.std(y)
 
 
 def test_readings_extrapolated_in_the_step_are_exact() -> None:
     run, y = irregular(3)
-    (free,) = free_runs(ftlm.Model(ftlm.equation(WORDS)), [run])
+    (free,) = simulate_runs(ftlm.Model(ftlm.equation(WORDS)), [run])
     assert np.abs(free.outputs[0] - y[: free.outputs.shape[1]]).max() < 1e-6 * np.std(y)
 
 
@@ -292,7 +293,7 @@ def test_readings_on_a_grid_are_the_samples_there(words: str) -> None:
     run = run_of(u, 0 * u + np.arange(u.size))
     times = run.time
     expected = model.simulate(run)["y"]
-    found = [sampled(model, run, every, {}, times)[0][0] for every in (8, 16)]
+    found = [simulate_samples(model, run, every, {}, times)[0][0] for every in (8, 16)]
     moved = np.abs((4 * found[1] - found[0]) / 3 - expected).max()
     assert moved < 2e-3 * np.std(expected)
     assert np.abs(found[1] - expected).max() < 4e-3 * np.std(expected)
@@ -302,11 +303,11 @@ def test_the_slope_at_times_of_their_own_is_that_of_the_residuals() -> None:
     run, _ = irregular(5, 0.01)
     structure = ftlm.equation("D^alpha y = c D^nu y + a y + b u + d D^alpha u", initial="rest")
     problem = FreeProblem.of(structure)
-    grid = Grid(problem, [run], [30.0], every=2)
+    grid = Objective(problem, [run], [30.0], every=2)
 
     def at(values: np.ndarray) -> dict[str, object]:
         orders, coefficients, _ = problem.split(values.tolist())
-        return grid.descend(Attempt(orders, coefficients, "here", {}), 1).outcome
+        return grid.minimize(Iterate(orders, coefficients, "here", {}), 1).outcome
 
     here = np.array([1.9, 0.9, -0.8, -4.0, 4.0, 0.3])
     slopes = np.asarray(at(here)["jacobian"])
@@ -325,10 +326,20 @@ def test_corners_are_those_of_the_definition() -> None:
     edges = np.arange(m + 1)
     held = np.array([np.sum(sizes * np.clip(e - jumps, 0, None)) for e in edges])
     means = np.diff(held)
-    response = h**eta * np.array([
-        sum(v * np.sum(np.diff([np.clip(x - k, 0, None) ** (eta + 1) for x in (n, n + 1)])) for k, v in
-            enumerate(np.diff(means, prepend=0.0)) if k <= n) for n in range(m)
-    ]) / 1.5446858458505939  # fmt: skip
+    response = (
+        h**eta
+        * np.array(
+            [
+                sum(
+                    v * np.sum(np.diff([np.clip(x - k, 0, None) ** (eta + 1) for x in (n, n + 1)]))
+                    for k, v in enumerate(np.diff(means, prepend=0.0))
+                    if k <= n
+                )
+                for n in range(m)
+            ]
+        )
+        / 1.5446858458505939
+    )
     read = _core.read_at(response[None], places)[0] + _core.corners(m, places, (jumps, sizes), eta, h)
     exact = [np.sum(sizes * np.clip(p - jumps, 0, None) ** eta) * h**eta / gamma(eta + 1) for p in places]
     assert gamma(eta + 2) == pytest.approx(1.5446858458505939)
@@ -342,7 +353,7 @@ def test_means_of_irregular_inputs_are_integrals(kind: str, delay: float) -> Non
     rng = np.random.default_rng(8)
     times = np.append(0.0, np.cumsum(rng.uniform(0.05, 0.3, 30)))
     values = rng.standard_normal(31)
-    readings = Readings(times, {"u": values})
+    readings = NonuniformSamples(times, {"u": values})
     duration, m = 5.0, 64
     found = readings.means("u", kind, m, duration, delay, 0.4)
     t = (np.arange(m * 4000) + 0.5) * duration / (m * 4000)
@@ -363,15 +374,13 @@ def test_a_run_of_irregular_rows_is_identified_as_a_regular_one() -> None:
     assert found.comparison.measured["y"][0].size == found.comparison.times[0].size
     assert found.model.compare(run).fit_percent["y"] == pytest.approx(found.fit_percent["y"], abs=1e-9)
     # A third of the outputs gone as well: the same mechanism serves.
-    u, part = run.readings.data["u"], run.readings.data["y"].copy()
+    u, part = run.sample_times.data["u"], run.sample_times.data["y"].copy()
     part[::3] = np.nan
-    both = ftlm.Run.from_arrays(
-        inputs={"u": u}, outputs={"y": part}, time=t, resample=STEP, missing="weight"
-    )  # fmt: skip
+    both = ftlm.Run.from_arrays(inputs={"u": u}, outputs={"y": part}, time=t, resample=STEP, missing="weight")
     fewer = ftlm.identify(both, ftlm.equation(FREE))
     near_truth(fewer)
-    assert fewer.joint is not None
-    assert fewer.joint.samples == pytest.approx(2 / 3 * ROWS, abs=4)
+    assert fewer.fit is not None
+    assert fewer.fit.samples == pytest.approx(2 / 3 * ROWS, abs=4)
 
 
 def test_a_known_delay_is_honoured_and_a_free_one_says_what_it_costs() -> None:
@@ -379,7 +388,7 @@ def test_a_known_delay_is_honoured_and_a_free_one_says_what_it_costs() -> None:
     late = np.searchsorted(t, t[-1] - 0.25)
     run = ftlm.Run.from_arrays(
         inputs={"u": u[:late]}, outputs={"y": np.interp(t[:late] - 0.2, t, y, left=0.0)}, time=t[:late], resample=STEP
-    )  # fmt: skip
+    )
     known = ftlm.identify(run, ftlm.equation(FREE, delay={"u": 0.2}))
     assert known.fit_percent["y"] > 99
     free = ftlm.identify(run, ftlm.equation(FREE, delay={"u": (0.1, 0.3)}))
@@ -393,8 +402,8 @@ def test_further_outputs_are_on_the_grid() -> None:
     more = run.with_outputs({"z": np.arange(float(run.length))})
     assert more.outputs == ("y", "z")
     assert more["z"][7] == 7.0
-    assert more.readings is not None
-    assert more.readings.data["z"].size == more.readings.times.size
+    assert more.sample_times is not None
+    assert more.sample_times.data["z"].size == more.sample_times.times.size
     with pytest.raises(ftlm.DataError, match=r"'u' is an input"):
         run.with_outputs({"u": np.zeros(run.length)})
     with pytest.raises(ftlm.DataError, match=r"rows where"):
@@ -429,7 +438,7 @@ def test_outliers_are_named_with_the_way_out_and_huber_ignores_them() -> None:
     assert f"loss: huber ({robust.settings['lowered']} of 398 residuals down-weighted, 4 of them" in robust.details()
     # The noise is that of the usual samples, and the figures are those of all.
     y = noisy(1)[1]
-    assert robust.joint.noise["y"] == pytest.approx(0.01 * np.std(y), rel=0.15)
+    assert robust.fit.noise["y"] == pytest.approx(0.01 * np.std(y), rel=0.15)
     assert robust.fit_percent["y"] < 90
 
 
@@ -451,8 +460,10 @@ def test_the_excess_of_a_smaller_model_is_chi_squared_whatever_a_few_outliers_ar
         rng = np.random.default_rng([77, seed])
         columns, noise = rng.standard_normal((400, 8)), rng.standard_normal(400)
         noise[:2] += 1000.0
-        scale = float(np.median(np.abs(noise))) / MAD
-        fit = least_squares(lambda x, c=columns, e=noise: e - c @ x, np.zeros(8), loss="huber", f_scale=BEND * scale)
+        scale = float(np.median(np.abs(noise))) / MAD_OVER_SIGMA
+        fit = least_squares(
+            lambda x, c=columns, e=noise: e - c @ x, np.zeros(8), loss="huber", f_scale=HUBER_THRESHOLD * scale
+        )
         excess.append(huber_excess(noise, noise - columns @ fit.x))
     # Mean and variance of chi-squared of 8 degrees are 8 and 16.
     assert abs(np.mean(excess) - 8.0) < 4 * np.sqrt(16 / 60)
@@ -467,10 +478,10 @@ def test_huber_is_the_minimum_of_its_loss() -> None:
     # On one grid: an estimate extrapolated to step 0 is the minimum of none.
     joint = fit_output_error([run], structure, loss="huber", refine=False)
     problem = FreeProblem.of(structure)
-    grid = Grid(problem, [run], [1.0 / joint.noise["y"]], joint.refinement)
+    grid = Objective(problem, [run], [1.0 / joint.noise["y"]], joint.refinement)
 
     def loss(values: np.ndarray) -> float:
-        r = np.abs(np.asarray(grid.descend(Attempt([], values.tolist(), "", {}), 1).outcome["residuals"]))
+        r = np.abs(np.asarray(grid.minimize(Iterate([], values.tolist(), "", {}), 1).outcome["residuals"]))
         return float(np.sum(np.where(r <= 1.345, 0.5 * r**2, 1.345 * r - 0.5 * 1.345**2)))
 
     best, errors = joint.values, np.array(list(joint.standard_errors.values()))
@@ -519,8 +530,10 @@ def test_the_covariance_of_colour_is_that_of_its_autocovariances() -> None:
     # Sums over lags alone leave less than 0.75 of it.
     ratio = np.mean(told, axis=0) / np.diag(exact)
     assert np.all((ratio > 0.85) & (ratio < 1.4)), ratio
-    through, power = coloured([colour[0]], 10)
-    assert colour_covariances(np.array([1.0, -0.9]), 1.0, 30) == pytest.approx(0.9 ** np.arange(30) / 0.19, rel=1e-9)
+    through, power = fit_whitening_filter([colour[0]], 10)
+    assert colored_noise_covariances(np.array([1.0, -0.9]), 1.0, 30) == pytest.approx(
+        0.9 ** np.arange(30) / 0.19, rel=1e-9
+    )
     assert through[1] == pytest.approx(-0.9, abs=0.08)
     assert power == pytest.approx(1.0, abs=0.2)
 
@@ -532,14 +545,15 @@ def test_coarse_steps_of_an_output_are_named() -> None:
     assert [w for w in found.warnings if w.startswith(f"y is quantised in steps of {step:.3g}")]
     fine = ftlm.identify(run_of(u, 1e-4 * np.round(y / 1e-4)), ftlm.equation(FREE))
     assert not [w for w in fine.warnings if "quantised" in w]
-    assert quantum(np.array([0.0, 0.3, 0.9, 1.5])) == pytest.approx(0.3)
-    assert quantum(np.random.default_rng(1).standard_normal(500)) == 0.0
-    assert quantum(np.ones(4)) == 0.0
+    assert quantization_step(np.array([0.0, 0.3, 0.9, 1.5])) == pytest.approx(0.3)
+    assert quantization_step(np.random.default_rng(1).standard_normal(500)) == 0.0
+    assert quantization_step(np.ones(4)) == 0.0
 
 
 @pytest.mark.slow
-@pytest.mark.parametrize("make", [lambda s: irregular(s, 0.01)[0], lambda s: run_of(noisy(s)[0], holes(noisy(s)[1]),
-                                                                                    missing="weight")])  # fmt: skip
+@pytest.mark.parametrize(
+    "make", [lambda s: irregular(s, 0.01)[0], lambda s: run_of(noisy(s)[0], holes(noisy(s)[1]), missing="weight")]
+)
 def test_intervals_cover_with_what_is_missing_and_what_jitters(make) -> None:
     inside = []
     for seed in range(20):

@@ -329,7 +329,7 @@ def test_constant_output_is_taken_with_a_warning_and_refused_by_require_outputs(
 def test_a_slice_can_be_constant_although_the_run_is_not():
     run = make(outputs={"y": np.r_[np.zeros(25), np.ones(25)]})
     assert run.warnings == ()
-    assert len(run.slice(0, 0.2).warnings) == 1
+    assert len(run.window(0, 0.2).warnings) == 1
 
 
 # --- time -------------------------------------------------------------------------------------------------------------
@@ -446,13 +446,13 @@ def test_resample_still_needs_increasing_times():
 def test_slice_shares_no_row_and_keeps_the_source_time():
     n = 10_000
     run = Run.from_arrays(time=np.round(82.174 + np.arange(n) * 0.002, 3), inputs={}, outputs={"y": np.arange(n)})
-    est, val = run.slice(1.1, 11.0), run.slice(11.0, None)
+    est, val = run.window(1.1, 11.0), run.window(11.0, None)
     assert (est.start, est.length, est["y"][0], est["y"][-1]) == (83.274, 4950, 550.0, 5499.0)
     assert (val.start, val["y"][0], val.length) == (93.174, 5500.0, 4500)
     assert est.step == val.step == 0.002
     assert est.time[0] == 0.0
-    assert run.slice(None, None).length == run.slice(0, 20.0).length == n
-    assert run.slice(None, 11.0).slice(1.1, None)["y"].tobytes() == est["y"].tobytes()
+    assert run.window(None, None).length == run.window(0, 20.0).length == n
+    assert run.window(None, 11.0).window(1.1, None)["y"].tobytes() == est["y"].tobytes()
 
 
 @pytest.mark.parametrize(
@@ -471,7 +471,7 @@ def test_slice_shares_no_row_and_keeps_the_source_time():
 )
 def test_bad_slices_are_refused(limits, words):
     with pytest.raises(DataError) as caught:
-        make().slice(*limits)
+        make().window(*limits)
     assert [word for word in ["slice", *words] if word not in str(caught.value)] == [], str(caught.value)
 
 
@@ -524,7 +524,7 @@ def test_rename_select_and_intersample():
 def test_check_compatible():
     run = make()
     check_compatible([run])
-    check_compatible([run, run.slice(0, 0.2), run.resample(0.005)])
+    check_compatible([run, run.window(0, 0.2), run.resample(0.005)])
     with pytest.raises(DataError, match="runs: there is none"):
         check_compatible([])
     with pytest.raises(DataError, match=r"run 1 \('run'\) and run 0 .* different outputs: 'z' and 'y'"):
@@ -720,7 +720,7 @@ def test_slices_by_time_agree_with_rows(n, step, start, data):
     whole = Run.from_arrays(time=times, inputs={"u": values}, outputs={"y": values})
     limits = (first * step, last * step)
     at_once = Run.from_arrays(time=times, inputs={"u": values}, outputs={"y": values}, slice=limits)
-    for part in (whole.slice(*limits), at_once):
+    for part in (whole.window(*limits), at_once):
         np.testing.assert_array_equal(part["y"], values[first:last])
         assert part.start == pytest.approx(times[first], rel=1e-11, abs=1e-11)
         assert part.step == pytest.approx(step, rel=1e-9)
@@ -741,7 +741,7 @@ def test_data_given_in_is_never_changed(values, unit):
     except DataError:
         assert not np.isfinite(values).all() or np.abs(values).max() > 1e149
     else:
-        run.slice(0, None).resample(0.25)
+        run.window(0, None).resample(0.25)
         assert not np.shares_memory(run["y"], values)
     assert values.tobytes() == before
     assert values.flags.writeable

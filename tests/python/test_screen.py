@@ -7,8 +7,16 @@ import pytest
 from scipy import signal
 
 import ftlm
-from ftlm.structure_selection.best_subset import ALL, Column, Judge, Products, grounds, judged_subsets, screened
-from ftlm.structure_selection.candidates import Inside
+from ftlm.structure_selection.best_subset import (
+    MAX_EXHAUSTIVE_SUBSETS,
+    Column,
+    Products,
+    SubsetScorer,
+    base_models,
+    score_subsets,
+    screen_subsets,
+)
+from ftlm.structure_selection.candidates import NestedStructures
 from ftlm.structure_selection.cross_validation import Folds
 
 WORDS = "D^2 y = a y + d D y + c0 s + c1 D s + c2 D^2 s + c3 v"
@@ -49,7 +57,7 @@ def runs():
 
 @pytest.fixture(scope="module")
 def subsets(runs):
-    return screened(Inside(ftlm.equation(WORDS, initial="rest")), Folds.of(runs, "runs"), Alone())
+    return screen_subsets(NestedStructures(ftlm.equation(WORDS, initial="rest")), Folds.of(runs, "runs"), Alone())
 
 
 def by_scipy(runs, subset, own):
@@ -73,12 +81,12 @@ def by_scipy(runs, subset, own):
 
 def test_the_products_say_what_scipy_says(runs):
     """At given own coefficients: every subset fitted on one run and judged on the other one, and fitted on both."""
-    every = grounds(Inside(ftlm.equation(WORDS, initial="rest")), tuple(runs))
+    every = base_models(NestedStructures(ftlm.equation(WORDS, initial="rest")), tuple(runs))
     ground = next(g for g in every if len(g.own) == 2)
     point = (math.log(5.0), math.log(0.3))
     own = ground.coefficients(point)
     assert own == pytest.approx({"a": -25.0, "d": -1.5})
-    found = judged_subsets(ground, Folds.of(runs, "runs"), Alone(), [point])
+    found = score_subsets(ground, Folds.of(runs, "runs"), Alone(), [point])
     assert len(found) == 15
     for one in found:
         subset = sorted(set(one.start) - {"a", "d"})
@@ -102,7 +110,7 @@ def test_the_choice_begins_with_the_best_subset(runs):
     found = ftlm.select(runs, ftlm.equation(WORDS, initial="rest"), threads=1)
     assert found.winner.name == "D^2 y = a y + d D^1 y + c0 s + c2 D^2 s"
     # 40 dB of noise leave 1 % over.
-    assert 98.5 < found.winner.unseen < 99.5
+    assert 98.5 < found.winner.validation_fit < 99.5
 
 
 def test_too_many_subsets_are_widened_and_the_best_is_among_them():
@@ -116,9 +124,9 @@ def test_too_many_subsets_are_widened_and_the_best_is_among_them():
         rows = np.column_stack([table, y])
         values.append(rows.T @ rows)
     made = tuple(Column(f"c{k}", f"u{k}", 0.0, ()) for k in range(count))
-    judge = Judge(made, ((1,), (0,), (0, 1)), (0, 1), np.array([values[0][-1, -1], values[1][-1, -1]]))
-    found = judge.every(Products([()], np.array([values])))
-    assert 2**count > ALL > len(found)
+    judge = SubsetScorer(made, ((1,), (0,), (0, 1)), (0, 1), np.array([values[0][-1, -1], values[1][-1, -1]]))
+    found = judge.score_all(Products([()], np.array([values])))
+    assert 2**count > MAX_EXHAUSTIVE_SUBSETS > len(found)
     best = min(found.values(), key=lambda v: v.score).score
     assert found[true].score < best + 0.02
     # One more that does nothing is as good; one less is not.
@@ -127,12 +135,18 @@ def test_too_many_subsets_are_widened_and_the_best_is_among_them():
 
 def test_a_term_at_several_orders_is_one_at_a_time(runs):
     words = "D^2 y = a y + d D y + c0 D^g0 s + c1 D^g1 s + c3 v"
-    inside = Inside(ftlm.equation(words, initial="rest", orders={"g0": (0.0, 1.0, 0.1), "g1": (1.0, 2.0, 0.1)}))
-    ground = next(g for g in grounds(inside, tuple(runs)) if len(g.own) == 2)
-    assert [(c.coefficient, c.place) for c in ground.columns] == [
-        ("c0", 0.0), ("c0", 1.0), ("c1", 1.0), ("c1", 2.0), ("c3", 0.0),
-    ]  # fmt: skip
-    found = judged_subsets(ground, Folds.of(runs, "runs"), Alone(), [(math.log(5.0), math.log(0.3))])
+    inside = NestedStructures(
+        ftlm.equation(words, initial="rest", orders={"g0": (0.0, 1.0, 0.1), "g1": (1.0, 2.0, 0.1)})
+    )
+    ground = next(g for g in base_models(inside, tuple(runs)) if len(g.own) == 2)
+    assert [(c.coefficient, c.order) for c in ground.columns] == [
+        ("c0", 0.0),
+        ("c0", 1.0),
+        ("c1", 1.0),
+        ("c1", 2.0),
+        ("c3", 0.0),
+    ]
+    found = score_subsets(ground, Folds.of(runs, "runs"), Alone(), [(math.log(5.0), math.log(0.3))])
     # Both at order 1 are one term twice: (3 x 3 - 1 pairs, none included) x (v or not) less nothing at all.
     assert len(found) == 8 * 2 - 1
     assert "c0 s + c1 D^2 s" in " ".join(s.change.words for s in found)
@@ -140,7 +154,7 @@ def test_a_term_at_several_orders_is_one_at_a_time(runs):
 
 def test_little_choice_and_blocks_are_not_screened(runs):
     few = ftlm.equation("D^2 y = a y + d D y + c0 s + c3 v")
-    assert screened(Inside(few), Folds.of(runs, "runs"), Alone()) == []
-    assert screened(Inside(ftlm.equation(WORDS)), Folds.of(runs[0], "blocks"), Alone()) == []
+    assert screen_subsets(NestedStructures(few), Folds.of(runs, "runs"), Alone()) == []
+    assert screen_subsets(NestedStructures(ftlm.equation(WORDS)), Folds.of(runs[0], "blocks"), Alone()) == []
     delayed = ftlm.equation(WORDS, delay={"v": (0.0, 0.1)})
-    assert screened(Inside(delayed), Folds.of(runs, "runs"), Alone()) == []
+    assert screen_subsets(NestedStructures(delayed), Folds.of(runs, "runs"), Alone()) == []

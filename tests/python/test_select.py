@@ -14,12 +14,26 @@ from typer.testing import CliRunner
 import friction
 import ftlm
 from ftlm.cli.main import app
-from ftlm.structure_selection.candidates import Change, Inside, Variant, named
-from ftlm.structure_selection.cross_validation import Folds, Trial, fit, judged, least_unseen, masked
-from ftlm.structure_selection.result import percent
-from ftlm.structure_selection.select import _as_good, _ranked, _reason, automatic
-from ftlm.structure_selection.stepwise import Fitted, Work, _judged, contenders, duration, listed
-from ftlm.utils.resources import stop
+from ftlm.structure_selection.candidates import Change, NestedStructures, Variant, name_candidates
+from ftlm.structure_selection.cross_validation import (
+    Folds,
+    Trial,
+    fit,
+    mask_outputs,
+    validate_fit,
+    validation_score_bound,
+)
+from ftlm.structure_selection.result import format_fit
+from ftlm.structure_selection.select import _predicts_equally, _rank_trials, _reason, automatic_structures
+from ftlm.structure_selection.stepwise import (
+    CandidateEvaluator,
+    FittedVariant,
+    _validate_variants,
+    evaluate_list,
+    format_duration,
+    prescreen,
+)
+from ftlm.utils.resources import stop_flag
 
 RICH = "D^2 y = d D^mu y + a y + b0 u + b1 D^gamma u"
 
@@ -112,10 +126,10 @@ def test_friction_is_chosen_where_there_is_some(strength):
 
 
 def test_frictions_that_may_be_left_out():
-    inside = Inside(ftlm.equation("D^2 y = g u - fc*sign(D y) - fs*exp(-(D y/vs)^2)*sign(D y)"))
+    inside = NestedStructures(ftlm.equation("D^2 y = g u - fc*sign(D y) - fs*exp(-(D y/vs)^2)*sign(D y)"))
     assert inside.frictions == {"friction of y": None, "friction of y near rest": "friction of y"}
-    assert str(inside.sliding) == "D^2 y = g u"
-    (first,) = [c.variant for c in inside.skeletons()]
+    assert str(inside.without_optional_friction) == "D^2 y = g u"
+    (first,) = [c.variant for c in inside.simplest()]
     coulomb = next(c for c in inside.larger(first))
     assert [c.words for c in inside.larger(first)] == ["friction of y"]
     assert str(inside.build(coulomb.variant)) == "D^2 y = g u - fc sign(D y)"
@@ -126,9 +140,9 @@ def test_frictions_that_may_be_left_out():
     assert fewer["without friction of y"] == "D^2 y = g u"
     assert fewer["without friction of y near rest"] == "D^2 y = g u - fc sign(D y)"
     # Of a size that is known it is no choice.
-    known = Inside(ftlm.equation("D^2 y = g u - 0.5*sign(D y)"))
+    known = NestedStructures(ftlm.equation("D^2 y = g u - 0.5*sign(D y)"))
     assert known.frictions == {}
-    assert known.sliding == known.structure
+    assert known.without_optional_friction == known.structure
 
 
 def test_a_list_is_ranked_by_prediction_and_failures_have_a_reason(runs):
@@ -144,15 +158,15 @@ def test_a_list_is_ranked_by_prediction_and_failures_have_a_reason(runs):
     assert found.trials[0].name == found.winner.name == "second order"
     assert found.fitted == 3
     assert [t.score for t in found.trials] == sorted(t.score for t in found.trials)
-    assert found.trials[0].unseen > 98.5
-    assert found.trials[1].unseen < 90
+    assert found.trials[0].validation_fit > 98.5
+    assert found.trials[1].validation_fit < 90
 
 
 def test_blocks_of_one_run_are_judged_by_a_fit_that_has_not_read_them():
     run = motor(2)
     folds = Folds.of(run, "blocks")
     assert [f.rows for f in folds.parts] == [(0, 100), (100, 200), (200, 300), (300, 400)]
-    unread = folds.parts[1].seen(["y"])[0]
+    unread = folds.parts[1].estimation_runs(["y"])[0]
     assert np.isnan(unread["y"][100:200]).all()
     assert not np.isnan(np.delete(unread["y"], slice(100, 200))).any()
     assert not np.isnan(run["y"]).any()
@@ -167,29 +181,27 @@ def test_blocks_of_one_run_are_judged_by_a_fit_that_has_not_read_them():
 def test_no_fold_is_left_less_than_where_all_is_fitted(runs, text, validation):
     structure, folds = ftlm.equation(text), Folds.of(runs, validation)
     joint = fit(folds.runs, structure, [], refine=False)
-    least, found = least_unseen(joint, folds), judged("it", structure, folds, joint)
+    least, found = validation_score_bound(joint, folds), validate_fit("it", structure, folds, joint)
     # Free runs that judge are of finer grids and of two samples a run more.
     assert found.score > least - 0.01
     assert found.score < least + 0.2
     own = Folds.of(runs[0], runs[1])
-    assert least_unseen(joint, own) == -np.inf
-    assert least_unseen(replace(joint, converged=False), folds) == -np.inf
+    assert validation_score_bound(joint, own) == -np.inf
+    assert validation_score_bound(replace(joint, converged=False), folds) == -np.inf
 
 
 def test_what_cannot_matter_is_not_judged(runs):
     """Of two whose fits are known, the far worse one waits for the better, and is judged where that fails."""
-    inside = Inside(ftlm.equation("D^alpha y = a y + b0 u + b1 D^gamma u", orders={"gamma": (0.5, 1.5, 0.1)}))
+    inside = NestedStructures(ftlm.equation("D^alpha y = a y + b0 u + b1 D^gamma u", orders={"gamma": (0.5, 1.5, 0.1)}))
     variants = [Variant(frozenset({"a", "b0"}), (("alpha", top),), offset=False) for top in (2.0, 1.0)]
     folds = Folds.of(runs, "runs")
-    ahead = [
-        Fitted(Change("", v), fit(folds.runs, inside.build(v), [], refine=False), 0.0) for v in variants
-    ]  # fmt: skip
-    scores = [judged("", inside.build(v), folds, f.joint).score for v, f in zip(variants, ahead, strict=True)]
+    ahead = [FittedVariant(Change("", v), fit(folds.runs, inside.build(v), [], refine=False), 0.0) for v in variants]
+    scores = [validate_fit("", inside.build(v), folds, f.joint).score for v, f in zip(variants, ahead, strict=True)]
     order = sorted(range(2), key=lambda k: scores[k])
     better, worse = (ahead[k] for k in order)
 
     def names(pair, **more):
-        return [t.name for t in _judged(inside, Work(folds, 1), pair, **more)]
+        return [t.name for t in _validate_variants(inside, CandidateEvaluator(folds, 1), pair, **more)]
 
     both = names([better, worse])
     assert len(both) == 2
@@ -205,14 +217,14 @@ def test_long_records_are_fitted_by_those_alone_that_may_lead():
         ftlm.equation, ("D^2 y = d D y + a y + b u", "D^2 y = d D^mu y + a y + b u", "D y = a y + b u")
     )
     starts = [(first, [at]), (true, [at]), (first, [{"a": -1.0, "b": 0.1}]), (free, [{**at, "mu": 1.2}])]
-    work = Work(Folds.of(runs, "runs"), 1)
-    assert contenders(runs, starts, 2, work) == [1, 3]
-    assert contenders(runs, starts, 3, work) == [0, 1, 3]
-    assert contenders(runs, starts, 4, work) == [0, 1, 2, 3]
+    work = CandidateEvaluator(Folds.of(runs, "runs"), 1)
+    assert prescreen(runs, starts, 2, work) == [1, 3]
+    assert prescreen(runs, starts, 3, work) == [0, 1, 3]
+    assert prescreen(runs, starts, 4, work) == [0, 1, 2, 3]
     # Short ones are not thinned, and what sticks is not told from what slides by a few evaluations.
-    assert contenders([motor(0)], starts, 2, work) == [0, 1, 2, 3]
+    assert prescreen([motor(0)], starts, 2, work) == [0, 1, 2, 3]
     rubbing = ftlm.equation("D^2 y = d D y + a y + b u - fc*sign(D y)")
-    assert contenders(runs, [*starts, (rubbing, [{**at, "fc": 0.1}])], 2, work) == [0, 1, 2, 3, 4]
+    assert prescreen(runs, [*starts, (rubbing, [{**at, "fc": 0.1}])], 2, work) == [0, 1, 2, 3, 4]
     assert work.done == work.known == 0
 
 
@@ -224,38 +236,40 @@ def test_a_run_of_its_own_judges(runs):
 
 def test_what_was_chosen_from_rest_is_judged_on_a_run_in_motion(runs):
     whole = motor(3, rows=800)
-    found = ftlm.select(whole.slice(0, 8.0), [ftlm.equation("D^2 y = d D y + a y + b u")], threads=1)
-    late = whole.slice(8.0, 16.0)
+    found = ftlm.select(whole.window(0, 8.0), [ftlm.equation("D^2 y = d D y + a y + b u")], threads=1)
+    late = whole.window(8.0, 16.0)
     ours = found.best.validate(late).fit_percent["y"]
-    theirs = ftlm.identify(whole.slice(0, 8.0), found.winner.structure).validate(late).fit_percent["y"]
+    theirs = ftlm.identify(whole.window(0, 8.0), found.winner.structure).validate(late).fit_percent["y"]
     assert ours > 95.0
     assert abs(ours - theirs) < 0.1
 
 
 def test_auto_has_an_equation_of_each_order(runs):
-    made = automatic(runs)
+    made = automatic_structures(runs)
     assert [len(s.equations[0].terms) for s in made] == [2, 3, 4, 5]
-    first = [str(Inside(s).build(next(iter(Inside(s).skeletons())).variant)) for s in made]
+    first = [str(NestedStructures(s).build(next(iter(NestedStructures(s).simplest())).variant)) for s in made]
     assert first[0] == "D^1 y = a0 y + b1 u"
     assert first[3] == "D^4 y = a3 D^3 y + a2 D^2 y + a1 D^1 y + a0 y + b1 u"
     with pytest.raises(ftlm.ModelError, match="the outputs y, z; structure='auto' is of one"):
-        automatic([ftlm.Run.from_arrays(step=1, inputs={"u": [0, 1, 2]}, outputs={"y": [0, 1, 2], "z": [0, 1, 2]})])
+        automatic_structures(
+            [ftlm.Run.from_arrays(step=1, inputs={"u": [0, 1, 2]}, outputs={"y": [0, 1, 2], "z": [0, 1, 2]})]
+        )
     with pytest.raises(ftlm.ModelError, match="the runs have no input"):
-        automatic([ftlm.Run.from_arrays(step=1, inputs={}, outputs={"y": [0, 1, 2]})])
+        automatic_structures([ftlm.Run.from_arrays(step=1, inputs={}, outputs={"y": [0, 1, 2]})])
 
 
 @pytest.mark.slow
 def test_auto_finds_order_and_terms(runs):
     found = ftlm.select(runs, "auto", threads=2)
-    assert found.winner.numbers == 3
+    assert found.winner.parameters == 3
     item = found.winner.structure.equations[0]
     assert item.order.constant == 2.0
     assert sorted((t.signal, t.order.constant) for t in item.terms) == [("u", 0.0), ("y", 0.0), ("y", 1.0)]
 
 
 def test_everything_inside_a_structure_is_one():
-    inside = Inside(rich(offset="auto"))
-    first = next(iter(inside.skeletons())).variant
+    inside = NestedStructures(rich(offset="auto"))
+    first = next(iter(inside.simplest())).variant
     assert str(inside.build(first)) == "D^2 y = d D^1 y + a y + b0 u"
     grown = {c.words for c in inside.larger(first)}
     assert grown == {"+ b1 D^1 u", "mu free", "an offset of each run"}
@@ -263,18 +277,18 @@ def test_everything_inside_a_structure_is_one():
         back = {str(inside.build(c.variant)) for c in inside.smaller(change.variant)}
         assert str(inside.build(first)) in back
     # A second own term at order 0 would be the same as the first.
-    assert not inside.possible(Variant(frozenset({"d", "a", "b0"}), (("mu", 2.0),), offset=False))
+    assert not inside.is_valid(Variant(frozenset({"d", "a", "b0"}), (("mu", 2.0),), offset=False))
 
 
 def test_what_only_drives_has_a_skeleton(runs):
-    inside = Inside(ftlm.equation("D^2 y = b0 u + b1 D u"))
-    assert [str(inside.build(c.variant)) for c in inside.skeletons()] == ["D^2 y = b0 u", "D^2 y = b1 D^1 u"]
+    inside = NestedStructures(ftlm.equation("D^2 y = b0 u + b1 D u"))
+    assert [str(inside.build(c.variant)) for c in inside.simplest()] == ["D^2 y = b0 u", "D^2 y = b1 D^1 u"]
     found = ftlm.select(runs, ftlm.equation("D^2 y = b u"), threads=1)
     assert found.winner.name == "D^2 y = b u"
 
 
 def test_masked_runs_keep_what_was_read(runs):
-    unread = masked(runs[0], ["y"], (10, 20))
+    unread = mask_outputs(runs[0], ["y"], (10, 20))
     assert unread.step == runs[0].step
     assert unread.name == runs[0].name
     np.testing.assert_array_equal(unread["u"], runs[0]["u"])
@@ -292,7 +306,7 @@ def test_words_where_nothing_can_be_chosen(runs):
     with pytest.raises(ftlm.ModelError, match="candidate 1 of 2 is str"):
         ftlm.select(runs, [second, "D y = u"])
     with pytest.raises(ftlm.ModelError, match="are the same structure; leave one out"):
-        named({"one": second, "two": ftlm.equation("D^2 y = d D y + a y + b u")})
+        name_candidates({"one": second, "two": ftlm.equation("D^2 y = d D y + a y + b u")})
     renamed = ftlm.equation("D^2 y = k y + c D y + g u")
     with pytest.raises(ftlm.ModelError, match="the same structure but for the names of their numbers; leave one out"):
         ftlm.select(runs, {"one": second, "two": renamed})
@@ -347,7 +361,7 @@ def test_who_stops_it_ends_what_threads_compute(runs):
             return number
         entered.set()
         # The core asks the same flag at every evaluation.
-        assert wait_for(stop())
+        assert wait_for(stop_flag())
         ended.append(number)
         raise KeyboardInterrupt
 
@@ -357,31 +371,31 @@ def test_who_stops_it_ends_what_threads_compute(runs):
     def interrupt(done, known):
         raise KeyboardInterrupt
 
-    work = Work(Folds.of(runs, "runs"), 2, interrupt)
+    work = CandidateEvaluator(Folds.of(runs, "runs"), 2, interrupt)
     with pytest.raises(KeyboardInterrupt):
-        work.each(item, list(range(20)))
+        work.map_candidates(item, list(range(20)))
     # The thread of the first item may have taken up a third before.
     assert set(begun) <= {0, 1, 2}
     assert sorted(ended) == sorted(begun)[1:]
 
 
 def test_fits_on_threads_end_with_the_flag(runs):
-    work = Work(Folds.of(runs, "runs"), 1)
+    work = CandidateEvaluator(Folds.of(runs, "runs"), 1)
     structure = ftlm.equation("D^2 y = d D y + a y + b u")
     start = {"d": -5.0, "a": -40.0, "b": 40.0}
 
     def stopped(call):
         def item(_):
-            stop().set()
+            stop_flag().set()
             return call()
 
         with pytest.raises(KeyboardInterrupt):
-            work.quietly(item, [0])
+            work.map_items(item, [0])
 
-    joint = work.fitted(structure, [start])
-    stopped(lambda: work.fitted(structure, []))
-    stopped(lambda: work.fitted(structure, [start]))
-    stopped(lambda: work.judge("second order", structure, joint))
+    joint = work.fit_candidate(structure, [start])
+    stopped(lambda: work.fit_candidate(structure, []))
+    stopped(lambda: work.fit_candidate(structure, [start]))
+    stopped(lambda: work.validate("second order", structure, joint))
 
 
 def test_many_candidates_are_told_how_long_they_take(runs):
@@ -390,15 +404,15 @@ def test_many_candidates_are_told_how_long_they_take(runs):
     def judge(name, structure, joint, *, fine):
         return Trial(name, structure, 1, failed="not asked")
 
-    work = Work(Folds.of(runs, "runs"), 2, clock=lambda: next(ticks))
-    work.fitted = lambda structure, starts: None
-    work.judge = judge
+    work = CandidateEvaluator(Folds.of(runs, "runs"), 2, clock=lambda: next(ticks))
+    work.fit_candidate = lambda structure, starts: None
+    work.validate = judge
     candidates = {str(k): ftlm.equation(f"D^{1 + k * 1e-4:.6f} y = a y + b u") for k in range(202)}
     with pytest.warns(
         UserWarning, match="202 candidates: the first 2 took 3 s, so the other 200 take about 5 min on 2"
     ):
-        assert len(listed(candidates, work)) == 202
-    assert [duration(s) for s in (0.123, 119.0, 121.0, 7300.0)] == ["0.12 s", "1.2e+02 s", "2 min", "2 h"]
+        assert len(evaluate_list(candidates, work)) == 202
+    assert [format_duration(s) for s in (0.123, 119.0, 121.0, 7300.0)] == ["0.12 s", "1.2e+02 s", "2 min", "2 h"]
 
 
 def test_predictions_are_alike_where_folds_do_not_tell_them_apart():
@@ -408,40 +422,43 @@ def test_predictions_are_alike_where_folds_do_not_tell_them_apart():
         return Trial("", ftlm.equation("D y = a y + b u"), 1, scores=scores, bic=bic)
 
     best = trial(-3.7766, -4.4820, -4.7931, -4.8312)
-    assert _as_good(trial(-3.7169, -4.4811, -4.7930, -4.8305), best)
+    assert _predicts_equally(trial(-3.7169, -4.4811, -4.7930, -4.8305), best)
     # However much the folds scatter, beyond 5 % nothing is alike; nor what is a little worse in each of them.
-    assert not _as_good(trial(-3.5, -4.4811, -4.7930, -4.8305), best)
-    assert not _as_good(trial(-3.76, -4.467, -4.777, -4.815), best)
+    assert not _predicts_equally(trial(-3.5, -4.4811, -4.7930, -4.8305), best)
+    assert not _predicts_equally(trial(-3.76, -4.467, -4.777, -4.815), best)
     # Another seed: the truth without the one block that tells it is far off there, but very likely on all samples.
     best = trial(-3.7591, -4.5182, -4.7539, -4.8769, bic=-14235.6)
-    assert _as_good(trial(-3.2813, -4.5247, -4.7543, -4.8814, bic=-14254.4), best)
-    assert not _as_good(trial(-3.2813, -4.5247, -4.7543, -4.8814, bic=-14240.0), best)
-    assert not _as_good(trial(-3.2813, -4.1247, -4.3543, -4.4814, bic=-14254.4), best)
+    assert _predicts_equally(trial(-3.2813, -4.5247, -4.7543, -4.8814, bic=-14254.4), best)
+    assert not _predicts_equally(trial(-3.2813, -4.5247, -4.7543, -4.8814, bic=-14240.0), best)
+    assert not _predicts_equally(trial(-3.2813, -4.1247, -4.3543, -4.4814, bic=-14254.4), best)
     # Two folds tell no scatter: 1 %.
-    assert _as_good(trial(-3.76, -4.48), trial(-3.7766, -4.4820))
-    assert not _as_good(trial(-3.75, -4.48), trial(-3.7766, -4.4820))
+    assert _predicts_equally(trial(-3.76, -4.48), trial(-3.7766, -4.4820))
+    assert not _predicts_equally(trial(-3.75, -4.48), trial(-3.7766, -4.4820))
     # Of a motor's two runs: the luckiest had five numbers more, and on all samples a criterion of 21 more.
     best = trial(-4.6434, -4.5739, bic=-6645.1)
-    assert _as_good(trial(-4.6380, -4.5558, bic=-6666.5), best)
-    assert not _as_good(trial(-4.6380, -4.5558, bic=-6654.0), best)
-    assert not _as_good(trial(-4.5380, -4.5058, bic=-6666.5), best)
+    assert _predicts_equally(trial(-4.6380, -4.5558, bic=-6666.5), best)
+    assert not _predicts_equally(trial(-4.6380, -4.5558, bic=-6654.0), best)
+    assert not _predicts_equally(trial(-4.5380, -4.5058, bic=-6666.5), best)
 
 
 def stretches(name, fits, numbers=3):
     """A candidate with these fits in percent on stretches of a run."""
     return Trial(
-        name, ftlm.equation("D y = a y + b u"), numbers, bic=0.0,
+        name,
+        ftlm.equation("D y = a y + b u"),
+        numbers,
+        bic=0.0,
         validation={f"run {k}": {"y": fit} for k, fit in enumerate(fits)},
         scores=tuple(math.log(1 - max(fit, -100.0) / 100) for fit in fits),
-    )  # fmt: skip
+    )
 
 
 def test_none_wins_that_fails_where_another_does_not():
     """Three stretches in four do not make good what is lost on the fourth, and the reason says so."""
     failing, steady = stretches("failing", (92, 92, 92, -3e7), 6), stretches("steady", (80, 80, 80, 60), 5)
     assert failing.score < steady.score
-    assert _ranked([failing, steady]) == [steady, failing]
-    assert failing.least == -3e7
+    assert _rank_trials([failing, steady]) == [steady, failing]
+    assert failing.worst_fold == -3e7
     said = _reason(steady, steady, [steady, failing])
     assert "steady (5 numbers, 75.00 % where unseen), which predicts best" in said
     assert said.endswith(
@@ -452,18 +469,18 @@ def test_none_wins_that_fails_where_another_does_not():
     assert "more (6)" not in said
     # Where each fails somewhere the mean decides, and the reason tells where.
     other = stretches("other", (-50, 80, 80, 60))
-    assert _ranked([other, failing]) == [failing, other]
+    assert _rank_trials([other, failing]) == [failing, other]
     assert "It fails on y of run 3, with < -1000 % where other has 60.00, which fails elsewhere." in _reason(
         failing, failing, [failing, other]
     )
     # One that grows without bound fails nobody, nor do stretches that nobody predicts, of noise alone.
     grown = replace(stretches("grown", (80, 80, 80, 60)), grows=True)
-    assert _ranked([grown, failing]) == [failing, grown]
+    assert _rank_trials([grown, failing]) == [failing, grown]
     quiet = [stretches("one", (90, 90, 90, -1)), stretches("two", (89, 89, 89, 3))]
-    assert _ranked(quiet) == quiet
+    assert _rank_trials(quiet) == quiet
     # Candidates of other outputs have other parts.
     apart = replace(steady, validation={"run 0": {"z": 80.0}}, scores=(math.log(0.2),))
-    assert _ranked([apart, failing]) == [failing, apart]
+    assert _rank_trials([apart, failing]) == [failing, apart]
 
 
 def test_the_first_rows_of_a_run_in_motion_are_judged_with_its_own_initial_terms():
@@ -478,13 +495,13 @@ def test_the_first_rows_of_a_run_in_motion_are_judged_with_its_own_initial_terms
     structure, folds = ftlm.equation("D y = a y + b u"), Folds.of(run, "blocks")
     joint = fit(folds.runs, structure, [])
     assert joint.initial == "caputo"
-    found = judged("lag", structure, folds, joint)
+    found = validate_fit("lag", structure, folds, joint)
     # What it leaves over is the noise, on the first block as on the others.
-    assert found.least > 97.0
-    assert least_unseen(joint, folds) == -np.inf
+    assert found.worst_fold > 97.0
+    assert validation_score_bound(joint, folds) == -np.inf
     # A whole run always is, and what is known of it at least stays known.
-    whole = Folds.of([run, run.slice(0, 4)], "runs")
-    assert least_unseen(fit(whole.runs, structure, []), whole) > -np.inf
+    whole = Folds.of([run, run.window(0, 4)], "runs")
+    assert validation_score_bound(fit(whole.runs, structure, []), whole) > -np.inf
 
 
 def test_the_page_and_the_figures(chosen, tmp_path):
@@ -531,6 +548,10 @@ def test_the_command(tmp_path):
 
 
 def test_a_fit_below_all_measure_keeps_its_column():
-    assert [percent(v) for v in (99.123, -12.3, -1e15, -math.inf, math.nan)] == [
-        "99.12", "-12.30", "< -1000", "< -1000", "nan",
-    ]  # fmt: skip
+    assert [format_fit(v) for v in (99.123, -12.3, -1e15, -math.inf, math.nan)] == [
+        "99.12",
+        "-12.30",
+        "< -1000",
+        "< -1000",
+        "nan",
+    ]

@@ -12,8 +12,16 @@ from ftlm.cli.main import app
 from ftlm.estimation.output_error import fit_output_error
 from ftlm.order_search import checkpoint as frames
 from ftlm.structure_selection import cross_validation as trial
-from ftlm.structure_selection.candidates import named
-from ftlm.structure_selection.checkpoint import ENCODER, SELECTION, FitFile, Kept, Refused, Request, Store
+from ftlm.structure_selection.candidates import name_candidates
+from ftlm.structure_selection.checkpoint import (
+    ANSWER_ENCODER,
+    SELECTION_FILE,
+    FitError,
+    FitFile,
+    Request,
+    Store,
+    StoredAnswer,
+)
 from ftlm.structure_selection.cross_validation import Folds
 from test_select import motor
 
@@ -90,8 +98,8 @@ def test_screened_subsets_are_kept(tmp_path):
 def test_a_store_cut_anywhere_goes_on_and_one_that_is_damaged_is_refused(runs, whole, tmp_path):
     path, found = whole
     data, place = path.read_bytes(), tmp_path / "cut.ftlm"
-    ends = [len(SELECTION.magic)]
-    digest = bytes(frames.DIGEST)
+    ends = [len(SELECTION_FILE.magic)]
+    digest = bytes(frames.DIGEST_BYTES)
     while ends[-1] < len(data):
         _, digest, end = frames.next_frame(memoryview(data), ends[-1], digest)
         ends.append(end)
@@ -119,7 +127,7 @@ def test_a_store_cut_anywhere_goes_on_and_one_that_is_damaged_is_refused(runs, w
 
 def _asked(runs):
     folds = Folds.of(runs, "runs")
-    return folds.runs, [[], named([SECOND, FIRST])], [], folds.words
+    return folds.runs, [[], name_candidates([SECOND, FIRST])], [], folds.description
 
 
 def test_what_is_another_selection_is_refused(runs, whole, tmp_path):
@@ -170,7 +178,7 @@ def test_what_is_another_selection_is_refused(runs, whole, tmp_path):
         ftlm.search_status(place)
     forged = tmp_path / "forged.ftlm"
     with Store(forged, request) as kept:
-        kept._log.append([ENCODER.encode(request)])
+        kept._log.append([ANSWER_ENCODER.encode(request)])
     with pytest.raises(ftlm.DataError, match="holds something else at byte"):
         Store(forged, request)
 
@@ -183,7 +191,7 @@ def test_errors_of_candidates_are_kept_and_those_of_ftlm_are_not(runs, tmp_path)
         wrong = ftlm.InternalError("a panic")
         assert kept.fit(SECOND, [], True, lambda: wrong) is wrong
         assert len(kept) == 1
-    assert ENCODER.encode(Kept(b"0", Refused("DataError", "x")))
+    assert ANSWER_ENCODER.encode(StoredAnswer(b"0", FitError("DataError", "x")))
 
 
 def _forged(path, request, *payloads):
@@ -201,10 +209,10 @@ def _fit(runs):
 def test_wrong_contents_under_valid_digests_are_refused_in_words(runs, tmp_path):
     request = Request.of(*_asked(runs))
     plain = _fit(runs)
-    sound = _forged(tmp_path / "sound.ftlm", request, ENCODER.encode(Kept(b"0", plain)))
+    sound = _forged(tmp_path / "sound.ftlm", request, ANSWER_ENCODER.encode(StoredAnswer(b"0", plain)))
     with Store(sound, request) as kept:
         assert len(kept) == 1
-    unknown = ENCODER.encode(Kept(b"0", Refused("KeyError", "x")))
+    unknown = ANSWER_ENCODER.encode(StoredAnswer(b"0", FitError("KeyError", "x")))
     history = msgspec.structs.replace(plain, initial="auto", history=True)
     fits = {
         r"a covariance or values of other than its \d numbers": [
@@ -218,14 +226,14 @@ def test_wrong_contents_under_valid_digests_are_refused_in_words(runs, tmp_path)
     }
     wrong = [("holds something else at byte .*choose another file", unknown)]
     wrong += [
-        ("holds something else at byte .*choose another file", ENCODER.encode(Kept(b"0", one)))
+        ("holds something else at byte .*choose another file", ANSWER_ENCODER.encode(StoredAnswer(b"0", one)))
         for one in (
             msgspec.structs.replace(plain, initial="nowhere"),
             msgspec.structs.replace(plain, growth=(True, "x", False)),
         )
     ]
     wrong += [
-        (f"holds a fit with {words} at byte .*; choose another file", ENCODER.encode(Kept(b"0", one)))
+        (f"holds a fit with {words} at byte .*; choose another file", ANSWER_ENCODER.encode(StoredAnswer(b"0", one)))
         for words, each in fits.items()
         for one in each
     ]
@@ -256,9 +264,9 @@ def test_an_answer_to_another_question_is_refused_in_words(runs, tmp_path):
     for what, (key, _) in answers.items():
         others = {n: answer for n, (_, answer) in answers.items() if n != what}
         if what != "a fit":
-            others["an error"] = Refused("DataError", "x")
+            others["an error"] = FitError("DataError", "x")
         for held, answer in others.items():
-            place = _forged(tmp_path / f"{what} {held}.ftlm", request, ENCODER.encode(Kept(key, answer)))
+            place = _forged(tmp_path / f"{what} {held}.ftlm", request, ANSWER_ENCODER.encode(StoredAnswer(key, answer)))
             with (
                 Store(place, request) as kept,
                 pytest.raises(ftlm.DataError, match=f"holds {held} where {what} was asked for; choose another file"),
@@ -273,9 +281,24 @@ def test_the_command_goes_on(runs, tmp_path, monkeypatch):
     files = [str(tmp_path / f"{r.name}.csv") for r in runs]
     place = tmp_path / "kept.ftlm"
     words = [
-        "select", *files, "--time", "t", "-u", "u=u", "-y", "y=y", "--structure", "D y = a y + b u", "--structure",
-        "D^2 y = d D y + a y + b u", "--store", str(place), "--json", "--threads", "1",
-    ]  # fmt: skip
+        "select",
+        *files,
+        "--time",
+        "t",
+        "-u",
+        "u=u",
+        "-y",
+        "y=y",
+        "--structure",
+        "D y = a y + b u",
+        "--structure",
+        "D^2 y = d D y + a y + b u",
+        "--store",
+        str(place),
+        "--json",
+        "--threads",
+        "1",
+    ]
     held = []
 
     def stopped(*args, **more):

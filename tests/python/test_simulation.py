@@ -11,7 +11,7 @@ import ftlm
 import oracles
 from ftlm import _core
 from ftlm.simulation.discretization import record
-from ftlm.simulation.simulate import compared, respond
+from ftlm.simulation.simulate import comparison_records, respond
 
 
 def zeros_run(n=301, step=0.02, inputs=None, outputs=("y",), **options):
@@ -48,7 +48,7 @@ def test_one_equation_is_the_dense_solve(m):
 def test_coupled_equations_are_the_dense_solve(m):
     run = zeros_run(n=201, outputs=("y", "z"))
     coupled = model(TWO, "simulated")
-    (rec,) = compared([run], coupled, m)
+    (rec,) = comparison_records([run], coupled, m)
     responses, _ = respond(coupled, rec)
     u = oracles.pulse_means(run["u"], m, "zoh")
     described = [

@@ -18,7 +18,7 @@ import lsim_link
 from ftlm import _core
 from ftlm.cli.options import StructureOptions
 from ftlm.estimation.free_parameters import FreeProblem
-from ftlm.estimation.objective import Attempt, Grid
+from ftlm.estimation.objective import Iterate, Objective
 from measured import DATA, needs_data
 
 ANGLES = {"theta11": "th11_deg", "theta12": "th12_deg", "theta21": "th21_deg", "theta22": "th22_deg"}
@@ -72,9 +72,9 @@ def test_a_machine_that_grows_is_found_growing() -> None:
     found = ftlm.identify(swing(0.2), ftlm.equation("D^2 y = a y + d D y + b u"), intervals="quadratic")
     assert found.coefficients["d"] == pytest.approx(0.2, abs=0.02)
     assert found.coefficients["a"] == pytest.approx(-25.0, rel=0.01)
-    assert found.joint is not None
-    assert found.joint.growth is not None
-    assert found.joint.growth.kept
+    assert found.fit is not None
+    assert found.fit.unstable_optimum is not None
+    assert found.fit.unstable_optimum.is_accepted
     assert any("which the runs refuse at 99 %" in w or "no stable optimum" in w for w in found.warnings)
     assert any("grows without bound" in w for w in found.warnings)
 
@@ -96,12 +96,12 @@ def test_what_is_printed_of_a_machine_that_grows_is_what_it_leaves() -> None:
 def test_a_machine_that_dies_away_is_compared_with_nothing() -> None:
     found = ftlm.identify(swing(-0.5), ftlm.equation("D^2 y = a y + d D y + b u"), intervals="quadratic")
     assert found.coefficients["d"] == pytest.approx(-0.5, abs=0.03)
-    assert found.joint is not None
-    assert found.joint.growth is None
+    assert found.fit is not None
+    assert found.fit.unstable_optimum is None
     assert not any("stable" in w for w in found.warnings)
 
 
-def grows(attempt: Attempt) -> bool:
+def grows(attempt: Iterate) -> bool:
     """Whether the free run of D^2 y = a y + d D y + ... grows."""
     a, d, *_ = attempt.coefficients
     return _core.grows(2.0, [(a, 0.0), (d, 1.0)])
@@ -109,28 +109,34 @@ def grows(attempt: Attempt) -> bool:
 
 def test_a_steady_descent_stays_where_free_runs_die_away() -> None:
     problem = FreeProblem.of(ftlm.equation("D^2 y = a y + d D y + b u", initial="caputo"))
-    grid = Grid(problem, [swing(0.2)], [1.0 / 0.001])
-    held = Grid(problem, [swing(0.2)], [1.0 / 0.001], steady=True)
-    start = Attempt([], [-25.0, -0.1, 1.0], "near", {})
-    free, kept = grid.descend(start, 60, plain=True), held.descend(start, 60, plain=True)
+    grid = Objective(problem, [swing(0.2)], [1.0 / 0.001])
+    held = Objective(problem, [swing(0.2)], [1.0 / 0.001], prefer_stable=True)
+    start = Iterate([], [-25.0, -0.1, 1.0], "near", {})
+    free, kept = grid.minimize(start, 60, plain=True), held.minimize(start, 60, plain=True)
     assert grows(free)
     assert not grows(kept)
-    assert free.level < kept.level < held.descend(start, 1).level
+    assert free.cost_per_residual < kept.cost_per_residual < held.minimize(start, 1).cost_per_residual
     # From where it grows, it may leave.
-    assert grows(held.descend(free, 20, plain=True))
+    assert grows(held.minimize(free, 20, plain=True))
 
 
 def arm_run(name: str, thin: int) -> ftlm.Run:
     """A laboratory's run, in rad, of which some samples are kept."""
     run = ftlm.load(
-        DATA / f"two_link_{name}" / f"{name}.csv", time="t_s", inputs={"I1": "Im1_meas_A", "I2": "Im2_meas_A"},
-        outputs=ANGLES, units=dict.fromkeys(ANGLES, "deg"),
-    )  # fmt: skip
-    run = run.slice(1.1, 19.5) if name == "psf" else run
+        DATA / f"two_link_{name}" / f"{name}.csv",
+        time="t_s",
+        inputs={"I1": "Im1_meas_A", "I2": "Im2_meas_A"},
+        outputs=ANGLES,
+        units=dict.fromkeys(ANGLES, "deg"),
+    )
+    run = run.window(1.1, 19.5) if name == "psf" else run
     return ftlm.Run.from_arrays(
-        step=thin * run.step, inputs={n: run[n][::thin] for n in run.inputs},
-        outputs={n: run[n][::thin] for n in ANGLES}, units=run.units, name=name,
-    )  # fmt: skip
+        step=thin * run.step,
+        inputs={n: run[n][::thin] for n in run.inputs},
+        outputs={n: run[n][::thin] for n in ANGLES},
+        units=run.units,
+        name=name,
+    )
 
 
 def test_a_driven_link_has_its_spring_below_its_damper() -> None:
@@ -153,10 +159,10 @@ def test_a_link_that_would_feed_energy_is_no_link(runs_of_lqr: ftlm.Run) -> None
     run, unseen = runs_of_lqr, arm_run("psf", 10)
     link = StructureOptions(orders=["beta4=0"], fixed=["w4=0"]).structure("arm:2")
     found = ftlm.identify(run, link, intervals="quadratic")
-    assert found.joint is not None
-    assert found.joint.growth is not None
-    assert not found.joint.growth.kept
-    assert 0.01 < found.joint.growth.excess < 0.1
+    assert found.fit is not None
+    assert found.fit.unstable_optimum is not None
+    assert not found.fit.unstable_optimum.is_accepted
+    assert 0.01 < found.fit.unstable_optimum.residual_excess < 0.1
     assert found.coefficients["d4"] < 0.0
     assert found.model.stability(coupling="measured").unstable_poles == 0
     assert found.coefficients["p4"] == pytest.approx(-2.1, abs=0.15)
@@ -173,11 +179,17 @@ def test_scipy_alone_finds_the_growing_link_no_further_off(runs_of_lqr: ftlm.Run
         for point in ((-468.0, 1.477), (-497.0, -0.514))
         for _, rest in [
             lsim_link.projected(
-                signals, runs_of_lqr.step, "theta22", point, terms, filtered=("theta12", "theta22"), offset=True,
+                signals,
+                runs_of_lqr.step,
+                "theta22",
+                point,
+                terms,
+                filtered=("theta12", "theta22"),
+                offset=True,
                 first=-1.0,
             )
         ]
-    ]  # fmt: skip
+    ]
     assert left == pytest.approx([0.001164, 0.001221], rel=1e-3)
 
 
@@ -197,8 +209,12 @@ def identified(folder: Path, files: list[str], *options: str) -> dict[str, Any]:
     (folder / "lqr.csv").write_bytes((DATA / "two_link_lqr" / "lqr.csv").read_bytes())
     found = subprocess.run(
         [sys.executable, "-m", "ftlm", "identify", *files, "--columns", "arm.toml", *options, "--json"],
-        cwd=folder, capture_output=True, text=True, check=False, env={**os.environ, "NO_COLOR": "1"},
-    )  # fmt: skip
+        cwd=folder,
+        capture_output=True,
+        text=True,
+        check=False,
+        env={**os.environ, "NO_COLOR": "1"},
+    )
     assert found.returncode == 0, found.stderr
     told: dict[str, Any] = json.loads(found.stdout)
     return told
@@ -226,12 +242,12 @@ def test_a_raw_run_by_the_natural_call(tmp_path: Path, fitted: str, judged: str,
 def test_a_coefficient_that_keeps_its_sign_ends_where_it_no_longer_shows() -> None:
     # D y feeds energy here: with the sign of a damper a descent went on towards 0 until its evaluations ran out.
     problem = FreeProblem.of(ftlm.equation("D^2 y = a y + d D y + b u", initial="caputo"))
-    grid = Grid(problem, [swing(0.2)], [1.0 / 0.001])
-    start = Attempt([], [-25.0, -0.1, 1.0], "damped", {})
-    end = grid.descend(start, 60)
-    assert end.converged
+    grid = Objective(problem, [swing(0.2)], [1.0 / 0.001])
+    start = Iterate([], [-25.0, -0.1, 1.0], "damped", {})
+    end = grid.minimize(start, 60)
+    assert end.has_converged
     assert end.outcome["evaluations"] < 30
     assert end.coefficients[1] == pytest.approx(-0.1 * np.exp(-20.0), rel=1e-6)
     # At 0 itself it may take the other sign.
     let_go = replace(end, coefficients=[end.coefficients[0], 0.0, end.coefficients[2]])
-    assert grid.descend(let_go, 60).coefficients[1] == pytest.approx(0.2, abs=0.02)
+    assert grid.minimize(let_go, 60).coefficients[1] == pytest.approx(0.2, abs=0.02)

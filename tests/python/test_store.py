@@ -22,12 +22,21 @@ import store as bench
 from ftlm import _core
 from ftlm.errors import ModelError
 from ftlm.order_search import checkpoint as frames
-from ftlm.order_search.checkpoint import MAGIC, Joined, Rounds, Section, Store, Verdicts, contents_of, read_store
+from ftlm.order_search.checkpoint import (
+    FILE_SIGNATURE,
+    CoupledTable,
+    Rounds,
+    Section,
+    Store,
+    Verdicts,
+    contents_of,
+    read_store,
+)
 from ftlm.order_search.options import Settings
 from ftlm.order_search.search import make_job
 
 EQUATION = "D^alpha y = a D^beta y + c D^mu y + b D^nu u"
-COARSE = ftlm.lattice(step=0.1)
+COARSE = ftlm.order_grid(step=0.1)
 
 
 @pytest.fixture(scope="module")
@@ -80,7 +89,7 @@ def rows_of(contents):
         {"early_stopping": True},
         {"early_stopping": True, "criterion": "equation-error", "norm": "l2", "rows": "time"},
         {"coefficients": "least-squares", "norm": "l2", "keep": 3, "threads": 3},
-        {"early_stopping": True, "coefficients": "instrumental-variables", "lattice": ftlm.lattice(step=0.2)},
+        {"early_stopping": True, "coefficients": "instrumental-variables", "lattice": ftlm.order_grid(step=0.2)},
     ],
 )
 def test_a_search_with_a_store_is_the_search_without(run, tmp_path, options):
@@ -111,11 +120,11 @@ def test_several_runs_a_delay_and_a_sensor_filter_survive_in_a_store(run, tmp_pa
 def test_rounds_do_not_depend_on_how_they_are_cut_up(run):
     """R4: any number of threads, any stretch of rounds, in any order."""
     job = job_of(run, ftlm.equation(EQUATION, initial="rest"), COARSE, m=32, early_stopping=False)
-    work = job.equation_work()
+    work = job.equation_problem()
     count, ends, _ = work.plan()
     assert count == 19_295
     assert ends == [1, 3, 5]
-    ready = work.ready()
+    ready = work.build_evaluator()
     tables = []
     for threads, cuts in ((1, [1, 3, 5]), (2, [1, 2, 3, 4, 5]), (3, [1, 3, 4, 5]), (8, [1, 3, 5])):
         parts, seed, first = [], [], 0
@@ -201,10 +210,14 @@ def test_control_c_leaves_a_store_that_goes_on(tmp_path):
     call += ["--coefficients", "least-squares", "--norm", "l2", "--initial", "rest"]
     environment = {**os.environ, "PYTHONUNBUFFERED": "1"}
     with subprocess.Popen(
-        [*call, "--store", str(path)], stdout=subprocess.PIPE, stderr=subprocess.PIPE, text=True, env=environment,
-    ) as child:  # fmt: skip
+        [*call, "--store", str(path)],
+        stdout=subprocess.PIPE,
+        stderr=subprocess.PIPE,
+        text=True,
+        env=environment,
+    ) as child:
         try:
-            while child.poll() is None and not (path.exists() and path.stat().st_size > len(MAGIC)):
+            while child.poll() is None and not (path.exists() and path.stat().st_size > len(FILE_SIGNATURE)):
                 pass
             child.send_signal(signal.SIGINT)
             _, errors = child.communicate(timeout=60)
@@ -232,10 +245,10 @@ def test_control_c_at_a_terminal_ends_a_search_that_can_be_resumed(tmp_path):
     assert "Traceback" not in said
     status = ftlm.search_status(path)["y"]
     assert 0 < status.done < status.candidates
-    assert (status.torn, status.damage) == (0, None)
+    assert (status.truncated, status.corruption) == (0, None)
     with Store(path) as kept:
         assert kept.notes == []
-        assert kept.contents.sections[0].dealt == status.done
+        assert kept.contents.sections[0].processed_count == status.done
 
 
 def test_a_store_cut_at_any_byte_holds_only_right_rows_and_goes_on(run, whole, expected, tmp_path):
@@ -255,9 +268,9 @@ def test_a_store_cut_at_any_byte_holds_only_right_rows_and_goes_on(run, whole, e
             continue
         found = read_store(path)
         assert set(rows_of(found)) <= rows
-        assert found.damage is None
-        assert found.end + found.torn == size
-    for size in [0, 7, len(MAGIC), begun - 1, *range(begun, len(whole), 311)]:
+        assert found.corruption is None
+        assert found.end + found.truncated_bytes == size
+    for size in [0, 7, len(FILE_SIGNATURE), begun - 1, *range(begun, len(whole), 311)]:
         path.write_bytes(whole[:size])
         assert bytes_of(search(run, path)) == expected
         if size >= begun:
@@ -268,36 +281,36 @@ def test_a_store_cut_at_any_byte_holds_only_right_rows_and_goes_on(run, whole, e
 @pytest.mark.parametrize("order", [0, 12345])
 def test_a_half_done_stretch_of_another_visiting_order_is_done_again(run, whole, expected, tmp_path, order):
     """Its candidates would be followed twice or never: the table is that of an uninterrupted search all the same."""
-    _, digest, end = frames.next_frame(memoryview(whole), len(MAGIC), bytes(frames.DIGEST))
-    _, (wave, *_), _ = job_of(run, ftlm.equation(EQUATION, initial="rest"), COARSE, m=32).equation_work().plan()
+    _, digest, end = frames.next_frame(memoryview(whole), len(FILE_SIGNATURE), bytes(frames.DIGEST_BYTES))
+    _, (wave, *_), _ = job_of(run, ftlm.equation(EQUATION, initial="rest"), COARSE, m=32).equation_problem().plan()
     found = contents_of("whole", memoryview(whole)).sections[0].done[0].part
     # A row that would win, were it believed.
     rows = ((found[0][0][0], 0.0, *found[0][0][2:]),)
     place = (0, 5, 256, 256, math.inf)
-    begun = frames.Begun(0, 0, wave, place, rows, (0, 0, 5, 0, 0, 0, 0), (), order)
+    begun = frames.PartialRounds(0, 0, wave, place, rows, (0, 0, 5, 0, 0, 0, 0), (), order)
     path = tmp_path / "half.ftlm"
-    path.write_bytes(whole[:end] + frames.framed(frames.ENCODER.encode(begun), end, digest)[0])
+    path.write_bytes(whole[:end] + frames.encode_frame(frames.FRAME_ENCODER.encode(begun), end, digest)[0])
     assert read_store(path).sections[0].open[0].order == order
     assert bytes_of(search(run, path)) == expected
     section = read_store(path).sections[0]
     assert not section.open
-    assert section.dealt == sum(sum(f.part[1][1:]) for f in section.done.values()) > 0
+    assert section.processed_count == sum(sum(f.part[1][1:]) for f in section.done.values()) > 0
 
 
 def test_what_stood_before_a_stretch_was_begun_anew_does_not_count():
     section = Section()
     row = (3, 1.0, (1.0, 2.0, 3.0), ((),))
     counts = (0, 0, 5, 0, 0, 0, 0)
-    first = frames.Begun(0, 0, 2, (1, 5, 256, 256, 1.0), (row,), counts, ((7, False),), 9, True)
-    section.take(first)
-    section.take(msgspec.structs.replace(first, rows=((4, *row[1:]),), failures=None, anew=False))
+    first = frames.PartialRounds(0, 0, 2, (1, 5, 256, 256, 1.0), (row,), counts, ((7, False),), 9, True)
+    section.add_frame(first)
+    section.add_frame(msgspec.structs.replace(first, rows=((4, *row[1:]),), failures=None, anew=False))
     assert [r[0] for r in section.open[0].rows] == [3, 4]
     assert section.open[0].failures == ((7, False),)
     assert section.open[0].checkpoint[0] == (1, 5, 256, 256, 1.0, 9)
-    section.take(msgspec.structs.replace(first, rows=((5, *row[1:]),), failures=()))
+    section.add_frame(msgspec.structs.replace(first, rows=((5, *row[1:]),), failures=()))
     assert [r[0] for r in section.open[0].rows] == [5]
     assert section.open[0].failures == ()
-    assert section.dealt == 5
+    assert section.processed_count == 5
 
 
 @pytest.mark.parametrize("mask", [0xFF, 0x01])
@@ -317,10 +330,10 @@ def test_a_store_flipped_at_any_byte_never_gives_a_wrong_row(whole, tmp_path, ma
         assert got == rows[: len(got)]
         assert len(got) < len(rows)
         assert found.end <= at
-        if found.damage is None:
-            assert found.torn == len(whole) - found.end
+        if found.corruption is None:
+            assert found.truncated_bytes == len(whole) - found.end
         else:
-            assert f"at byte {found.end}" in found.damage
+            assert f"at byte {found.end}" in found.corruption
 
 
 def test_damage_is_reported_with_its_offset_and_salvaged_on_demand(run, whole, expected, tmp_path):
@@ -348,7 +361,7 @@ def test_damage_is_reported_with_its_offset_and_salvaged_on_demand(run, whole, e
 def test_zeros_behind_the_last_frame_are_a_torn_tail(run, whole, expected, tmp_path):
     path = tmp_path / "s.ftlm"
     path.write_bytes(whole + bytes(4096))
-    assert ftlm.search_status(path)["y"].torn == 4096
+    assert ftlm.search_status(path)["y"].truncated == 4096
     with Store(path) as kept:
         assert kept.notes == [f"4096 bytes of an unfinished write at byte {len(whole)} were dropped"]
     assert path.read_bytes() == whole
@@ -376,15 +389,15 @@ def stage_run(plant, drive, with_noise):
 
 def search_stage(run, path=None, *, structure=None, lattice=None, **options):
     options = {"m": 64, "keep": 8, **options}
-    lattice = lattice or ftlm.Lattice(orders=STAGE)
+    lattice = lattice or ftlm.OrderGrid(orders=STAGE)
     return ftlm.search_orders(run, structure or ftlm.flexible_link(form="published"), lattice, store=path, **options)
 
 
 @pytest.fixture
 def small_pieces(monkeypatch):
     """Some candidates a frame, so that a small store has many."""
-    monkeypatch.setattr("ftlm.order_search.schedule.FEWEST", 16)
-    monkeypatch.setattr("ftlm.order_search.schedule.PIECE", 0.0)
+    monkeypatch.setattr("ftlm.order_search.schedule.MIN_BLOCK_CANDIDATES", 16)
+    monkeypatch.setattr("ftlm.order_search.schedule.CHECKPOINT_INTERVAL_S", 0.0)
 
 
 @pytest.fixture(scope="module")
@@ -411,7 +424,7 @@ def stage_store(stage_run, small_pieces, tmp_path):
             "coefficients": "least-squares",
         },
         # More candidates than the first pass follows at a time, so that some are left early and followed further.
-        {"lattice": ftlm.Lattice(step=0.1, orders={"alpha": (1.8, 2.0)}), "coefficients": "least-squares"},
+        {"lattice": ftlm.OrderGrid(increment=0.1, orders={"alpha": (1.8, 2.0)}), "coefficients": "least-squares"},
     ],
 )
 def test_the_search_of_a_stage_with_a_store_is_the_search_without(stage_run, small_pieces, tmp_path, options):
@@ -445,8 +458,8 @@ def test_a_store_of_a_stage_cut_anywhere_holds_only_right_verdicts(stage_store, 
             begun = begun or size
             assert found.sections[0].done.items() <= right.items()
             assert found.sections[0].joined is None
-            assert found.damage is None
-            assert found.end + found.torn == size
+            assert found.corruption is None
+            assert found.end + found.truncated_bytes == size
     assert 0 < begun < len(stage_store) - 9 * 128
 
 
@@ -496,7 +509,7 @@ def test_a_stage_goes_on_wherever_it_was_cut(stage_run, stage_store, stage_expec
 def test_a_finished_search_of_a_stage_is_only_read(stage_run, stage_store, stage_expected, tmp_path, monkeypatch):
     path = tmp_path / "s.ftlm"
     path.write_bytes(stage_store)
-    monkeypatch.setattr("ftlm.order_search.schedule.StageWork.ready", None)
+    monkeypatch.setattr("ftlm.order_search.schedule.StageWork.build_evaluator", None)
     assert bytes_of(ftlm.resume_search(path)["stage"]) == stage_expected
     assert ftlm.search_status(path)["stage"].complete
     held = msgspec.structs.asdict(read_store(path).sections[0].joined)
@@ -513,12 +526,12 @@ def test_a_finished_search_of_a_stage_is_only_read(stage_run, stage_store, stage
     ):
         forged = tmp_path / f"{number}.ftlm"
         with Store(forged, whole.requests) as kept:
-            kept._append([Joined(**{**held, **change})])
+            kept._append([CoupledTable(**{**held, **change})])
         for call in (ftlm.resume_search, ftlm.search_status):
             with pytest.raises(ftlm.DataError, match="its table is of another search"):
                 call(forged)
     with Store(path) as kept, pytest.raises(ModelError, match="a table stands where none belongs"):
-        kept.contents.sections[0].take(Joined(**held))
+        kept.contents.sections[0].add_frame(CoupledTable(**held))
 
 
 def test_a_stage_that_is_interrupted_goes_on(stage_run, stage_expected, small_pieces, tmp_path):
@@ -543,12 +556,16 @@ def test_a_stage_that_is_interrupted_goes_on(stage_run, stage_expected, small_pi
     [
         (lambda run, path: search_stage(run, path, m=32), "asked is other data"),
         (lambda run, path: search_stage(run, path, keep=9), "asked is other settings: keep = 9"),
-        (lambda run, path: search_stage(run, path, structure=PUBLISHED.with_coefficients({"g1": 40.0})),
-         "asked is another equation"),
-        (lambda run, path: search_stage(run, path, lattice=ftlm.Lattice(orders=STAGE | {"alpha2": 2.0})),
-         "asked is another lattice"),
+        (
+            lambda run, path: search_stage(run, path, structure=PUBLISHED.with_coefficients({"g1": 40.0})),
+            "asked is another equation",
+        ),
+        (
+            lambda run, path: search_stage(run, path, lattice=ftlm.OrderGrid(orders=STAGE | {"alpha2": 2.0})),
+            "asked is another lattice",
+        ),
     ],
-)  # fmt: skip
+)
 def test_the_search_of_another_stage_is_refused(stage_run, stage_store, tmp_path, change, message):
     path = tmp_path / "s.ftlm"
     path.write_bytes(stage_store)
@@ -559,9 +576,9 @@ def test_the_search_of_another_stage_is_refused(stage_run, stage_store, tmp_path
 
 def test_verdicts_that_do_not_fit_their_search_are_refused(stage_run, small_pieces, tmp_path):
     """What a forger would write: whole frames, under digests that are right."""
-    job = job_of(stage_run, ftlm.flexible_link(form="published"), ftlm.Lattice(orders=STAGE), m=64, keep=8)
-    work = job.stage_work()
-    wave = sum(last - first for _, first, last, _ in work.ready(keeps_course=True).wanted())
+    job = job_of(stage_run, ftlm.flexible_link(form="published"), ftlm.OrderGrid(orders=STAGE), m=64, keep=8)
+    work = job.coupled_problem()
+    wave = sum(last - first for _, first, last, _ in work.build_evaluator(keeps_course=True).wanted())
     for number, (first, last, kind, message) in enumerate(
         [
             (0, wave + 1, 0, "are cut up otherwise"),
@@ -571,20 +588,20 @@ def test_verdicts_that_do_not_fit_their_search_are_refused(stage_run, small_piec
     ):
         path = tmp_path / f"{number}.ftlm"
         with Store(path, [job.request("stage")]) as kept:
-            kept.done(Verdicts(0, first, last, bytes(8 * (last - first)), bytes([kind]) * (last - first)))
+            kept.append_block(Verdicts(0, first, last, bytes(8 * (last - first)), bytes([kind]) * (last - first)))
         with pytest.raises(ftlm.DataError, match=message):
             ftlm.resume_search(path)
     path = tmp_path / "nan.ftlm"
     with Store(path, [job.request("stage")]) as kept:
-        kept.done(Verdicts(0, 0, wave, np.full(wave, np.nan).tobytes(), bytes(wave)))
+        kept.append_block(Verdicts(0, 0, wave, np.full(wave, np.nan).tobytes(), bytes(wave)))
     for call in (ftlm.resume_search, ftlm.search_status):
         with pytest.raises(ftlm.DataError, match="are not those of"):
             call(path)
     path = tmp_path / "kinds.ftlm"
     with Store(path, [job.request("stage")]) as kept, pytest.raises(ModelError, match="other verdicts"):
-        kept.contents.sections[0].take(Verdicts(0, 0, 2, bytes(8), b"\0"))
+        kept.contents.sections[0].add_frame(Verdicts(0, 0, 2, bytes(8), b"\0"))
     with Store(path) as kept, pytest.raises(ModelError, match="no stretch"):
-        kept.contents.sections[0].take(Rounds(0, 0, 1, ((), (0,) * 7, ())))
+        kept.contents.sections[0].add_frame(Rounds(0, 0, 1, ((), (0,) * 7, ())))
 
 
 # ----------------------------------------------------------------------------------------------------------------------
@@ -600,7 +617,7 @@ def test_verdicts_that_do_not_fit_their_search_are_refused(stage_run, small_piec
 )
 def test_an_identification_keeps_its_searches(stage_run, small_pieces, tmp_path, structure, names):
     path = tmp_path / "s.ftlm"
-    lattice = ftlm.Lattice(orders=STAGE) if names == ["stage"] else ftlm.Lattice(step=0.3, alpha=(1.8, 2.0))
+    lattice = ftlm.OrderGrid(orders=STAGE) if names == ["stage"] else ftlm.OrderGrid(increment=0.3, alpha=(1.8, 2.0))
     options = {"method": "least-squares", "lattice": lattice, "m": 64, "keep": 5, "threads": 1}
     plain = ftlm.identify(stage_run, structure, **options)
     calls = []
@@ -670,7 +687,7 @@ def another(text):
     [
         (lambda run, path: search(run.slice(0.0, 8.0), path), "asked is other data"),
         (lambda run, path: search(run, path, m=64), "asked is other data"),
-        (lambda run, path: search(run, path, lattice=ftlm.lattice(step=0.2)), "asked is another lattice"),
+        (lambda run, path: search(run, path, lattice=ftlm.order_grid(step=0.2)), "asked is another lattice"),
         (lambda run, path: search(run, path, norm="l2"), "asked is other settings: norm = l2"),
         (another("D^alpha y = a D^beta y + c D^mu y + b u"), "asked is another equation"),
         (another("D^alpha y = a D^beta y + c D^mu y + 5 D^nu u"), "asked is another equation"),
@@ -690,7 +707,7 @@ def test_a_store_of_another_algorithm_is_read_where_it_is_finished_and_refused_w
     finished, half = tmp_path / "finished.ftlm", tmp_path / "half.ftlm"
     finished.write_bytes(whole)
     half.write_bytes(whole[: len(whole) // 2])
-    monkeypatch.setattr("ftlm.order_search.checkpoint.ALGORITHM", 6)
+    monkeypatch.setattr("ftlm.order_search.checkpoint.ALGORITHM_VERSION", 6)
     assert bytes_of(ftlm.resume_search(finished)["y"]) == expected
     assert finished.read_bytes() == whole
     kept = read_store(half).end
@@ -707,7 +724,7 @@ def test_only_what_another_algorithm_does_otherwise_is_refused_half_done(run, tm
         expected = bytes_of(search(run, finished, **options))
         held = read_store(finished)
         with monkeypatch.context() as patch:
-            patch.setattr("ftlm.order_search.checkpoint.ALGORITHM", 4)
+            patch.setattr("ftlm.order_search.checkpoint.ALGORITHM_VERSION", 4)
             Store(half, held.requests).close()
         if name == "free":
             begun = half.read_bytes()
@@ -754,7 +771,7 @@ def test_a_full_disk_leaves_the_store_whole(run, expected, tmp_path, monkeypatch
         patch.setattr("ftlm.order_search.checkpoint.os.write", full)
         with pytest.raises(ftlm.DataError, match=r"cannot be written: No space left on device; what it holds is whole"):
             search(run, path)
-    assert read_store(path).torn == 0
+    assert read_store(path).truncated_bytes == 0
     assert path.stat().st_size >= begun
     assert bytes_of(search(run, path)) == expected
 
@@ -838,8 +855,8 @@ def test_a_read_only_folder_is_an_error_and_leaves_the_store_whole(run, whole, e
         (b"t,y\n0,1\n", "is no ftlm search store"),
         (b"ftlm search store 2\n", "is no ftlm search store"),
         (b"", "ends before its first frame"),
-        (MAGIC[:9], "ends before its first frame"),
-        (MAGIC + b"\x07\x00\x00\x00zzzz", "cannot be used: the frame at byte 20 has a damaged length"),
+        (FILE_SIGNATURE[:9], "ends before its first frame"),
+        (FILE_SIGNATURE + b"\x07\x00\x00\x00zzzz", "cannot be used: the frame at byte 20 has a damaged length"),
     ],
 )
 def test_what_is_no_store_is_refused_and_kept(run, tmp_path, content, message):
@@ -866,8 +883,8 @@ def test_paths_that_hold_no_store_are_refused(run, tmp_path):
 
 def test_the_core_refuses_checkpoints_and_parts_of_another_search(run):
     job = job_of(run, ftlm.equation(EQUATION, initial="rest"), COARSE, m=32, early_stopping=False)
-    work = job.equation_work()
-    ready = work.ready()
+    work = job.equation_problem()
+    ready = work.build_evaluator()
     counts = (0, 0, 0, 0, 0, 0, 0)
     row = (3, 1.0, (1.0, 2.0, 3.0), ((),))
     for first, last, start in (

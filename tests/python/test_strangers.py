@@ -31,8 +31,20 @@ def files(tmp_path_factory):
 def test_one_command_from_a_strangers_file_to_a_validated_model(files, name):
     folder, made = files
     path = folder / made[name].name
-    done = command("identify", path, *made[name].words, "--structure", strangers.EQUATION, "--slice", ":3.6",
-                   "--intervals", "quadratic", "--validation", path, "--json")  # fmt: skip
+    done = command(
+        "identify",
+        path,
+        *made[name].words,
+        "--structure",
+        strangers.EQUATION,
+        "--slice",
+        ":3.6",
+        "--intervals",
+        "quadratic",
+        "--validation",
+        path,
+        "--json",
+    )
     assert done.exit_code == 0, done.output
     found = json.loads(done.stdout)
     for number, true in strangers.TRUTH.items():
@@ -48,9 +60,21 @@ def test_a_heated_rods_csv_becomes_a_model_of_half_an_order(tmp_path):
     within = []
     for seed in range(2):
         (tmp_path / "rod.csv").write_bytes(strangers.rod([(10, 12), (150, -9), (230, 9), (290, -12), (350, 6)], seed))
-        done = command("identify", tmp_path / "rod.csv", "-u", "P=Heizleistung", "-y", "T=Temperatur", "--structure",
-                       "D^alpha T = a T + b P + c", "--intervals", "quadratic", "--validation", tmp_path / "other.csv",
-                       "--json")  # fmt: skip
+        done = command(
+            "identify",
+            tmp_path / "rod.csv",
+            "-u",
+            "P=Heizleistung",
+            "-y",
+            "T=Temperatur",
+            "--structure",
+            "D^alpha T = a T + b P + c",
+            "--intervals",
+            "quadratic",
+            "--validation",
+            tmp_path / "other.csv",
+            "--json",
+        )
         assert done.exit_code == 0, done.output
         found = json.loads(done.stdout)
         for number, true in strangers.ROD.items():

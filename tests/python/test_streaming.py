@@ -28,7 +28,7 @@ def batch(run, structure, **options):
     """The closed form on the run's own grid, rows in the order of time."""
     return ftlm.identify(
         run, structure, method="multi-innovation", rows="time", m=run.length - 1, **options
-    ).coefficients  # fmt: skip
+    ).coefficients
 
 
 @pytest.mark.parametrize(("p", "k0", "allowed"), [(1, 1.0, 1e-9), (3, 1.0, 1e-9), (7, 1.0, 1e-9), (7, 100.0, 1e-9)])
@@ -81,12 +81,15 @@ def test_a_record_is_identified_while_it_is_made(tmp_path, stage):
     stream = Streaming(stage, step=0.002, longest=5.0, prior_covariance=1e8)
     seen = []
     run = rig.record(
-        duration=2.0, parameters="linear", out=tmp_path / "run.csv", live=stream,
+        duration=2.0,
+        parameters="linear",
+        out=tmp_path / "run.csv",
+        live=stream,
         progress=lambda *_: seen.append(stream.pulses),
-    )  # fmt: skip
+    )
     assert seen[0] == 499
     assert seen[-1] == 1000
-    told = ftlm.load(tmp_path / "run.csv").about["live"]
+    told = ftlm.load(tmp_path / "run.csv").metadata["live"]
     assert told["coefficients"] == stream.coefficients
     assert told["trouble"] is None
     truth = batch(run, stage, prior_covariance=1e8)
@@ -98,7 +101,7 @@ def test_an_estimate_that_fails_does_not_stop_the_run(stage):
     stream = Streaming(stage, step=0.002, longest=0.5)
     run = rig.record(duration=2.0, live=stream)
     assert run.length == 1001
-    assert "pulses in the stream" in run.about["live"]["trouble"]
+    assert "pulses in the stream" in run.metadata["live"]["trouble"]
 
 
 @pytest.mark.parametrize(

@@ -106,10 +106,12 @@ def test_a_sledge_on_a_slow_spring_sticks_and_slips(law) -> None:
 @pytest.mark.parametrize(
     ("alpha", "own", "law"),
     [
-        (2.0, [(-1.0, 1.0)], (0.6, 0.4, 0.3)), (1.8, [(-1.0, 0.9)], (0.6, 0.4, 0.3)),
-        (1.7, [(-2.0, 0.0), (-0.5, 1.2)], (0.6, 0.4, 0.2)), (1.4, [(-0.3, 0.5)], (0.6, 0.4, 0.3)),
+        (2.0, [(-1.0, 1.0)], (0.6, 0.4, 0.3)),
+        (1.8, [(-1.0, 0.9)], (0.6, 0.4, 0.3)),
+        (1.7, [(-2.0, 0.0), (-0.5, 1.2)], (0.6, 0.4, 0.2)),
+        (1.4, [(-0.3, 0.5)], (0.6, 0.4, 0.3)),
     ],
-)  # fmt: skip
+)
 def test_fractional_bodies_are_those_of_slow_stepping(alpha: float, own, law) -> None:
     errors = []
     for count in (250, 500, 1000):
@@ -166,9 +168,19 @@ def test_derivatives_are_those_of_finite_differences(orders) -> None:
 
     def at(point):
         return _core.friction_error(
-            runs, [law], [(0, [(1.0, [(i, 1)]) for i in (2, 3, 4)])], [(1.05, 2.0), (0.0, 1.5)], ["plain"] * 5,
-            (True, [], 1), list(point[:2]), list(point[2:7]), [], [list(point[7:10]), list(point[10:])], 1, 1e-9,
-        )  # fmt: skip
+            runs,
+            [law],
+            [(0, [(1.0, [(i, 1)]) for i in (2, 3, 4)])],
+            [(1.05, 2.0), (0.0, 1.5)],
+            ["plain"] * 5,
+            (True, [], 1),
+            list(point[:2]),
+            list(point[2:7]),
+            [],
+            [list(point[7:10]), list(point[10:])],
+            1,
+            1e-9,
+        )
 
     point = np.array([*orders, 0.7, 1.1, 0.6, 0.3, 0.15, 0.1, 0.2, 0.05, -0.2, 0.4, -0.1])
     assert max(friction.slope_errors(at, point, 7)) < 1e-6

@@ -13,7 +13,7 @@ from typer.testing import CliRunner
 
 import ftlm
 from ftlm.cli.main import app
-from ftlm.order_search.options import METHODS
+from ftlm.order_search.options import METHOD_CHOICES
 from ftlm.utils.validation import available_threads, check_threads
 
 WORDS = "D^1.5 y = a y + b u"
@@ -78,7 +78,7 @@ def test_the_environment_gives_the_threads_of_what_does_not_say_its_own(monkeypa
         ("identify --meth", {"--method"}),
         (
             "identify --method ",
-            set(METHODS),
+            set(METHOD_CHOICES),
         ),
         ("identify-frequency --weights ", {"auto", "relative", "uniform", "deviation"}),
     ],
@@ -97,6 +97,8 @@ def test_what_a_shell_is_to_read_is_shown(shell):
     done = subprocess.run(
         [sys.executable, "-c", script, "--show-completion", shell],
         env={**os.environ, "_TYPER_COMPLETE_TEST_DISABLE_SHELL_DETECTION": "1"},
-        capture_output=True, text=True, check=True,
-    )  # fmt: skip
+        capture_output=True,
+        text=True,
+        check=True,
+    )
     assert "_FTLM_COMPLETE=complete_" in done.stdout

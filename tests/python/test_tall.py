@@ -10,7 +10,15 @@ from pathlib import Path
 import numpy as np
 import pytest
 
-from ftlm.utils.linalg import dot, length, orthonormal, projections, singular, solved, triangle
+from ftlm.utils.linalg import (
+    dot,
+    minimum_norm_solution,
+    orthonormal,
+    projections,
+    thin_svd,
+    triangular_factor,
+    vector_norm,
+)
 
 SHAPES = [(1, 1), (3, 5), (5, 5), (300, 5), (1800, 5), (1801, 5), (20_000, 5), (700, 60), (2300, 13), (40, 0)]
 
@@ -27,7 +35,7 @@ def table(rows: int, columns: int) -> np.ndarray:
 @pytest.mark.parametrize(("rows", "columns"), SHAPES)
 def test_singular_values_are_numpy_s(rows: int, columns: int) -> None:
     tall = table(rows, columns)
-    left, sizes, right = singular(tall)
+    left, sizes, right = thin_svd(tall)
     largest = sizes.max(initial=1.0)
     np.testing.assert_allclose(sizes, np.linalg.svd(tall, compute_uv=False), rtol=1e-6, atol=1e-14 * largest)
     np.testing.assert_allclose(left * sizes @ right, tall, atol=1e-13 * largest)
@@ -38,7 +46,7 @@ def test_singular_values_are_numpy_s(rows: int, columns: int) -> None:
 @pytest.mark.parametrize(("rows", "columns"), SHAPES)
 def test_a_triangle_keeps_inner_products(rows: int, columns: int) -> None:
     tall = table(rows, columns)
-    last = triangle(tall)
+    last = triangular_factor(tall)
     assert last.shape == (columns, columns)
     scale = float(np.max(np.abs(tall.T @ tall), initial=1.0))
     np.testing.assert_allclose(last.T @ last, tall.T @ tall, atol=1e-13 * scale)
@@ -51,7 +59,7 @@ def test_least_squares_are_numpy_s(rows: int, columns: int, rcond: float | None)
     tall[:, 4:5] += 1.0
     wanted = np.random.default_rng(6).standard_normal(rows)
     expected = np.linalg.lstsq(tall, wanted, rcond=rcond)[0]
-    found = solved(tall, wanted, rcond)
+    found = minimum_norm_solution(tall, wanted, rcond)
     # Of two columns that are nearly alike the difference has seven digits.
     assert found == pytest.approx(expected, rel=1e-4, abs=1e-9 * float(np.max(np.abs(expected))))
     np.testing.assert_allclose(tall @ found, tall @ expected, atol=1e-6)
@@ -64,8 +72,8 @@ def test_a_basis_leaves_out_what_is_rounding() -> None:
 def test_sums_are_those_of_rows() -> None:
     row = np.random.default_rng(1).standard_normal(30_000)
     assert dot(row, row[::-1]) == pytest.approx(float(np.sum(row * row[::-1])), rel=1e-10)
-    assert length(row) == pytest.approx(float(np.linalg.norm(row)), rel=1e-12)
-    assert length(np.zeros(0)) == 0.0
+    assert vector_norm(row) == pytest.approx(float(np.linalg.norm(row)), rel=1e-12)
+    assert vector_norm(np.zeros(0)) == 0.0
     np.testing.assert_allclose(projections(np.stack([row, 2 * row], axis=1), row), [dot(row, row), 2 * dot(row, row)])
 
 

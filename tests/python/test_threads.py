@@ -8,7 +8,7 @@ import numpy as np
 import pytest
 
 from ftlm import _core
-from ftlm.utils.resources import pool, stop
+from ftlm.utils.resources import interruptible_pool, stop_flag
 
 
 def step_response(m: int) -> list:
@@ -25,7 +25,7 @@ def fitted(m: int, flag: _core.Stop | None, evaluations: int = 60) -> dict:
     start = [-0.3, 2.0]
     return _core.output_error(
         step_response(m), [LAW], [], ["plain"] * 2, False, (True, []), [], start, [], evaluations, 1e-12, False, flag
-    )  # fmt: skip
+    )
 
 
 @pytest.mark.parametrize("m", [200, 4000])
@@ -51,7 +51,7 @@ def test_friction_is_ended_as_well() -> None:
     def fit(flag: _core.Stop | None) -> dict:
         return _core.friction_error(
             runs, [law], [(0, strength)], [], ["plain"] * 2, (True, []), [], [1.0, 0.2], [], [], 3, 1e-9, flag
-        )  # fmt: skip
+        )
 
     assert fit(None)["evaluations"] > 1
     flag = _core.Stop()
@@ -65,15 +65,15 @@ def test_an_interrupt_reaches_what_other_threads_compute() -> None:
     seen, begun = [], threading.Barrier(3)
 
     def work(_: int) -> None:
-        flag = stop()
+        flag = stop_flag()
         assert flag is not None
         begun.wait()
         while not flag.is_set:
             fitted(200, None, 2)
-        seen.append(stop() is flag)
+        seen.append(stop_flag() is flag)
 
-    assert stop() is None
-    with pytest.raises(KeyboardInterrupt), pool(2) as workers:  # noqa: PT012
+    assert stop_flag() is None
+    with pytest.raises(KeyboardInterrupt), interruptible_pool(2) as workers:  # noqa: PT012
         for k in range(5):
             workers.submit(work, k)
         begun.wait()
@@ -86,14 +86,14 @@ def test_work_inside_work_ends_with_the_outermost() -> None:
     flags = []
 
     def inner(_: int) -> None:
-        flags.append(stop())
+        flags.append(stop_flag())
 
     def outer(k: int) -> None:
-        flags.append(stop())
-        with pool(1) as workers:
+        flags.append(stop_flag())
+        with interruptible_pool(1) as workers:
             list(workers.map(inner, [k]))
 
-    with pool(2) as workers:
+    with interruptible_pool(2) as workers:
         list(workers.map(outer, range(2)))
     assert len(flags) == 4
     assert len({id(flag) for flag in flags}) == 1
@@ -103,11 +103,11 @@ def test_an_error_of_one_thread_stops_no_other_fit() -> None:
     flags = []
 
     def work(k: int) -> int:
-        flags.append(stop())
+        flags.append(stop_flag())
         if k == 0:
             raise ValueError(k)
         return k
 
-    with pytest.raises(ValueError, match="0"), pool(1) as workers:
+    with pytest.raises(ValueError, match="0"), interruptible_pool(1) as workers:
         list(workers.map(work, range(3)))
     assert not flags[0].is_set

@@ -61,10 +61,10 @@ def test_standard_errors_wider_than_the_bounds_say_so(noisy):
     from dataclasses import replace
 
     from ftlm.estimation.free_parameters import FreeProblem
-    from ftlm.estimation.model_checks import uncertain as _uncertain
+    from ftlm.estimation.model_checks import identifiability_warnings as _uncertain
 
     structure = ftlm.equation(WORDS, orders={"alpha": "1.5:1.7:0.1"})
-    joint = ftlm.identify(noisy, structure).joint
+    joint = ftlm.identify(noisy, structure).fit
     problem = FreeProblem.of(structure)
     assert not [w for w in _uncertain(joint, problem) if "alpha" in w]
     for value in (0.3**2, np.nan, np.inf):
@@ -78,9 +78,9 @@ def test_standard_errors_wider_than_the_bounds_say_so(noisy):
 def test_correlated_numbers_are_told_apart_where_each_is_known(noisy):
     from dataclasses import replace
 
-    from ftlm.estimation.model_checks import inseparable
+    from ftlm.estimation.model_checks import correlation_warnings
 
-    joint = ftlm.identify(noisy, ftlm.equation(WORDS)).joint
+    joint = ftlm.identify(noisy, ftlm.equation(WORDS)).fit
     n = len(joint.names)
     # All of them correlated by 0.999; only the size of their errors differs.
     alike = np.full((n, n), 0.999) + 0.001 * np.eye(n)
@@ -90,7 +90,7 @@ def test_correlated_numbers_are_told_apart_where_each_is_known(noisy):
 
     def said_of(shares):
         spread = np.asarray(shares) * sizes
-        return inseparable(replace(joint, covariance=alike * np.outer(spread, spread)))
+        return correlation_warnings(replace(joint, covariance=alike * np.outer(spread, spread)))
 
     assert said_of(np.full(n, 0.01)) == []
     assert said_of([0.2, *np.full(n - 1, 0.01)]) == []

@@ -70,14 +70,14 @@ def test_coupled_instrumental_variables_reach_the_fit_that_the_noise_allows_and_
 
 def test_the_lattice_with_instrumental_variables_finds_the_orders_of_three_terms() -> None:
     structure, clean = plants.structure("3T"), plants.clean_run("3T")
-    lattice = ftlm.lattice(alpha=(2.0, 2.4), nu=(0.7, 1.1))
+    lattice = ftlm.order_grid(alpha=(2.0, 2.4), nu=(0.7, 1.1))
     for seed in range(3):
         run = plants.noisy_run("3T", 40, seed)
         found = ftlm.search_orders(run, structure, lattice, coefficients="instrumental-variables")
         assert found.settings["coefficients"] == "instrumental-variables"
         assert abs(found.orders["alpha"] - 2.2) < 0.051
         assert abs(found.orders["nu"] - 0.9) < 0.051
-        assert sum(found.pruned.values()) + len(found.table) == found.candidates
+        assert sum(found.exclusion_counts.values()) + len(found.table) == found.candidates
         assert fit_percent(clean["y"], found.model.simulate(clean)["y"]) > 99.8
     whole = ftlm.identify(run, structure, method="instrumental-variables", lattice=lattice)
     assert whole.orders == found.orders
@@ -86,7 +86,7 @@ def test_the_lattice_with_instrumental_variables_finds_the_orders_of_three_terms
 
 def test_instrumental_variables_are_the_same_for_any_number_of_threads() -> None:
     run = plants.noisy_run("3T", 20, 1)
-    lattice = ftlm.lattice(0.1, alpha=(1.9, 2.4), nu=(0.5, 1.2))
+    lattice = ftlm.order_grid(0.1, alpha=(1.9, 2.4), nu=(0.5, 1.2))
     tables = [
         ftlm.search_orders(
             run, plants.structure("3T"), lattice, coefficients="instrumental-variables", threads=t, m=512
@@ -99,7 +99,10 @@ def test_instrumental_variables_are_the_same_for_any_number_of_threads() -> None
 def test_noise_beyond_the_instruments_is_said(fitted: ftlm.Identification) -> None:
     constant = plants.noisy_run("3T", 0, 3)
     found = ftlm.identify(
-        constant, plants.structure("3T"), method="instrumental-variables", lattice=ftlm.lattice(0.2, alpha=(1.8, 2.4))
+        constant,
+        plants.structure("3T"),
+        method="instrumental-variables",
+        lattice=ftlm.order_grid(0.2, alpha=(1.8, 2.4)),
     )
     assert found.fit_percent["y"] < 90
     assert found.warnings
@@ -111,7 +114,7 @@ def test_noise_beyond_the_instruments_is_said(fitted: ftlm.Identification) -> No
 def test_physical_parameters_follow_from_one_of_them(fitted: ftlm.Identification) -> None:
     inertia = 0.0635
     found = fitted.physical(J_11=inertia)
-    c = fitted.joint.coefficients
+    c = fitted.fit.coefficients
     assert found["J_11"].value == inertia
     assert found["J_11"].standard_error < 1e-9
     assert found["K_s1"].value == pytest.approx(c["a1"] * inertia)
@@ -164,9 +167,9 @@ def test_an_equation_error_method_has_no_physical_intervals() -> None:
 def test_coefficients_of_the_law_have_standard_errors(fitted: ftlm.Identification) -> None:
     assert set(fitted.standard_errors) >= {"a2", "b2", "d2", "g2", "r1"}
     assert fitted.standard_errors["b2"] == pytest.approx(fitted.standard_errors["b1"], rel=1e-9)
-    place = [fitted.joint.names.index(n) for n in ("a1", "r1")]
-    spread = fitted.joint.covariance[np.ix_(place, place)]
-    slope = np.array([-fitted.joint.coefficients["r1"], -fitted.joint.coefficients["a1"]])
+    place = [fitted.fit.names.index(n) for n in ("a1", "r1")]
+    spread = fitted.fit.covariance[np.ix_(place, place)]
+    slope = np.array([-fitted.fit.coefficients["r1"], -fitted.fit.coefficients["a1"]])
     assert fitted.standard_errors["a2"] == pytest.approx(np.sqrt(slope @ spread @ slope), rel=1e-9)
 
 
@@ -193,7 +196,7 @@ def test_a_closed_loop_record_starts_from_a_scan_of_resonances() -> None:
 def test_estimates_do_not_depend_on_the_grid() -> None:
     run = plants.noisy_run("A2", 60, 2)
     found = fit_output_error([run], plants.structure("A2"), start=plants.truth("A2"))
-    assert found.settled
+    assert found.step_converged
     assert found.refinement <= 8
     exact = plants.truth("A2")
     z = [(v - exact[n]) / found.standard_errors[n] for n, v in zip(found.names, found.values, strict=True)]
@@ -259,10 +262,10 @@ def test_a_richer_equation_never_fits_worse_than_a_simpler_one() -> None:
     simple = ftlm.identify(run, ftlm.equation("D^alpha y = a0 y + b0 u", **rest))
     structure = ftlm.equation("D^alpha y = a2 D^kappa y + a1 D^nu y + a0 y + b0 u", **rest)
     rich = ftlm.identify(run, structure, intervals="quadratic")
-    assert rich.joint.noise["y"] <= simple.joint.noise["y"] * (1 + 1e-4)
+    assert rich.fit.noise["y"] <= simple.fit.noise["y"] * (1 + 1e-4)
     # What it does not need it cannot tell, and says so.
     assert any("cannot be told" in w or "not different from 0" in w for w in rich.warnings)
-    assert any("from a" in origin and "= 0" in origin for _, origin in rich.joint.starts)
+    assert any("from a" in origin and "= 0" in origin for _, origin in rich.fit.starts)
 
 
 def test_starts_that_stay_above_the_noise_are_not_the_last_word() -> None:
@@ -284,16 +287,16 @@ def test_an_order_too_many_ends_as_a_pole_too_fast_to_see_and_not_in_a_mode_of_t
     run = ftlm.Run.from_arrays(step=2.0, inputs={"u": u, "one": one}, outputs={"y": noisy})
     first = ftlm.identify(run, ftlm.equation("D y = a0 y + b0 u + c0 one", initial=(0.0,)))
     second = ftlm.identify(run, ftlm.equation("D^2 y = a1 D y + a0 y + b0 u + c0 one", initial=(0.0, 1.0)))
-    assert second.joint is not None
+    assert second.fit is not None
     # Left to itself the fit follows the misfit with a mode of the pulse scheme: 62 % beside the first order's 74 %.
     assert second.fit_percent["y"] >= first.fit_percent["y"] - 0.1
-    assert second.joint.noise["y"] == pytest.approx(second.output_error["y"].rmse, rel=0.1)
-    assert any("from the equation of lower order" in origin for _, origin in second.joint.starts)
+    assert second.fit.noise["y"] == pytest.approx(second.output_error["y"].rmse, rel=0.1)
+    assert any("from the equation of lower order" in origin for _, origin in second.fit.starts)
 
 
 def test_of_neighbouring_orders_of_a_stage_the_coupled_run_decides() -> None:
     run, free = plants.noisy_run("A", 40, 3), plants.structure("A")
-    near = ftlm.lattice(alpha=(1.95, 2.0), gamma1=(0.95, 1.0), beta2=(0.1, 0.15), mu2=(0.8, 0.85))
+    near = ftlm.order_grid(alpha=(1.95, 2.0), gamma1=(0.95, 1.0), beta2=(0.1, 0.15), mu2=(0.8, 0.85))
     found = ftlm.identify(run, free, method="instrumental-variables", lattice=near)
     table = found.searches["stage"].table
     assert found.orders == table[found.settings.get("rank", 1) - 1].orders

@@ -128,7 +128,7 @@ def test_regularised_friction_tends_to_it() -> None:
 
 def test_words_in_any_order() -> None:
     structure = ftlm.equation(WORDS)
-    assert (structure.coupling, structure.sticks) == ("simulated", (0, 1))
+    assert (structure.coupling, structure.friction_equations) == ("simulated", (0, 1))
     turned = ftlm.equation("; ".join(reversed(WORDS.split("; "))), fixed={**TRUTH, **STRENGTH})
     first, second = model_of().simulate(sampled()), ftlm.Model(turned).simulate(sampled())
     exact, rates = friction.bodies(
@@ -172,7 +172,7 @@ def test_stages_that_do_not_meet_are_two_machines(tmp_path) -> None:
         return ftlm.Model(structure.with_coefficients({n: values[n] for n in structure.coefficient_names}))
 
     together = made("both")
-    assert together.structure.sticks == (0, 2)
+    assert together.structure.friction_equations == (0, 2)
     found = ftlm.load_model(together.save(tmp_path / "arm.json")).simulate(run)
     for stage in (1, 2):
         alone = made(stage).simulate(run)
@@ -208,23 +208,50 @@ def test_derivatives_are_those_of_finite_differences(leans) -> None:
 
     # Free are both alphas, a spring that both feel, dampers, the drive, and all numbers of both frictions.
     laws = [
-        (0, order(0.0, 0), [(0, order(0.0), (-1.0, [(0, 1)])), (1, order(0.0), (1.0, [(0, 1)])),
-                            (0, order(0.9), (-1.0, [(1, 1)])), (2, order(0.0), (1.0, [(2, 1)]))]),
-        (1, order(0.0, 1), [(0, order(0.0), (0.8, [(0, 1)])), (1, order(0.0), (-1.2, [(0, 1)])),
-                            (0, order(0.9), (0.5, [(1, 1)])), (1, order(1.0), (-1.0, []))]),
-    ]  # fmt: skip
+        (
+            0,
+            order(0.0, 0),
+            [
+                (0, order(0.0), (-1.0, [(0, 1)])),
+                (1, order(0.0), (1.0, [(0, 1)])),
+                (0, order(0.9), (-1.0, [(1, 1)])),
+                (2, order(0.0), (1.0, [(2, 1)])),
+            ],
+        ),
+        (
+            1,
+            order(0.0, 1),
+            [
+                (0, order(0.0), (0.8, [(0, 1)])),
+                (1, order(0.0), (-1.2, [(0, 1)])),
+                (0, order(0.9), (0.5, [(1, 1)])),
+                (1, order(1.0), (-1.0, [])),
+            ],
+        ),
+    ]
     for lean, (_, _, terms), other, sign in zip(leans, laws, (1, 0), (0.4, -0.4), strict=bool(leans)):
         terms.append((other, order(*lean), (sign, [(2, 1)])))
     frictions = [
-        (0, [(1.0, [(3, 1)]), (0.4, [(3, 1)]), (0.2, [])]), (1, [(1.0, [(4, 1)]), (1.0, [(5, 1)]), (1.0, [(6, 1)])]),
-    ]  # fmt: skip
+        (0, [(1.0, [(3, 1)]), (0.4, [(3, 1)]), (0.2, [])]),
+        (1, [(1.0, [(4, 1)]), (1.0, [(5, 1)]), (1.0, [(6, 1)])]),
+    ]
     count, each = 9, 6
 
     def at(point):
         return _core.friction_error(
-            runs, laws, frictions, [(1.05, 2.0)] * 2, ["plain"] * 7, (True, [], 1), list(point[:2]),
-            list(point[2:count]), [], [list(point[count : count + each]), list(point[count + each :])], 1, 1e-9,
-        )  # fmt: skip
+            runs,
+            laws,
+            frictions,
+            [(1.05, 2.0)] * 2,
+            ["plain"] * 7,
+            (True, [], 1),
+            list(point[:2]),
+            list(point[2:count]),
+            [],
+            [list(point[count : count + each]), list(point[count + each :])],
+            1,
+            1e-9,
+        )
 
     starts = [0.02, -0.3, 0.01, 0.2, 0.4, 0.1, -0.05, 0.1, 0.02, -0.3, 0.3, -0.1]
     point = np.array([1.9, 1.8, 40.0, 1.5, 1.2, 6.0, 3.0, 1.0, 0.2, *starts])
@@ -243,9 +270,12 @@ def noisy(seed: int, start=(0.0,) * 4) -> ftlm.Run:
     places, _ = friction.bodies(lambda t: (force(t), 0.0), t, SPRINGS, DAMPERS, laws, start)
     places += 0.003 * np.std(places, axis=1)[:, None] * rng.standard_normal(places.shape)
     return ftlm.Run.from_arrays(
-        step=END / 500, inputs={"u": force(t)}, outputs=dict(zip("xy", places, strict=True)),
-        intersample={"u": "foh"}, name=f"seed {seed}",
-    )  # fmt: skip
+        step=END / 500,
+        inputs={"u": force(t)},
+        outputs=dict(zip("xy", places, strict=True)),
+        intersample={"u": "foh"},
+        name=f"seed {seed}",
+    )
 
 
 @pytest.mark.slow
@@ -262,8 +292,10 @@ def test_both_bodies_are_recovered(seed: int, start) -> None:
 def test_a_body_that_never_moves_is_refused() -> None:
     run = noisy(0)
     still = ftlm.Run.from_arrays(
-        step=run.step, inputs={"u": run["u"]}, intersample={"u": "foh"},
+        step=run.step,
+        inputs={"u": run["u"]},
+        intersample={"u": "foh"},
         outputs={"x": run["x"], "y": 1e-4 * np.random.default_rng(0).standard_normal(run.length)},
-    )  # fmt: skip
+    )
     with pytest.raises(DataError, match="y never moves"):
         ftlm.identify(still, ftlm.equation(WORDS, initial="caputo"))

@@ -18,7 +18,7 @@ from scipy.signal import lsim
 
 import ftlm
 from ftlm.estimation import nuisance_parameters as history
-from ftlm.estimation.objective import covariance_of, deviation
+from ftlm.estimation.objective import covariance_of, propagated_errors
 from ftlm.estimation.output_error import JointFit, fit_output_error
 from ftlm.report.html_report import model_page
 
@@ -50,9 +50,13 @@ def test_another_linear_algebra_moves_last_digits_alone() -> None:
     told = []
     for kernels in ("Prescott", "Nehalem"):
         done = subprocess.run(
-            [sys.executable, "-c", FITTED], check=True, capture_output=True, text=True, timeout=120,
+            [sys.executable, "-c", FITTED],
+            check=True,
+            capture_output=True,
+            text=True,
+            timeout=120,
             env={**os.environ, "OPENBLAS_CORETYPE": kernels, "OPENBLAS_NUM_THREADS": "1"},
-        )  # fmt: skip
+        )
         told.append(json.loads(done.stdout))
     (*numbers, spread), (*others, again) = told
     for one, other in zip(numbers, others, strict=True):
@@ -92,7 +96,7 @@ def test_parameters_of_an_unseen_direction_have_infinite_variance_and_the_others
         np.testing.assert_allclose(once[:3, :3], digits_of(jacobian[:3], float(residuals @ residuals)), rtol=1e-9)
         once *= (400 - 3) / (400 - 5)
     np.testing.assert_allclose(found[np.ix_([0, 2], [0, 2])], once[np.ix_([0, 2], [0, 2])], rtol=1e-9)
-    derived = deviation(np.array([[1.0, 0, 2.0, 0, 0], [1.0, 1.0, 0, 0, 0]]), found)
+    derived = propagated_errors(np.array([[1.0, 0, 2.0, 0, 0], [1.0, 1.0, 0, 0, 0]]), found)
     np.testing.assert_allclose(derived[0] ** 2, found[0, 0] + 4 * found[2, 2] + 4 * found[0, 2])
     assert math.isinf(derived[1])
 
@@ -104,8 +108,9 @@ def driven_twice(seed: int, apart: float) -> ftlm.Run:
     y = lsim(([[0, 1], [-4, -0.4]], [[0], [4.0]], [[1, 0]], 0), u, np.arange(u.size) * 0.05, interp=False)[1]
     return ftlm.Run.from_arrays(
         inputs={"u": u, "v": u + apart * rng.standard_normal(u.size)},
-        outputs={"y": y + 0.01 * np.std(y) * rng.standard_normal(y.size)}, step=0.05,
-    )  # fmt: skip
+        outputs={"y": y + 0.01 * np.std(y) * rng.standard_normal(y.size)},
+        step=0.05,
+    )
 
 
 START = {"c": -0.4, "a": -4.0, "b": 2.0, "e": 2.0}
@@ -154,9 +159,19 @@ def test_two_terms_that_are_nearly_one_have_the_wide_intervals_of_their_differen
 def test_derived_errors_of_what_is_not_seen_are_infinite() -> None:
     covariance = np.array([[np.inf, np.nan], [np.nan, 0.04]])
     fit = JointFit(
-        {}, {"a": 2.0, "r": 3.0}, covariance, {}, 0.0, 9, 1, True, True, [], [],
+        {},
+        {"a": 2.0, "r": 3.0},
+        covariance,
+        {},
+        0.0,
+        9,
+        1,
+        True,
+        True,
+        [],
+        [],
         products={"both": (1.0, ("a", "r")), "square": (-1.0, ("r", "r"))},
-    )  # fmt: skip
+    )
     assert fit.derived_errors == {"both": math.inf, "square": pytest.approx(2 * 3.0 * 0.2)}
     assert np.isnan(fit.correlation[0, 1])
     assert fit.intervals["a"] == (-math.inf, math.inf)

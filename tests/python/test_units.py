@@ -14,9 +14,11 @@ UNITS = {"time in ms": (1e3, 1.0, 1.0), "time in min": (1 / 60, 1.0, 1.0), "y x 
 def told(run, time, outputs, inputs):
     """A run in other units."""
     return ftlm.Run.from_arrays(
-        step=time * run.step, inputs={n: inputs * run[n] for n in run.inputs},
-        outputs={n: outputs * run[n] for n in run.outputs}, name=run.name,
-    )  # fmt: skip
+        step=time * run.step,
+        inputs={n: inputs * run[n] for n in run.inputs},
+        outputs={n: outputs * run[n] for n in run.outputs},
+        name=run.name,
+    )
 
 
 def identified(runs, structure):
@@ -55,9 +57,13 @@ def test_friction_is_the_same_in_any_unit(kind):
         alpha, mu = here.orders.get("alpha", 2.0), here.orders.get("mu", 1.0)
         second = outputs * time**-alpha
         units = {
-            "d": time ** (mu - alpha), "k": time**-alpha, "g": second / inputs, "fc": second, "fs": second,
+            "d": time ** (mu - alpha),
+            "k": time**-alpha,
+            "g": second / inputs,
+            "fc": second,
+            "fs": second,
             "vs": outputs / time,
-        }  # fmt: skip
+        }
         back = {n: v / units[n] for n, v in there.coefficients.items()}
         assert back == pytest.approx(here.coefficients, rel=1e-3)
 
@@ -99,8 +105,13 @@ def test_laws_between_coefficients_are_the_same_in_any_unit():
         assert there.fit_percent == pytest.approx(here.fit_percent, abs=1e-4)
         alpha, mu, beta = (here.orders[n] for n in ("alpha1", "mu2", "beta2"))
         units = {
-            "a1": time ** (beta - 2), "b1": time ** (mu - alpha), "d1": time ** (mu - 2),
-            "g1": outputs / inputs * time**-alpha, "a2": time ** (beta - 2), "b2": 1.0, "d2": time ** (mu - 2),
-        }  # fmt: skip
+            "a1": time ** (beta - 2),
+            "b1": time ** (mu - alpha),
+            "d1": time ** (mu - 2),
+            "g1": outputs / inputs * time**-alpha,
+            "a2": time ** (beta - 2),
+            "b2": 1.0,
+            "d2": time ** (mu - 2),
+        }
         back = {n: v / units[n] for n, v in there.coefficients.items()}
         assert back == pytest.approx(here.coefficients, rel=1e-3)

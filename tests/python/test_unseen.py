@@ -7,7 +7,13 @@ import numpy as np
 import pytest
 
 import ftlm
-from ftlm.reproduction.cross_validation import MARGIN, judged, link_structure, orders_on_unseen_runs, stages_in
+from ftlm.reproduction.cross_validation import (
+    MIN_FIT_GAIN,
+    improves_prediction,
+    link_structure,
+    orders_on_unseen_runs,
+    stages_in,
+)
 from ftlm.reproduction.report import places_table, sentence, unseen_page, unseen_text
 from test_cli import ftlm_command
 
@@ -26,14 +32,18 @@ def hub(seed: int) -> np.ndarray:
 def link_run(order: float, damping: float, seed: int, name: str) -> ftlm.Run:
     """A link on that hub, noise on its deflection."""
     truth = ftlm.Model(ftlm.equation(f"D^2 theta12 = -170 theta12 - {damping} D^{order} theta12 - D^2 theta11"))
-    blank = ftlm.Run.from_arrays(step=STEP, inputs={"theta11": hub(seed)}, outputs={"theta12": np.zeros(ROWS)},
-                                 intersample={"theta11": "foh"})  # fmt: skip
+    blank = ftlm.Run.from_arrays(
+        step=STEP, inputs={"theta11": hub(seed)}, outputs={"theta12": np.zeros(ROWS)}, intersample={"theta11": "foh"}
+    )
     clean = truth.simulate(blank)["theta12"]
     noise = 0.01 * np.std(clean) * np.random.default_rng([seed, 1]).standard_normal(ROWS)
     return ftlm.Run.from_arrays(
-        step=STEP, inputs={}, outputs={"theta11": hub(seed), "theta12": clean + noise},
-        units={"theta11": "rad", "theta12": "rad"}, name=name,
-    )  # fmt: skip
+        step=STEP,
+        inputs={},
+        outputs={"theta11": hub(seed), "theta12": clean + noise},
+        units={"theta11": "rad", "theta12": "rad"},
+        name=name,
+    )
 
 
 @pytest.fixture(scope="module")
@@ -59,9 +69,9 @@ SURE, OTHER, WIDE = (0.2, 0.4), (0.6, 0.8), (-0.2, 0.4)
         ([3.0, 2.0], (SURE, SURE), True),
         ([3.0, 2.0], (SURE, WIDE), None),  # one run does not tell
         ([3.0, 2.0], (SURE, OTHER), None),  # one machine has one order
-        ([3.0, -MARGIN], (SURE, SURE), None),  # one run loses
-        ([MARGIN, MARGIN], (SURE, SURE), True),
-        ([0.9 * MARGIN, 0.9 * MARGIN], (SURE, SURE), False),  # told apart, and worth nothing
+        ([3.0, -MIN_FIT_GAIN], (SURE, SURE), None),  # one run loses
+        ([MIN_FIT_GAIN, MIN_FIT_GAIN], (SURE, SURE), True),
+        ([0.9 * MIN_FIT_GAIN, 0.9 * MIN_FIT_GAIN], (SURE, SURE), False),  # told apart, and worth nothing
         ([0.1, -4.0], (WIDE, WIDE), False),
         ([3.0, -4.0], (WIDE, WIDE), False),
         ([3.0, 2.0], (WIDE, WIDE), None),
@@ -71,24 +81,24 @@ SURE, OTHER, WIDE = (0.2, 0.4), (0.6, 0.8), (-0.2, 0.4)
 )
 def test_a_verdict_follows_gains_and_intervals(gains, intervals, wanted):
     told = {"beta2": dict(zip(("a", "b"), intervals, strict=True))}
-    assert judged(gains, told, {"beta2": 0.0}) is wanted
+    assert improves_prediction(gains, told, {"beta2": 0.0}) is wanted
 
 
 def test_one_of_two_orders_tells_a_run_apart():
     told = {"beta2": {"a": WIDE, "b": SURE}, "mu2": {"a": (0.5, 0.7), "b": (0.6, 1.4)}}
-    assert judged([1.0, 2.0], told, {"beta2": 0.0, "mu2": 1.0}) is True
+    assert improves_prediction([1.0, 2.0], told, {"beta2": 0.0, "mu2": 1.0}) is True
 
 
 def test_a_fractional_damping_earns_its_place_where_the_link_has_one(fractional):
     link = fractional.deflections["theta12"]
     assert link.verdict("fractional damping").earns is True
     assert link.verdict("both fractional").earns is True
-    assert min(link.gains("fractional damping").values()) > 2 * MARGIN
+    assert min(link.gains("fractional damping").values()) > 2 * MIN_FIT_GAIN
     for low, high in link.intervals("fractional damping")["mu2"].values():
         assert low < 0.4 < high
     assert sentence("theta12", link.verdict("fractional damping")) == (
         "θ₁₂: a fractional order of the damping earns its place."
-    )  # fmt: skip
+    )
 
 
 @pytest.mark.slow

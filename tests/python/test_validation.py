@@ -10,8 +10,8 @@ import ftlm
 import oracles
 from ftlm import _core
 from ftlm.simulation import output_samples as past
-from ftlm.simulation.output_samples import sampled
-from ftlm.validation.comparison import compare_means, near_identity
+from ftlm.simulation.output_samples import simulate_samples
+from ftlm.validation.comparison import compare_means, near_identity_warnings
 
 # ----------------------------------------------------------------------------------------------------------------------
 # The four figures
@@ -122,7 +122,7 @@ def test_initial_terms_are_fitted_anew_for_every_run(small_model):
     omega = np.sqrt(9 - 0.04)
     y = np.exp(-0.2 * t) * np.cos(omega * t)
     run = ftlm.Run.from_arrays(step=0.01, inputs={"u": np.zeros(1001)}, outputs={"y": y}, name="whole")
-    found = swinging.compare([run.slice(0, 5), run.slice(5, None)], m=499)
+    found = swinging.compare([run.window(0, 5), run.window(5, None)], m=499)
     assert found.fit_percent["y"] > 99.98
     # Terms of t^0 and t^1, where D y = -0.4 leaves 0.4 y(0) beside y'(0).
     for terms, start in zip(found.initial, (0, 500), strict=True):
@@ -193,13 +193,15 @@ def test_runs_that_cannot_be_compared_are_refused(small_model, small_run):
         ),
         "output 'y' is not in run 'run'": ftlm.Run.from_arrays(step=1, inputs={"y": u, "u": u}, outputs={"w": u}),
         "have different outputs": [
-            small_run, ftlm.Run.from_arrays(step=1, inputs={"u": u}, outputs={"y": u, "w": u}),
+            small_run,
+            ftlm.Run.from_arrays(step=1, inputs={"u": u}, outputs={"y": u, "w": u}),
         ],
         "have different inputs": [small_run, ftlm.Run.from_arrays(step=1, inputs={"v": u}, outputs={"y": u})],
         "have different units: signal 'y' is in 'V' and 'rad'": [
-            small_run, ftlm.Run.from_arrays(step=1, inputs={"u": u}, outputs={"y": u}, units={"y": "V", "u": "A"}),
+            small_run,
+            ftlm.Run.from_arrays(step=1, inputs={"u": u}, outputs={"y": u}, units={"y": "V", "u": "A"}),
         ],
-    }  # fmt: skip
+    }
     for message, runs in others.items():
         with pytest.raises(ftlm.DataError, match=message):
             small_model.compare(runs)
@@ -240,7 +242,7 @@ def figures(nr):
 )
 def test_free_runs_far_worse_than_their_equation_error_are_named(own, equation, output, words):
     text = "D^1.5 y = " + " ".join(f"+ 1 D^{order} y" for order in own) + " + u"
-    found = near_identity(ftlm.equation(text), figures(equation), figures(output))
+    found = near_identity_warnings(ftlm.equation(text), figures(equation), figures(output))
     if words is None:
         assert found == []
     else:
@@ -291,11 +293,11 @@ def test_a_run_in_motion_that_starts_at_zero_is_said_to_be_no_run_from_rest(monk
 
     def counted(model, run, *more):
         simulated.append(run.name)
-        return sampled(model, run, *more)
+        return simulate_samples(model, run, *more)
 
     with monkeypatch.context() as patch:
-        patch.setattr(past, "sampled", counted)
-        assert past.looked_like_rest(model, [from_rest, cut]) == ["cut"]
+        patch.setattr(past, "simulate_samples", counted)
+        assert past.runs_in_motion(model, [from_rest, cut]) == ["cut"]
     assert simulated == ["from rest", "from rest", "cut", "cut"]
     asked = ftlm.Model(replace(model.structure, initial="history"))
     assert ftlm.compare(asked, cut).fit_percent["y"] > ftlm.compare(model, cut).fit_percent["y"] + 1.0

@@ -19,7 +19,7 @@ from ftlm.estimation import nuisance_parameters as history
 from ftlm.estimation.output_error import ProfileInterval, fit_output_error
 from ftlm.estimation.verdict import saved_verdict
 from ftlm.report import html_report as model_page
-from ftlm.validation.findings import KINDS, OTHER, SHOWN, concerns, kind_of
+from ftlm.validation.findings import MAX_SUMMARY_WARNINGS, OTHER_KIND, WARNING_KINDS, group_warnings, warning_kind
 from loops import loop
 
 SOURCE = Path(ftlm.__file__).parent
@@ -70,9 +70,12 @@ def test_a_clean_record_that_predicts_another_one_is_trusted(found, checked):
 
 def test_a_large_run_does_not_hide_that_a_small_one_is_lost(found, other):
     small = ftlm.Run.from_arrays(
-        step=0.02, inputs={"u": 0.02 * other["u"]}, outputs={"y": -0.02 * other["y"]}, units={"u": "V", "y": "m"},
+        step=0.02,
+        inputs={"u": 0.02 * other["u"]},
+        outputs={"y": -0.02 * other["y"]},
+        units={"u": "V", "y": "m"},
         name="small",
-    )  # fmt: skip
+    )
     checked = found.validate([other, small])
     assert checked.output_error["y"].fit > 95.0
     assert checked.verdict.level == "do not use"
@@ -181,11 +184,12 @@ def test_each_rule_finds_its_own_fault(found, checked):
     assert lost.level == "with care"
     gone = found.verdict(fit(checked, 40.0))
     assert (gone.level, gone.reason) == (
-        "do not use", "the free run explains little of the validation run of y (fit 40 %)"
-    )  # fmt: skip
-    never = worse(found, comparison=replace(found.comparison, output_error={
-        "y": replace(found.output_error["y"], nr=math.inf)
-    })).verdict(checked)  # fmt: skip
+        "do not use",
+        "the free run explains little of the validation run of y (fit 40 %)",
+    )
+    never = worse(
+        found, comparison=replace(found.comparison, output_error={"y": replace(found.output_error["y"], nr=math.inf)})
+    ).verdict(checked)
     assert (never.level, never.reason) == ("do not use", "the free run leaves the range of numbers")
     stuck = worse(found, joint=replace(found.joint, converged=False)).verdict(checked)
     assert (stuck.level, stuck.reason) == ("with care", "the fit ended before it stood still")
@@ -267,19 +271,22 @@ FAULTS = {
     "a missing mode": ("D^3 y = -6 D^2 y - 14 D y - 36 y + 24 u", "D^2 y = a1 D y + a0 y + b0 u", {}, []),
     "no errors": ("D y = -2 y + 3 u", "D y = a0 y + b0 u", {"method": "multi-innovation"}, []),
     "errors of instruments": (
-        "D y = -2 y + 3 u", "D y = a0 y + b0 u", {"method": "instrumental-variables"}, [],
+        "D y = -2 y + 3 u",
+        "D y = a0 y + b0 u",
+        {"method": "instrumental-variables"},
+        [],
     ),
     "explains nothing": ("D^2 y = -0.2 D y - 900 y + u", "D y = b u", {}, []),
     "undamped": ("D^2 y = -4 y + u", "D^2 y = a0 y + b0 u", {}, []),
     "integrates": ("D y = 3 u", "D y = b0 u", {}, []),
-}  # fmt: skip
+}
 
 
 @pytest.mark.parametrize("fault", FAULTS)
 def test_a_saved_model_is_judged_as_its_result_was(fault, tmp_path, monkeypatch):
     plant, words, given, warnings = FAULTS[fault]
-    real = estimating.uncertain
-    monkeypatch.setattr(estimating, "uncertain", lambda *args: [*real(*args), *warnings])
+    real = estimating.identifiability_warnings
+    monkeypatch.setattr(estimating, "identifiability_warnings", lambda *args: [*real(*args), *warnings])
     found = ftlm.identify(record(SQUARE, plant), ftlm.equation(words), **given)
     other = record(CHIRP, plant, seed=2, name="chirp")
     saved = ftlm.load_model(found.model.save(tmp_path / "m.json"))
@@ -314,9 +321,10 @@ def test_residuals_below_a_thousandth_of_the_output_decide_nothing(found, checke
     for nr, trusted in ((0.01, False), (0.0009, True)):
         part = replace(found.residuals, outputs={"y": replace(red, nr=nr)})
         assert worse(found, residuals=part).verdict(checked).trusted == trusted
-    part = replace(found.residuals, outputs={"y": replace(tests, inputs={
-        "u": replace(tests.inputs["u"], passed=False, decided=True)
-    })})  # fmt: skip
+    part = replace(
+        found.residuals,
+        outputs={"y": replace(tests, inputs={"u": replace(tests.inputs["u"], passed=False, decided=True)})},
+    )
     assert worse(found, residuals=part).verdict(checked).reason == (
         "residuals of y still follow u: it leaves something out"
     )
@@ -337,9 +345,11 @@ def test_a_run_in_motion_says_so(found):
 
 
 def test_what_may_not_be_used_comes_before_what_needs_care(found):
-    poor = worse(found, joint=replace(found.joint, converged=False), comparison=replace(
-        found.comparison, output_error={"y": replace(found.output_error["y"], nr=0.8, fit=20.0)}
-    ))  # fmt: skip
+    poor = worse(
+        found,
+        joint=replace(found.joint, converged=False),
+        comparison=replace(found.comparison, output_error={"y": replace(found.output_error["y"], nr=0.8, fit=20.0)}),
+    )
     judged = poor.verdict()
     assert judged.level == "do not use"
     assert len(judged.reasons) == 3
@@ -368,7 +378,7 @@ def test_every_mark_stands_in_a_sentence_of_the_program():
                 strings += "".join(p.value if isinstance(p, ast.Constant) else "{}" for p in node.values) + "\n"
             elif isinstance(node, ast.Constant) and isinstance(node.value, str):
                 strings += node.value + "\n"
-    assert [mark for kind in KINDS for mark in kind.marks if mark not in strings] == []
+    assert [mark for kind in WARNING_KINDS for mark in kind.marks if mark not in strings] == []
 
 
 def test_warnings_are_grouped_the_most_serious_first():
@@ -379,25 +389,28 @@ def test_warnings_are_grouped_the_most_serious_first():
         "the model is not stable: 1 pole: its free run grows without bound, however well it fits",
         "time read in ms, as the header 'time [ms]' says",
     ]
-    found = concerns([*said, said[0]])
+    found = group_warnings([*said, said[0]])
     assert [c.kind.name for c in found] == ["unstable", "residuals", "edge", "other"]
     assert found[1].warnings == (said[0], said[2])
     assert found[1].count == " (and 1 more alike)"
-    assert kind_of("anything") is OTHER
+    assert warning_kind("anything") is OTHER_KIND
     assert sum(len(c.warnings) for c in found) == len(said)
-    assert concerns([]) == ()
+    assert group_warnings([]) == ()
     # What is of no kind stands alone.
-    assert [c.warnings for c in concerns(["this", "that"])] == [("this",), ("that",)]
+    assert [c.warnings for c in group_warnings(["this", "that"])] == [("this",), ("that",)]
 
 
 def test_the_first_screen_has_three_groups_and_says_where_the_rest_is(found):
     many = (
         *(f"the prior (K0 = {k}) pulls" for k in range(3)),
-        "order x = 1 is on its bound; widen it", "coefficient law: a", "y is quantised in steps", "y: a closed loop",
-    )  # fmt: skip
+        "order x = 1 is on its bound; widen it",
+        "coefficient law: a",
+        "y is quantised in steps",
+        "y: a closed loop",
+    )
     poor = worse(found, warnings=many)
     text = str(poor)
-    assert sum(line.startswith("! ") for line in text.splitlines()) == SHOWN == 3
+    assert sum(line.startswith("! ") for line in text.splitlines()) == MAX_SUMMARY_WARNINGS == 3
     assert "! y: a closed loop" in text
     assert "(4 more warnings: print(result.details()))" in text
     assert all(f"warning: {w}" in poor.details() for w in many)
@@ -416,8 +429,16 @@ def test_the_first_screen_has_verdict_model_behaviour_and_both_fits(found, check
     assert max(map(len, lines)) <= 120
     assert lines[0].startswith("TRUST: ")
     assert lines[2].startswith(f"D^{found.orders['alpha']:.4f} y = ")
-    for word in ("gain   y from u: 0.44", "m/V", "mode ", "damping 0.26", "pole -0.9", "estimation", "validation",
-                 f"s^{-round(found.orders['alpha'], 4):g} m/V"):  # fmt: skip
+    for word in (
+        "gain   y from u: 0.44",
+        "m/V",
+        "mode ",
+        "damping 0.26",
+        "pole -0.9",
+        "estimation",
+        "validation",
+        f"s^{-round(found.orders['alpha'], 4):g} m/V",
+    ):
         assert word in text, word
     assert "not tried" in str(found)
     assert str(found) == found.summary()

@@ -12,19 +12,19 @@ from ftlm.arm.flexible_link import flexible_link
 from ftlm.estimation.genetic import differential_evolution_search
 from ftlm.fractional_calculus import block_pulse_matrix
 from ftlm.reproduction import published_values as printed
-from ftlm.reproduction.claims import beats, case, ruled, sooner, spread_in_words
+from ftlm.reproduction.claims import beats, case, combine_cases, converges_faster, deviation_in_words
 from ftlm.reproduction.optimizer_comparison import (
-    arrived_at,
-    freed_of,
-    like_for_like,
+    compare_optimizers,
+    compare_orders,
+    convergence_step,
     rivals_lattice,
     seeds_for,
     simulated_panel,
 )
-from ftlm.reproduction.published_models import one_angle, papers_current, printed_numbers, ran
-from ftlm.reproduction.published_values import SCAN, as_printed, implied_spreads, papers_record
-from ftlm.reproduction.simulated_arm import ARMS, MAIN, demo_run
-from ftlm.reproduction.stage_models import Preset, StageWork, Steps, Whole, seconds_of, seconds_of_all
+from ftlm.reproduction.published_models import one_angle, papers_current, printed_numbers, run_printed_models
+from ftlm.reproduction.published_values import PRIOR_GRID, as_printed, implied_spreads, papers_record
+from ftlm.reproduction.simulated_arm import ARM_VARIANTS, MAIN_ARM, demo_run
+from ftlm.reproduction.stage_models import Preset, StageWork, TotalProgress, WorkerProgress, seconds_of, seconds_of_all
 from ftlm.simulation.discretization import prepare
 
 # ----------------------------------------------------------------------------------------------------------------------
@@ -34,55 +34,58 @@ from ftlm.simulation.discretization import prepare
 def cases(rule, *, arms=("one", "two"), angles=("a", "b")):
     return [
         case(rule(prior, arm, angle), K0=prior, the_arm=arm, the_angle=angle)
-        for prior in ("1", "weak") for arm in arms for angle in angles
-    ]  # fmt: skip
+        for prior in ("1", "weak")
+        for arm in arms
+        for angle in angles
+    ]
 
 
 def test_where_all_cases_agree_the_verdict_is_theirs():
-    assert str(ruled(cases(lambda *_: True))) == "holds"
-    assert str(ruled(cases(lambda *_: False))) == "does not hold"
-    assert str(ruled([])) == "cannot be told"
+    assert str(combine_cases(cases(lambda *_: True))) == "holds"
+    assert str(combine_cases(cases(lambda *_: False))) == "does not hold"
+    assert str(combine_cases([])) == "cannot be told"
 
 
 def test_a_verdict_turns_with_what_changes_it_while_all_else_stays():
-    weak = ruled(cases(lambda prior, *_: prior == "weak"))
-    assert (str(weak), weak.cases, weak.held) == ("turns with K0", 8, 4)
+    weak = combine_cases(cases(lambda prior, *_: prior == "weak"))
+    assert (str(weak), weak.cases, weak.holding_cases) == ("turns with K0", 8, 4)
     assert weak.levels == (("1", 4, 0), ("weak", 4, 4))
-    both = ruled(cases(lambda prior, arm, angle: prior == "weak" and angle == "a"))
+    both = combine_cases(cases(lambda prior, arm, angle: prior == "weak" and angle == "a"))
     assert set(both.factors) == {"K0", "the angle"}
-    assert str(ruled(cases(lambda prior, arm, angle: (prior == "weak") != (angle == "a")))) in (
-        "turns with K0 and the angle", "turns with the angle and K0",
-    )  # fmt: skip
+    assert str(combine_cases(cases(lambda prior, arm, angle: (prior == "weak") != (angle == "a")))) in (
+        "turns with K0 and the angle",
+        "turns with the angle and K0",
+    )
 
 
 def test_what_turns_with_the_arm_cannot_be_told_of_the_machine_from_a_simulated_one():
     def of_arm(prior, arm, angle):
         return arm == "one" and angle == "a"
 
-    assert str(ruled(cases(of_arm), of_the_machine=True)) == "cannot be told from a simulated truth"
-    assert ruled(cases(of_arm)).word == "turns with"
+    assert str(combine_cases(cases(of_arm), of_the_machine=True)) == "cannot be told from a simulated truth"
+    assert combine_cases(cases(of_arm)).word == "turns with"
     # What the arm does not change can be told of any.
-    assert str(ruled(cases(lambda prior, *_: prior == "1"), of_the_machine=True)) == "turns with K0"
+    assert str(combine_cases(cases(lambda prior, *_: prior == "1"), of_the_machine=True)) == "turns with K0"
     # One arm says what was put into it, whatever it says.
     for rule in (of_arm, lambda *_: True, lambda *_: False):
-        one = ruled(cases(rule, arms=("one",)), of_the_machine=True)
+        one = combine_cases(cases(rule, arms=("one",)), of_the_machine=True)
         assert (str(one), one.cases) == ("cannot be told from a simulated truth", 4)
-    assert str(ruled(cases(lambda *_: True), of_the_machine=True)) == "holds"
+    assert str(combine_cases(cases(lambda *_: True), of_the_machine=True)) == "holds"
 
 
 def test_an_error_arrives_where_it_stays():
     def trace(*errors):
-        return ftlm.Trace(np.arange(1, len(errors) + 1) * 2, {}, np.array(errors), 3)
+        return ftlm.MultiInnovationTrace(np.arange(1, len(errors) + 1) * 2, {}, np.array(errors), 3)
 
-    assert arrived_at(trace(9.0, 1.0, 3.0, 1.01, 1.0), 1.0) == 8
-    assert arrived_at(trace(np.inf, 1.0, 1.0), 1.0) == 4
-    assert arrived_at(trace(0.5, 0.5), 1.0) == 2
-    assert arrived_at(trace(1.0, 1.0, 1.5), 1.0) == np.inf
+    assert convergence_step(trace(9.0, 1.0, 3.0, 1.01, 1.0), 1.0) == 8
+    assert convergence_step(trace(np.inf, 1.0, 1.0), 1.0) == 4
+    assert convergence_step(trace(0.5, 0.5), 1.0) == 2
+    assert convergence_step(trace(1.0, 1.0, 1.5), 1.0) == np.inf
 
 
 def test_nothing_is_sooner_where_all_arrive_at_once_or_never():
     def of(*steps):
-        return sooner(dict(zip(printed.INNOVATION_LENGTHS, steps, strict=True)))
+        return converges_faster(dict(zip(printed.INNOVATION_LENGTHS, steps, strict=True)))
 
     assert of(46, 10, 10, 10) is True
     assert of(26, 28, 28, 28) is False
@@ -97,7 +100,7 @@ def test_nothing_is_sooner_where_all_arrive_at_once_or_never():
 
 @pytest.fixture(scope="module")
 def first_stage():
-    return {(r.output, r.p): r for r in ran(1, threads=1)}
+    return {(r.output, r.p): r for r in run_printed_models(1, threads=1)}
 
 
 def dense_response(stage, p, m):
@@ -142,12 +145,12 @@ def test_printed_models_move_5_to_316_times_less_than_the_paper_s_arm(first_stag
 
 def test_words_on_printed_models_follow_their_numbers(first_stage):
     rows = tuple(first_stage.values())
-    told = spread_in_words(SimpleNamespace(ran=rows))
+    told = deviation_in_words(SimpleNamespace(ran=rows))
     assert "from 5.78 to 316, median 18.9" in told
     assert "at least 0.83 to 0.997, where 0.14 to 0.37 is printed: in 8 of 8 rows" in told
     # Had they moved as far, nothing would follow.
     moving = tuple(replace(r, moved=0.9 * r.implied) for r in rows)
-    assert spread_in_words(SimpleNamespace(ran=moving)).endswith("from 1.11 to 1.11, median 1.11")
+    assert deviation_in_words(SimpleNamespace(ran=moving)).endswith("from 1.11 to 1.11, median 1.11")
 
 
 def test_the_one_angle_reading_moves_as_little(first_stage):
@@ -159,7 +162,7 @@ def test_the_one_angle_reading_moves_as_little(first_stage):
 def test_a_printed_model_does_not_give_back_its_coefficients(first_stage):
     for (output, p), row in first_stage.items():
         a = f"a{output[-1]}"
-        stated = printed.FRACTIONAL[output][p].coefficients["a"]
+        stated = printed.FRACTIONAL_ROWS[output][p].coefficients["a"]
         # With K0 = 1 a response this small is nothing beside the prior.
         assert abs(row.returned[1.0][a]) < 1e-3 * abs(stated)
         assert abs(row.returned[1e10][a] / stated - 1) > 0.02
@@ -178,7 +181,7 @@ def tables():
 
 def test_tables_4_and_5_come_near_as_equation_errors(tables):
     for output, made in tables.items():
-        table = printed.FRACTIONAL[output]
+        table = printed.FRACTIONAL_ROWS[output]
         assert made.away < 1.15, output
         # With the identity for K0 only the hubs come near.
         assert (made.away_at_one > 3) is output.endswith("2"), output
@@ -200,7 +203,7 @@ def test_tables_4_and_5_come_near_as_equation_errors(tables):
 
 def test_the_scan_s_closed_form_is_the_recursion(tables):
     made = tables["theta21"]
-    assert made.reading.prior in SCAN
+    assert made.reading.prior in PRIOR_GRID
     run, scales = papers_record()
     for output, scale in scales.items():
         assert np.std(run[output]) == pytest.approx(implied_spreads()[output][1])
@@ -234,12 +237,12 @@ def hub():
 
 def test_rivals_have_one_budget_and_bounds_that_do_not_know_the_maker_s_values(hub):
     run, single = hub
-    lattice = ftlm.Lattice(step=0.25, alpha=(1.95, 2.0))
+    lattice = ftlm.OrderGrid(increment=0.25, alpha=(1.95, 2.0))
     settings = ftlm.Genetic(seeds=(0,), evaluations=400)
-    made = like_for_like(run, single, lattice, settings, threads=1)
+    made = compare_optimizers(run, single, lattice, settings, threads=1)
     assert made.candidates == 224
     # The maker's 2271 is not the middle of anything.
-    other = like_for_like(run, replace(single, reference={"a3": 1.0, "b3": 1.0}), lattice, settings, threads=1)
+    other = compare_optimizers(run, replace(single, reference={"a3": 1.0, "b3": 1.0}), lattice, settings, threads=1)
     assert made.genetic.bounds == made.evolution.bounds == other.genetic.bounds
     assert made.genetic.errors == other.genetic.errors
     assert 400 <= made.genetic.evaluations[0] <= 600
@@ -255,7 +258,7 @@ def test_differential_evolution_finds_what_is_there_and_the_same_again():
     truth = ftlm.Model(ftlm.equation("D^1.6 y = -3 D^0.6 y - 8 y + 5 u"))
     run = truth.simulate(ftlm.Run.from_arrays(step=0.02, inputs={"u": u}, outputs={"y": 0 * t}))
     single = ftlm.equation("D^alpha y = a1 D^nu y + a0 y + b0 u")
-    lattice = ftlm.Lattice(step=0.1, alpha=(1.5, 1.7))
+    lattice = ftlm.OrderGrid(increment=0.1, alpha=(1.5, 1.7))
     bounds = {"a1": (-10, 0), "a0": (-20, 0), "b0": (0, 10)}
     settings = ftlm.Genetic(seeds=(3,), evaluations=6000, bounds=bounds)
     records = prepare([run], single, None, power_of_two=True)
@@ -267,7 +270,7 @@ def test_differential_evolution_finds_what_is_there_and_the_same_again():
     assert found.coefficients["b0"] == pytest.approx(5, rel=0.1)
     assert told[-1][0] == told[-1][1] == found.evaluations[3]
     assert differential_evolution_search(records, single, lattice, settings, threads=2) == found
-    moving = prepare([run.slice(1.0, 9.0)], replace(single, initial="caputo"), None, power_of_two=True)
+    moving = prepare([run.window(1.0, 9.0)], replace(single, initial="caputo"), None, power_of_two=True)
     with pytest.raises(ftlm.ModelError, match="slice the runs to start at rest"):
         differential_evolution_search(moving, single, lattice, settings)
 
@@ -289,16 +292,16 @@ def test_rivals_have_the_same_lattice_and_as_many_seeds_on_every_arm(monkeypatch
         given.append((lattice, asked))
         raise ftlm.ModelError("enough")
 
-    monkeypatch.setattr("ftlm.reproduction.optimizer_comparison.like_for_like", like)
-    monkeypatch.setattr("ftlm.reproduction.stage_models.like_for_like", like)
+    monkeypatch.setattr("ftlm.reproduction.optimizer_comparison.compare_optimizers", like)
+    monkeypatch.setattr("ftlm.reproduction.stage_models.compare_optimizers", like)
     monkeypatch.setattr("ftlm.reproduction.optimizer_comparison.trials_of", lambda *_: [])
     with pytest.raises(ftlm.ModelError):
         simulated_panel(1, "whole orders", [1], 0.0, 1, lattice=rivals_lattice(step))
-    preset = Preset(ftlm.Lattice(step=step), 1, 2, alike=True)
+    preset = Preset(ftlm.OrderGrid(increment=step), 1, 2, common_pulses=True)
     work = StageWork(1, demo_run("square"), None, preset, 1, lambda _: None, None)
     assert work.rivals(None) == {}
-    assert rivals_lattice(step, 0.01).step == step
-    assert given[0] == given[1] == (ftlm.Lattice(step=max(step, 0.1), alpha=(1.95, 2.0)), None)
+    assert rivals_lattice(step, 0.01).increment == step
+    assert given[0] == given[1] == (ftlm.OrderGrid(increment=max(step, 0.1), alpha=(1.95, 2.0)), None)
 
 
 def test_seeds_are_ten_or_as_many_as_the_evaluations_allow():
@@ -313,16 +316,16 @@ def test_seeds_are_ten_or_as_many_as_the_evaluations_allow():
 
 
 def test_a_lattice_that_no_bound_prunes_is_searched_coarsely_first(monkeypatch):
-    monkeypatch.setattr("ftlm.reproduction.stage_models.COARSE", 0.4)
-    run, lattice = demo_run("square"), ftlm.Lattice(step=0.2)
-    work = StageWork(1, run, None, Preset(lattice, 1, 2, alike=True), 1, lambda _: None, None)
+    monkeypatch.setattr("ftlm.reproduction.stage_models.COARSE_INCREMENT", 0.4)
+    run, lattice = demo_run("square"), ftlm.OrderGrid(increment=0.2)
+    work = StageWork(1, run, None, Preset(lattice, 1, 2, common_pulses=True), 1, lambda _: None, None)
     options = {"coefficients": "multi-innovation", "innovation_length": 3}
     seen = []
     monkeypatch.setattr(
         "ftlm.reproduction.stage_models.search_orders",
         lambda *a, **k: seen.append(a[2].step) or ftlm.search_orders(*a, **k),
     )
-    found = work.searched("p = 3", lattice, **options)
+    found = work.search_candidate("p = 3", lattice, **options)
     # The hub once; the deflection in steps of 0.4, then around the ten best.
     assert seen == [0.2, 0.4, *[0.2] * 10]
     for output in ("theta11", "theta12"):
@@ -344,8 +347,8 @@ def test_fits_to_simulated_arms_ask_once_not_what_was_before(monkeypatch):
 
     monkeypatch.setattr("ftlm.reproduction.optimizer_comparison.identify", identify)
     with pytest.raises(ftlm.ConvergenceError):
-        freed_of(1, demo_run("square"), "fractional", 1)
-    preset = Preset(ftlm.Lattice(step=0.25), 1, 2, alike=True)
+        compare_orders(1, demo_run("square"), "fractional", 1)
+    preset = Preset(ftlm.OrderGrid(increment=0.25), 1, 2, common_pulses=True)
     for simulated, initial in ((True, "rest"), (False, "auto")):
         work = StageWork(1, demo_run("square"), None, preset, 1, lambda _: None, None, simulated=simulated)
         seen += [work.coupled.initial, work.published.initial]
@@ -355,8 +358,8 @@ def test_fits_to_simulated_arms_ask_once_not_what_was_before(monkeypatch):
 
 def test_the_share_that_is_done_is_of_the_whole_never_falls_and_ends_at_its_end():
     told, stop = [], threading.Event()
-    whole = Whole(10.0, lambda done, of: told.append(done / of))
-    one, two = Steps(whole, stop), Steps(whole, stop)
+    whole = TotalProgress(10.0, lambda done, of: told.append(done / of))
+    one, two = WorkerProgress(whole, stop), WorkerProgress(whole, stop)
     one.begin(4.0)
     two.begin(6.0)
     one(1, 2)
@@ -372,8 +375,8 @@ def test_the_share_that_is_done_is_of_the_whole_never_falls_and_ends_at_its_end(
     assert told[-1] == 1.0
     assert told == sorted(told)
     short = []
-    left_out = Whole(10.0, lambda done, of: short.append((done, of)))
-    Steps(left_out, stop).begin(1.0)
+    left_out = TotalProgress(10.0, lambda done, of: short.append((done, of)))
+    WorkerProgress(left_out, stop).begin(1.0)
     left_out.end()
     assert short[-1] == (1000, 1000)
     stop.set()
@@ -399,11 +402,11 @@ def test_the_time_that_is_said_beforehand_is_the_sum_of_all_steps():
 
 
 def test_arms_differ_in_what_they_are_called_for():
-    whole = ARMS["whole orders"]
+    whole = ARM_VARIANTS["whole orders"]
     assert [whole.stage1.orders(1)[n] for n in ("gamma1", "beta2", "mu2")] == [1.0, 0.0, 1.0]
-    assert whole.stage1.coulomb == ARMS[MAIN].stage1.coulomb == 0.0
-    assert ARMS["whole orders, friction"].stage2.coulomb > 0
-    assert ARMS["whole orders, friction"].coupling == ARMS["fractional, friction"].coupling == 1.0
+    assert whole.stage1.coulomb == ARM_VARIANTS[MAIN_ARM].stage1.coulomb == 0.0
+    assert ARM_VARIANTS["whole orders, friction"].stage2.coulomb > 0
+    assert ARM_VARIANTS["whole orders, friction"].coupling == ARM_VARIANTS["fractional, friction"].coupling == 1.0
     # The maker's model is the one arm: explicit Euler at 2 ms is what is left.
     run = demo_run("square", parameters=whole, noise=0.0).select(["I1", "theta11", "theta12"])
     exact = ftlm.link_model(stage=1).simulate(run)

@@ -108,7 +108,7 @@ def test_the_whole_arm_is_its_model_with_friction(name):
     parameters, driven = exact(name), currents(1001)
     model = parameters.model(friction=True)
     law = ftlm.flexible_link(stage="both", coupling="simulated", cross_stage="inertial", friction=True)
-    assert model.structure.sticks == law.sticks == (0, 2)
+    assert model.structure.friction_equations == law.friction_equations == (0, 2)
     assert [e.signals for e in model.equations] == [e.signals for e in law.equations]
     blank = ftlm.Run.from_arrays(
         step=STEP, inputs={"I1": driven[:, 0], "I2": driven[:, 1]}, outputs={n: np.zeros(1001) for n in ANGLES}
@@ -167,14 +167,22 @@ def test_the_links_of_a_noisy_run_with_friction_and_offset_are_recovered_with_in
     # Friction, torque and offset are those of hubs: driven by these the links know nothing of them.
     arm = rig.ArmParameters.of("effective")
     run = rig.record(
-        input="multisine", amplitude=(0.6, 0.8), period=8.0, band=(0.125, 8.0), duration=8.0, seed=1, parameters=arm,
+        input="multisine",
+        amplitude=(0.6, 0.8),
+        period=8.0,
+        band=(0.125, 8.0),
+        duration=8.0,
+        seed=1,
+        parameters=arm,
         offset=(0.01, -0.02),
-    )  # fmt: skip
+    )
     hubs, deflections = ("theta11", "theta21"), ("theta12", "theta22")
     driven = ftlm.Run.from_arrays(
-        step=2 * run.step, inputs={n: run[n][::2] for n in hubs}, outputs={n: run[n][::2] for n in deflections},
+        step=2 * run.step,
+        inputs={n: run[n][::2] for n in hubs},
+        outputs={n: run[n][::2] for n in deflections},
         intersample=dict.fromkeys(hubs, "foh"),
-    )  # fmt: skip
+    )
     truth = {**arm.model().orders, **arm.model().coefficients}
     structure = ftlm.flexible_link(stage="both", hub=False, cross_stage="inertial")
     structure = replace(structure, coupling="simulated", initial="rest")
@@ -199,7 +207,7 @@ def test_an_offset_is_of_the_run_and_ends_with_the_amplifiers(tmp_path):
     assert still["theta11"][0] == 0.0
     assert still["theta11"][-1] > 0.01
     assert still["theta21"][-1] < -0.01
-    assert still.about["parameters"]["current_offset"] == list(offset)
+    assert still.metadata["parameters"]["current_offset"] == list(offset)
     assert np.abs(still["I1"]).max() < 0.001
     arm = exact("linear", current_offset=offset).arm(STEP, 5.0)
     for _ in range(100):
@@ -281,9 +289,10 @@ def test_the_whole_arm_is_recovered_from_its_currents(name):
     angles = states_of(parameters, np.repeat(driven, 2, axis=0))[::2]
     angles += 0.003 * angles.std(axis=0) * rng.standard_normal(angles.shape)
     run = ftlm.Run.from_arrays(
-        step=2 * STEP, inputs={"I1": driven[:, 0], "I2": driven[:, 1]},
+        step=2 * STEP,
+        inputs={"I1": driven[:, 0], "I2": driven[:, 1]},
         outputs={n: angles[:, k] for k, n in enumerate(ANGLES)},
-    )  # fmt: skip
+    )
     structure = ftlm.flexible_link(stage="both", coupling="simulated", cross_stage="inertial", friction=True)
     found = ftlm.identify(run, structure)
     assert min(found.fit_percent.values()) > 99.5

@@ -15,8 +15,17 @@ from ftlm.rig import watchdog
 from ftlm.rig.quanser import QuanserBoard
 from quanser_stand_in import Board
 
-CALLS = ("task_read", "watchdog_reload", "write_analog", "write_digital", "task_stop", "task_delete", "watchdog_stop",
-         "watchdog_clear", "close")  # fmt: skip
+CALLS = (
+    "task_read",
+    "watchdog_reload",
+    "write_analog",
+    "write_digital",
+    "task_stop",
+    "task_delete",
+    "watchdog_stop",
+    "watchdog_clear",
+    "close",
+)
 STEPS = ("write", "enable", "stop", "let_expire", "stop_watchdog", "close")
 PAIRS = list(itertools.combinations(CALLS, 2))
 TRIPLES = list(itertools.combinations(CALLS, 3))
@@ -77,12 +86,12 @@ def check_failing(monkeypatch, failing, raises):
     if hardware.in_use and "close" not in failing:
         # Nothing could be confirmed: said, and everything that may still stop the motors is left as it is.
         assert {"write_analog", "write_digital", "watchdog_reload"} <= set(failing)
-        assert link.troubles[-1] == rig_module.LIVE
+        assert link.shutdown_errors[-1] == rig_module.MOTORS_LIVE_MESSAGE
         assert hardware.timeout
     else:
-        assert rig_module.LIVE not in link.troubles
+        assert rig_module.MOTORS_LIVE_MESSAGE not in link.shutdown_errors
     hardware.refuse = {}
-    assert not any("-599" in trouble for trouble in link.troubles)
+    assert not any("-599" in trouble for trouble in link.shutdown_errors)
 
 
 @pytest.mark.parametrize("raises", [False, True])
@@ -114,12 +123,12 @@ def virtual(tmp_path, monkeypatch, failing):
 
     ended(link, False, act)
     monkeypatch.undo()
-    found = watchdog.Page(page)
+    found = watchdog.RegisterPage(page)
     state = found.volts, bool(found.get("enabled")), found.get("timeout") > 0
     found.close()
     with suppress(OSError):
         rig_module.shut_down(board)
-    return state, link.troubles
+    return state, link.shutdown_errors
 
 
 def test_a_virtual_board_that_can_neither_write_nor_disable_is_stopped_by_its_watchdog(tmp_path, monkeypatch):
@@ -135,7 +144,7 @@ def test_no_failing_steps_leave_the_virtual_motors_live(tmp_path, monkeypatch, f
     (volts, enabled, watched), troubles = virtual(tmp_path, monkeypatch, failing)
     if {"write", "enable", "let_expire"} <= set(failing):
         assert watched
-        assert troubles[-1] == rig_module.LIVE
+        assert troubles[-1] == rig_module.MOTORS_LIVE_MESSAGE
     else:
         assert volts == (0.0, 0.0) or not enabled
 
@@ -169,7 +178,7 @@ def interrupted(monkeypatch, number, raises, line):
     assert hardware.timeout is None
     assert [what for what, _, _ in hardware.log[-2:]] == ["watchdog_stop", "close"]
     assert hardware.violations == []
-    assert link.troubles == []
+    assert link.shutdown_errors == []
     assert [signal.getsignal(n) for n in SIGNALS] == before
     return lines, found
 
@@ -254,7 +263,7 @@ def test_a_watchdog_that_died_is_noticed_within_a_sample(tmp_path):
     with pytest.raises(ftlm.RigFault, match="watchdog's process has died"):
         outlived()
     assert len(link.take()) == 21
-    page = watchdog.Page(tmp_path / "page")
+    page = watchdog.RegisterPage(tmp_path / "page")
     assert page.volts == (0.0, 0.0)
     assert not page.get("enabled")
     page.close()
@@ -308,7 +317,7 @@ def test_whatever_ends_a_recording_its_rows_are_kept(monkeypatch, tmp_path, erro
         )
     run = ftlm.load(tmp_path / "run.csv")
     assert run.length >= 32
-    assert type(error).__name__ in run.about["faults"][0]
+    assert type(error).__name__ in run.metadata["faults"][0]
     assert hardware.volts == (0.0, 0.0)
     assert [path.name for path in tmp_path.iterdir()] == ["run.csv"]
 

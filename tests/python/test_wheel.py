@@ -47,15 +47,23 @@ def test_the_check_of_a_wheel_ends_with_its_verdict(tmp_path):
 
 
 SHOWN = {
-    "wheel": "ftlm-1-cp311-abi3-manylinux2014_x86_64.manylinux_2_17_x86_64.whl", "overall_tag": "manylinux_2_17_x86_64",
-    "sym_tag": "manylinux_2_17_x86_64", "versioned_symbols": {"libc.so.6": ["GLIBC_2.17"]}, "external_libs": {},
-    "unsupported_isa": False, "pure": False,
-}  # fmt: skip
+    "wheel": "ftlm-1-cp311-abi3-manylinux2014_x86_64.manylinux_2_17_x86_64.whl",
+    "overall_tag": "manylinux_2_17_x86_64",
+    "sym_tag": "manylinux_2_17_x86_64",
+    "versioned_symbols": {"libc.so.6": ["GLIBC_2.17"]},
+    "external_libs": {},
+    "unsupported_isa": False,
+    "pure": False,
+}
 #: As auditwheel tells it on a machine whose C library is another one.
 SHOWN_MUSL = {
-    **SHOWN, "wheel": "ftlm-1-cp311-abi3-musllinux_1_2_x86_64.whl", "overall_tag": "linux_x86_64",
-    "sym_tag": "musllinux_1_2_x86_64", "versioned_symbols": {}, "external_libs": {"libc.so": None},
-}  # fmt: skip
+    **SHOWN,
+    "wheel": "ftlm-1-cp311-abi3-musllinux_1_2_x86_64.whl",
+    "overall_tag": "linux_x86_64",
+    "sym_tag": "musllinux_1_2_x86_64",
+    "versioned_symbols": {},
+    "external_libs": {"libc.so": None},
+}
 
 
 @pytest.mark.parametrize(

@@ -14,12 +14,12 @@ from typer.main import get_command
 from typer.testing import CliRunner
 
 import ftlm
-from ftlm.cli.framework import OPTIONS, in_options
+from ftlm.cli.framework import OPTION_BY_ARGUMENT, in_options
 from ftlm.cli.main import app
 from ftlm.data.units import TIME_UNITS
-from ftlm.order_search.options import METHODS, USED_BY
+from ftlm.order_search.options import METHOD_CHOICES, METHODS_BY_OPTION
 from ftlm.report.typesetting import equation_html
-from ftlm.structure.equation import numeric
+from ftlm.structure.equation import format_equation
 
 WORDS = "D^1.6 y = a D^0.6 y + c y + b u"
 FREE = "D^alpha y = a D^0.6 y + c y + b u"
@@ -41,7 +41,7 @@ def saved(small_run, tmp_path_factory):
 
 #: A value that each option takes where it is used, in Python and as words of the command line.
 GIVEN = {
-    "lattice": (ftlm.lattice(step=0.2, alpha=(1.4, 1.8)), ["--lattice", "alpha=1.4:1.8:0.2"]),
+    "lattice": (ftlm.order_grid(step=0.2, alpha=(1.4, 1.8)), ["--lattice", "alpha=1.4:1.8:0.2"]),
     "criterion": ("equation-error", ["--criterion", "equation-error"]),
     "norm": ("l2", ["--norm", "l2"]),
     "keep": (3, ["--keep", "3"]),
@@ -62,28 +62,29 @@ EVERYONE = {"runs", "structure", "method", "offset", "m", "threads", "progress"}
 
 
 def test_the_table_knows_every_option_of_identify():
-    assert set(inspect.signature(ftlm.identify).parameters) == EVERYONE | set(USED_BY)
-    assert set(GIVEN) == set(USED_BY)
-    for name, users in USED_BY.items():
-        assert set(users) <= set(METHODS), name
+    assert set(inspect.signature(ftlm.identify).parameters) == EVERYONE | set(METHODS_BY_OPTION)
+    assert set(GIVEN) == set(METHODS_BY_OPTION)
+    for name, users in METHODS_BY_OPTION.items():
+        assert set(users) <= set(METHOD_CHOICES), name
 
 
-@pytest.mark.parametrize("method", METHODS)
+@pytest.mark.parametrize("method", METHOD_CHOICES)
 @pytest.mark.parametrize("option", GIVEN)
 def test_an_option_that_a_method_does_not_use_is_refused_by_name(
     option, method, small_run, saved, tmp_path, monkeypatch
 ):
     monkeypatch.chdir(tmp_path)
     value, words = GIVEN[option]
-    used = method in USED_BY[option]
+    used = method in METHODS_BY_OPTION[option]
     if used:
         # What is used must change nothing into a refusal; that it acts is tested where it is made.
         if option in ("executor", "store", "genetic", "reference") or method == "genetic":
             return
-        beside = {"lattice": GIVEN["lattice"][0]} if method in USED_BY["lattice"] else {}
-        assert ftlm.identify(
-            small_run, ftlm.equation(FREE), method=method, m=64, **{**beside, option: value}
-        ).method == method  # fmt: skip
+        beside = {"lattice": GIVEN["lattice"][0]} if method in METHODS_BY_OPTION["lattice"] else {}
+        assert (
+            ftlm.identify(small_run, ftlm.equation(FREE), method=method, m=64, **{**beside, option: value}).method
+            == method
+        )
         return
     with pytest.raises(ftlm.ModelError, match=rf"^{option}= is not used by method='{method}'; leave it out, or use "):
         ftlm.identify(small_run, ftlm.equation(FREE), method=method, **{option: value})
@@ -98,8 +99,15 @@ def test_an_option_that_a_method_does_not_use_is_refused_by_name(
 
 def test_the_default_value_given_in_so_many_words_is_refused_too(small_run, saved):
     structure = ftlm.equation(WORDS)
-    defaults = {"criterion": "output-error", "norm": "l1", "innovation_length": 7, "prior_covariance": 1.0,
-                "rows": "haar", "keep": 20, "lattice": ftlm.Lattice()}  # fmt: skip
+    defaults = {
+        "criterion": "output-error",
+        "norm": "l1",
+        "innovation_length": 7,
+        "prior_covariance": 1.0,
+        "rows": "haar",
+        "keep": 20,
+        "lattice": ftlm.OrderGrid(),
+    }
     for name, value in defaults.items():
         with pytest.raises(ftlm.ModelError, match=f"^{name}= is not used by method='output-error'"):
             ftlm.identify(small_run, structure, **{name: value})
@@ -121,9 +129,18 @@ def test_options_of_a_search_need_a_free_order(small_run):
 
 @pytest.mark.parametrize(
     "words",
-    [["--friction"], ["--cross-stage"], ["--laws", "orders"], ["--laws", "none"], ["--coupling", "measured"],
-     ["--input-order", "derived"], ["--stock-filter"], ["--inertial"], ["--cross-sensitivity"]],
-)  # fmt: skip
+    [
+        ["--friction"],
+        ["--cross-stage"],
+        ["--laws", "orders"],
+        ["--laws", "none"],
+        ["--coupling", "measured"],
+        ["--input-order", "derived"],
+        ["--stock-filter"],
+        ["--inertial"],
+        ["--cross-sensitivity"],
+    ],
+)
 @pytest.mark.parametrize("command", ["identify", "search"])
 def test_options_of_the_flexible_link_are_refused_with_an_equation(command, words, saved):
     done = run_command(command, saved, "--structure", FREE, *words)
@@ -149,7 +166,7 @@ def test_a_delay_is_printed_wherever_the_equation_is(small_run):
     plain = re.sub(r"<[^>]*>", "", str(equation_html(model.equations[0], structure.delay)))
     assert plain.count("u(t−0.035s)") == 2
     assert re.sub(r"<[^>]*>", "", model._repr_html_()).count("u(t−0.035s)") == 2
-    assert "(t" not in numeric(model.equations[0])
+    assert "(t" not in format_equation(model.equations[0])
     found = ftlm.identify(small_run, ftlm.equation(WORDS).with_delays({"u": 0.04}), method="least-squares")
     assert "u(t - 0.04 s)" in str(found)
     assert "u(t - 0.04 s)" in found.to_dict()["equations"]["y"]
@@ -170,10 +187,23 @@ SIGNALS = {"inputs": {"u": "u"}, "outputs": {"y": "y"}}
 
 @pytest.mark.parametrize(
     ("header", "unit"),
-    [("time [ms]", "ms"), ("time (ms)", "ms"), ("Time_ms", "ms"), ("time/ms", "ms"), ("t [us]", "us"),
-     ("t [µs]", "us"), ("t_μs", "us"), ("time [min]", "min"), ("t_h", "h"), ("time [msec]", "ms"), ("t (s)", "s"),
-     ("time_s", "s"), ("T", "s"), ("seconds", "s")],
-)  # fmt: skip
+    [
+        ("time [ms]", "ms"),
+        ("time (ms)", "ms"),
+        ("Time_ms", "ms"),
+        ("time/ms", "ms"),
+        ("t [us]", "us"),
+        ("t [µs]", "us"),
+        ("t_μs", "us"),
+        ("time [min]", "min"),
+        ("t_h", "h"),
+        ("time [msec]", "ms"),
+        ("t (s)", "s"),
+        ("time_s", "s"),
+        ("T", "s"),
+        ("seconds", "s"),
+    ],
+)
 @pytest.mark.parametrize("named", [True, False])
 def test_a_header_states_the_unit_of_time(header, unit, named, tmp_path):
     path = table(tmp_path / "r.csv", header, TIME_UNITS[unit])
@@ -248,7 +278,7 @@ def literals():
 
 
 def test_no_message_of_a_command_names_an_argument_of_python():
-    pattern = re.compile(r"(?<![\w'\"])(" + "|".join(OPTIONS) + r")=")
+    pattern = re.compile(r"(?<![\w'\"])(" + "|".join(OPTION_BY_ARGUMENT) + r")=")
     found = [(name, text) for name, text in literals() if pattern.search(text)]
     assert len(found) > 20
     left = [(name, in_options(text)) for name, text in found if pattern.search(in_options(text))]

@@ -26,9 +26,31 @@ DIGITS = 60
 
 # Grid of the orders: both ends, both sides of every integer (where v_n changes character), and a few in between.
 KERNEL_ORDERS = [
-    1e-3, 0.05, 0.1, 0.15, 0.3, 0.5, 0.75, 0.95, 0.999, 1.0, 1.001, 1.05,
-    1.3, 1.5, 1.85, 1.95, 2.0, 2.05, 2.2, 2.5, 2.75, 2.95, 2.999, 3.0,
-]  # fmt: skip
+    1e-3,
+    0.05,
+    0.1,
+    0.15,
+    0.3,
+    0.5,
+    0.75,
+    0.95,
+    0.999,
+    1.0,
+    1.001,
+    1.05,
+    1.3,
+    1.5,
+    1.85,
+    1.95,
+    2.0,
+    2.05,
+    2.2,
+    2.5,
+    2.75,
+    2.95,
+    2.999,
+    3.0,
+]
 # Dense where a series in 1/n converges slowly, then both sides of the powers of two where block sizes change.
 KERNEL_INDICES = sorted(
     {*range(1, 17), 24, 50, 99, 100, 101, 200, 500, 1000, 1999, 2000, 2001, 5000, 10_000, 50_000, 100_000, 500_000}
@@ -42,9 +64,50 @@ RELAXATION_PULSES = [512, 2048, 8192]
 # Pulses are chosen by the time they contain, so that the three grids are compared at the same places. 1.0035 lies in
 # the first pulse whose midpoint is past t = 1 on two of the grids, where the error of alpha = 0.5 is largest, and
 # 5.054 in the pulse where the error of alpha = 1.8 is.
-RELAXATION_TIMES = [1.001, 1.0035, 1.01, 1.03, 1.06, 1.1, 1.15, 1.2, 1.3, 1.4, 1.5, 1.6, 1.8, 2.0, 2.2, 2.4, 2.6, 2.8,
-                    3.0, 3.25, 3.5, 3.75, 4.0, 4.25, 4.5, 4.75, 5.0, 5.054, 5.1, 5.25, 5.5, 5.75, 6.0, 6.5, 7.0, 7.5,
-                    8.0, 8.5, 9.0, 9.5, 9.9, 9.9995]  # fmt: skip
+RELAXATION_TIMES = [
+    1.001,
+    1.0035,
+    1.01,
+    1.03,
+    1.06,
+    1.1,
+    1.15,
+    1.2,
+    1.3,
+    1.4,
+    1.5,
+    1.6,
+    1.8,
+    2.0,
+    2.2,
+    2.4,
+    2.6,
+    2.8,
+    3.0,
+    3.25,
+    3.5,
+    3.75,
+    4.0,
+    4.25,
+    4.5,
+    4.75,
+    5.0,
+    5.054,
+    5.1,
+    5.25,
+    5.5,
+    5.75,
+    6.0,
+    6.5,
+    7.0,
+    7.5,
+    8.0,
+    8.5,
+    9.0,
+    9.5,
+    9.9,
+    9.9995,
+]
 
 
 def rounded(values: Iterable[mp.mpf]) -> list[float]:

@@ -10,11 +10,11 @@ from typing import Any, Literal
 import numpy as np
 
 from ftlm._core import __version__
-from ftlm.analysis.frequency_response import check_unlimited, transfer_functions
+from ftlm.analysis.frequency_response import check_no_input_nonlinearity, transfer_functions
 from ftlm.analysis.rational_approximation import approximate, identifier
 from ftlm.errors import ModelError
-from ftlm.model.model import Solved
-from ftlm.structure.equation import numeric
+from ftlm.model.model import ModelData
+from ftlm.structure.equation import format_equation
 from ftlm.structure.order import MAX_ORDER
 from ftlm.structure.parser import equation
 from ftlm.structure.structure import Structure
@@ -27,7 +27,7 @@ def _comment(text: str, mark: str) -> str:
     return "\n".join(f"{mark} {''.join(c if c.isprintable() else '?' for c in line)}" for line in lines)
 
 
-def json_text(model: Solved) -> str:
+def json_text(model: ModelData) -> str:
     """Return the transfer functions of a model as JSON, exact in powers and coefficients.
 
     Parameters
@@ -40,7 +40,7 @@ def json_text(model: Solved) -> str:
     ModelError
         An input that saturates or has a dead zone, or friction: there is no transfer function.
     """
-    check_unlimited(model, "a transfer function")
+    check_no_input_nonlinearity(model, "a transfer function")
     transfer = transfer_functions(model)
     document = {
         "format": "ftlm-transfer-functions",
@@ -61,7 +61,7 @@ def json_text(model: Solved) -> str:
     return json.dumps(document, indent=1, ensure_ascii=False, allow_nan=False) + "\n"
 
 
-def matlab_text(model: Solved) -> str:
+def matlab_text(model: ModelData) -> str:
     """Return a MATLAB script with the transfer functions as vectors, and as FOMCON ``fotf`` objects if available.
 
     Parameters
@@ -74,7 +74,7 @@ def matlab_text(model: Solved) -> str:
     ModelError
         As :func:`json_text`.
     """
-    check_unlimited(model, "a transfer function")
+    check_no_input_nonlinearity(model, "a transfer function")
     transfer = transfer_functions(model)
 
     def vector(values: Sequence[float]) -> str:
@@ -82,7 +82,7 @@ def matlab_text(model: Solved) -> str:
 
     lines = [
         _comment(f"{model.structure.name}, written by ftlm {__version__}", "%"),
-        *(_comment(numeric(e, model.structure.acting(".6g")), "%") for e in model.equations),
+        *(_comment(format_equation(e, model.structure.describe_inputs(".6g")), "%") for e in model.equations),
         "% G_y_u = (b(1)*s^nb(1) + ...)/(a(1)*s^na(1) + ...)*exp(-s*delay); SI units.",
         "% FOMCON (https://fomcon.net) makes fotf objects of them; without it the vectors remain.",
     ]
@@ -112,7 +112,7 @@ def matlab_text(model: Solved) -> str:
     return "\n".join(lines) + "\n"
 
 
-def control_text(model: Solved, *, band: tuple[float, float], order: int = 5) -> str:
+def control_text(model: ModelData, *, band: tuple[float, float], order: int = 5) -> str:
     """Return a Python script that builds the python-control system without ftlm.
 
     Parameters
@@ -137,7 +137,7 @@ def control_text(model: Solved, *, band: tuple[float, float], order: int = 5) ->
 
     lines = [
         _comment(f"{model.structure.name}, written by ftlm {__version__}", "#"),
-        *(_comment(numeric(e, model.structure.acting(".6g")), "#") for e in model.equations),
+        *(_comment(format_equation(e, model.structure.describe_inputs(".6g")), "#") for e in model.equations),
         *(_comment(line, "#") for line in str(near).splitlines()),
         "import control",
         "import numpy as np",
@@ -153,7 +153,11 @@ def control_text(model: Solved, *, band: tuple[float, float], order: int = 5) ->
 
 
 def export_text(
-    model: Solved, to: Literal["control", "matlab", "json"], *, band: tuple[float, float] | None = None, order: int = 5
+    model: ModelData,
+    to: Literal["control", "matlab", "json"],
+    *,
+    band: tuple[float, float] | None = None,
+    order: int = 5,
 ) -> str:
     """Return a model as text for another tool; raise ModelError for an unknown tool or a missing band."""
     if to == "json":
@@ -168,8 +172,8 @@ def export_text(
 
 
 #: Size of a Markov parameter, relative to its factors, below which it is rounding error.
-ROUNDING = 1e-12
-_LABEL = re.compile(r"([A-Za-z]+)\[(\d+)\]")
+MARKOV_TOLERANCE = 1e-12
+_LABEL_PATTERN = re.compile(r"([A-Za-z]+)\[(\d+)\]")
 
 
 def structure_of(system: Any, inputs: Sequence[str] | None = None, outputs: Sequence[str] | None = None) -> Structure:
@@ -179,9 +183,9 @@ def structure_of(system: Any, inputs: Sequence[str] | None = None, outputs: Sequ
             f"the system is sampled (dt = {system.dt}); an equation is of continuous time: design it there"
         )
     if hasattr(system, "A"):
-        parts = _of_states(*(np.asarray(getattr(system, n), dtype=float) for n in "ABCD"))
+        parts = _from_state_space(*(np.asarray(getattr(system, n), dtype=float) for n in "ABCD"))
     elif hasattr(system, "num") and hasattr(system, "den"):
-        parts = _of_fractions(system.num, system.den)
+        parts = _from_fractions(system.num, system.den)
     else:
         raise ModelError(
             f"{type(system).__name__} is no system of python-control with equations; for a measured response use "
@@ -193,10 +197,10 @@ def structure_of(system: Any, inputs: Sequence[str] | None = None, outputs: Sequ
     if twice:
         raise ModelError(f"{', '.join(twice)}: input and output at once; pass inputs= and outputs= with other names")
     rows = zip(results, parts, strict=True)
-    return equation("\n".join(_written(name, signals, *part) for name, part in rows), coupling="measured")
+    return equation("\n".join(_equation_text(name, signals, *part) for name, part in rows), coupling="measured")
 
 
-def _written(output: str, inputs: Sequence[str], bottom: Floats, tops: Sequence[Floats]) -> str:
+def _equation_text(output: str, inputs: Sequence[str], bottom: Floats, tops: Sequence[Floats]) -> str:
     """Return an equation D^n y = … as text, from a denominator and one numerator per input, highest powers first."""
     order = bottom.size - 1
     if not 0 < order <= MAX_ORDER:
@@ -212,7 +216,7 @@ def _written(output: str, inputs: Sequence[str], bottom: Floats, tops: Sequence[
     return f"D^{order} {output} = " + " + ".join(words).replace("+ -", "- ")
 
 
-def _of_fractions(tops: Any, bottoms: Any) -> list[tuple[Floats, list[Floats]]]:
+def _from_fractions(tops: Any, bottoms: Any) -> list[tuple[Floats, list[Floats]]]:
     """Return a common monic denominator of each output, and the numerators over it."""
     found = []
     for top, bottom in zip(tops, bottoms, strict=True):
@@ -238,7 +242,7 @@ def _product(factors: Sequence[Floats]) -> Floats:
     return out
 
 
-def _of_states(a: Floats, b: Floats, c: Floats, d: Floats) -> list[tuple[Floats, list[Floats]]]:
+def _from_state_space(a: Floats, b: Floats, c: Floats, d: Floats) -> list[tuple[Floats, list[Floats]]]:
     """Return C adj(sI - A) B + D det(sI - A) by Leverrier's recursion, without leading rounding errors."""
     count = a.shape[0]
     bottom, powers = [1.0], [np.eye(count)]
@@ -256,7 +260,7 @@ def _of_states(a: Floats, b: Floats, c: Floats, d: Floats) -> list[tuple[Floats,
             if d[i, j] == 0.0:
                 size = float(np.linalg.norm(row) * np.linalg.norm(b[:, j]))
                 answers = [abs(float(row @ np.linalg.matrix_power(a, k) @ b[:, j])) for k in range(count)]
-                seen = [k for k, v in enumerate(answers) if v > ROUNDING * size * scale**k]
+                seen = [k for k, v in enumerate(answers) if v > MARKOV_TOLERANCE * size * scale**k]
                 top[: 1 + (seen[0] if seen else count)] = 0.0
             tops.append(top)
         found.append((np.array(bottom), tops))
@@ -271,5 +275,5 @@ def _names(what: str, given: Sequence[str] | None, labels: Sequence[str] | None,
             raise ModelError(f"{what}: {len(names)} given, the system has {count}")
         return names
     names = list(labels) if labels else [f"{what[0]}[{k}]" for k in range(count)]
-    plain = [_LABEL.fullmatch(n) for n in names]
+    plain = [_LABEL_PATTERN.fullmatch(n) for n in names]
     return [n if m is None else m[1] + (m[2] if count > 1 else "") for n, m in zip(names, plain, strict=True)]

@@ -13,34 +13,35 @@ from numpy.typing import ArrayLike, NDArray
 
 from ftlm.data.run import Run
 from ftlm.errors import DataError, ModelError
-from ftlm.model.model import Solved
+from ftlm.model.model import ModelData
 from ftlm.simulation.discretization import check_linear
 from ftlm.simulation.simulate import simulate
 from ftlm.structure.equation import Equation, Term
-from ftlm.structure.input_nonlinearity import WORDS
+from ftlm.structure.input_nonlinearity import INPUT_EFFECT_LABELS
 from ftlm.structure.order import Order
 from ftlm.utils.validation import Complex, Floats, check_choice
 
 #: A sum of coefficient * s^power, by power.
 Polynomial: TypeAlias = dict[float, float]
 #: Difference below which two powers of s count as equal.
-GRAIN = 1e-9
+POWER_TOLERANCE = 1e-9
 #: Size of a sum of coefficients, relative to its summands, below which it is rounding error.
-CANCELLED = 1e-13
+CANCELLATION_TOLERANCE = 1e-13
 #: Relative step of the numerical derivatives of the delta method.
-DELTA = 1e-6
+DERIVATIVE_STEP_RATIO = 1e-6
 
 
-def check_unlimited(model: Solved, what: str) -> None:
+def check_no_input_nonlinearity(model: ModelData, what: str) -> None:
     """Raise ModelError for a saturation or a dead zone in a linear analysis."""
     for limit in model.structure.limits:
         raise ModelError(
-            f"{limit.signal} passes a {WORDS[limit.law]} before it acts, which {what} does not know; use free runs "
+            f"{limit.signal} passes a {INPUT_EFFECT_LABELS[limit.law]} before it acts, which {what} does not know; "
+            "use free runs "
             "(simulate, compare), or a model of the equation without it"
         )
 
 
-def response_inputs(model: Solved, *, coupled: bool) -> tuple[str, ...]:
+def response_inputs(model: ModelData, *, coupled: bool) -> tuple[str, ...]:
     """Input signals of the response: all but the outputs; of uncoupled equations, other outputs too."""
     if coupled:
         return tuple(s for s in model.structure.signals if s not in model.outputs)
@@ -50,18 +51,18 @@ def response_inputs(model: Solved, *, coupled: bool) -> tuple[str, ...]:
 
 def _add(into: Polynomial, other: Polynomial, factor: float = 1.0) -> None:
     for power, value in other.items():
-        at = next((p for p in into if abs(p - power) < GRAIN), power)
+        at = next((p for p in into if abs(p - power) < POWER_TOLERANCE), power)
         into[at] = into.get(at, 0.0) + factor * value
 
 
-def _times(a: Polynomial, b: Polynomial) -> Polynomial:
+def _multiply(a: Polynomial, b: Polynomial) -> Polynomial:
     out: Polynomial = {}
     for (p, x), (q, y) in itertools.product(a.items(), b.items()):
         _add(out, {round(p + q, 9): x * y})
     return out
 
 
-def row_of(item: Equation, names: Sequence[str]) -> tuple[list[Polynomial], dict[str, Polynomial]]:
+def equation_polynomials(item: Equation, names: Sequence[str]) -> tuple[list[Polynomial], dict[str, Polynomial]]:
     """Return polynomials of D^alpha y minus own and coupled terms, by output, and those of every other signal."""
     check_linear([item], "a frequency response")
     left: list[Polynomial] = [{} for _ in names]
@@ -87,10 +88,10 @@ def determinant(matrix: list[list[Polynomial]]) -> Polynomial:
             sign = -sign if order[i] > order[j] else sign
         product: Polynomial = {0.0: 1.0}
         for i, j in enumerate(order):
-            product = _times(product, matrix[i][j])
+            product = _multiply(product, matrix[i][j])
         _add(out, product, sign)
         _add(size, {p: abs(v) for p, v in product.items()})
-    return {p: v for p, v in sorted(out.items()) if abs(v) > CANCELLED * size[p]}
+    return {p: v for p, v in sorted(out.items()) if abs(v) > CANCELLATION_TOLERANCE * size[p]}
 
 
 @dataclass(frozen=True)
@@ -116,12 +117,12 @@ class TransferFunctions:
     delay: dict[str, float]
 
 
-def systems(model: Solved, *, coupled: bool) -> list[tuple[str, ...]]:
+def coupled_outputs(model: ModelData, *, coupled: bool) -> list[tuple[str, ...]]:
     """Groups of outputs whose equations are solved together."""
     return [model.outputs] if coupled else [(o,) for o in model.outputs]
 
 
-def transfer_functions(model: Solved, *, coupling: str = "simulated") -> TransferFunctions:
+def transfer_functions(model: ModelData, *, coupling: str = "simulated") -> TransferFunctions:
     """Transfer functions of a model by Cramer's rule, without the sensor filter.
 
     Parameters
@@ -145,24 +146,24 @@ def transfer_functions(model: Solved, *, coupling: str = "simulated") -> Transfe
     inputs = response_inputs(model, coupled=coupled)
     denominator: dict[str, tuple[tuple[float, float], ...]] = {}
     numerators: dict[tuple[str, str], tuple[tuple[float, float], ...]] = {}
-    for names in systems(model, coupled=coupled):
+    for names in coupled_outputs(model, coupled=coupled):
         items = [e for e in model.equations if e.output in names]
-        rows = [row_of(e, names) for e in items]
+        rows = [equation_polynomials(e, names) for e in items]
         matrix = [left for left, _ in rows]
         bottom = determinant(matrix)
         if not bottom:
             raise ModelError(f"the equations of {', '.join(names)} cannot be solved for them: their determinant is 0")
         for j, output in enumerate(names):
-            denominator[output] = _written(bottom)
+            denominator[output] = _coefficient_pairs(bottom)
             for signal in inputs:
                 column = [right.get(signal, {}) for _, right in rows]
                 replaced = [[*row[:j], column[i], *row[j + 1 :]] for i, row in enumerate(matrix)]
-                numerators[output, signal] = _written(determinant(replaced))
+                numerators[output, signal] = _coefficient_pairs(determinant(replaced))
     delay = {s: model.structure.delay.get(s, 0.0) for s in inputs}
     return TransferFunctions(model.outputs, inputs, denominator, numerators, delay)
 
 
-def _written(polynomial: Polynomial) -> tuple[tuple[float, float], ...]:
+def _coefficient_pairs(polynomial: Polynomial) -> tuple[tuple[float, float], ...]:
     return tuple((v, p) for p, v in sorted(polynomial.items(), reverse=True))
 
 
@@ -172,7 +173,7 @@ def is_coupled(coupling: str) -> bool:
     return coupling == "simulated"
 
 
-def frequency_response(model: Solved, w: ArrayLike, *, coupling: str = "simulated", sensor: bool = True) -> Complex:
+def frequency_response(model: ModelData, w: ArrayLike, *, coupling: str = "simulated", sensor: bool = True) -> Complex:
     """Exact frequency response with fractional orders.
 
     Parameters
@@ -201,7 +202,7 @@ def frequency_response(model: Solved, w: ArrayLike, *, coupling: str = "simulate
     ModelError
         Another coupling, an input that saturates or has a dead zone.
     """
-    check_unlimited(model, "a frequency response")
+    check_no_input_nonlinearity(model, "a frequency response")
     coupled = is_coupled(coupling)
     omega = np.asarray(w, dtype=np.float64)
     if omega.ndim != 1 or omega.size == 0:
@@ -215,12 +216,12 @@ def frequency_response(model: Solved, w: ArrayLike, *, coupling: str = "simulate
     inputs = response_inputs(model, coupled=coupled)
     out = np.zeros((len(model.outputs), len(inputs), omega.size), dtype=np.complex128)
     s = 1j * omega
-    for names in systems(model, coupled=coupled):
+    for names in coupled_outputs(model, coupled=coupled):
         items = [e for e in model.equations if e.output in names]
         a = np.zeros((omega.size, len(names), len(names)), dtype=np.complex128)
         b = np.zeros((omega.size, len(names), len(inputs)), dtype=np.complex128)
         for i, item in enumerate(items):
-            left, right = row_of(item, names)
+            left, right = equation_polynomials(item, names)
             # Divided by s^alpha at high and left as it is at low frequencies, numbers keep their range.
             scale = np.maximum(omega, 1.0) ** -item.order.constant
             for j, polynomial in enumerate(left):
@@ -258,7 +259,7 @@ def value_at(polynomial: Polynomial, s: NDArray[Any]) -> Complex:
     return total
 
 
-def response_deviation(model: Solved, w: ArrayLike, *, coupling: str = "simulated") -> tuple[Floats, Floats]:
+def response_deviation(model: ModelData, w: ArrayLike, *, coupling: str = "simulated") -> tuple[Floats, Floats]:
     """Standard deviations of the frequency response, from the covariance of the model by the delta method.
 
     Parameters
@@ -285,15 +286,17 @@ def response_deviation(model: Solved, w: ArrayLike, *, coupling: str = "simulate
             "and without a term whose interval is infinite"
         )
     centre = frequency_response(model, w, coupling=coupling)
-    values = model_numbers(model)
+    values = parameter_vector(model)
     derivative = np.zeros((values.size, *centre.shape), dtype=np.complex128)
     for k, value in enumerate(values):
-        step = DELTA * max(abs(value), 1e-3)
+        step = DERIVATIVE_STEP_RATIO * max(abs(value), 1e-3)
         if not np.any(covariance[k]):
             continue
         above, below = values.copy(), values.copy()
         above[k], below[k] = value + step, value - step
-        higher, lower = (frequency_response(with_numbers(model, v), w, coupling=coupling) for v in (above, below))
+        higher, lower = (
+            frequency_response(with_parameter_vector(model, v), w, coupling=coupling) for v in (above, below)
+        )
         with np.errstate(divide="ignore", invalid="ignore"):
             derivative[k] = (higher - lower) / (2 * step) / centre
     matrix = np.asarray(covariance, dtype=np.float64)
@@ -302,7 +305,7 @@ def response_deviation(model: Solved, w: ArrayLike, *, coupling: str = "simulate
     return gain, phase
 
 
-def model_numbers(model: Solved) -> Floats:
+def parameter_vector(model: ModelData) -> Floats:
     """All numbers of a model as a vector: alpha of each equation, then order and coefficient of each term."""
     numbers: list[float] = []
     for item in model.equations:
@@ -310,7 +313,7 @@ def model_numbers(model: Solved) -> Floats:
     return np.array(numbers)
 
 
-def with_numbers(model: Solved, numbers: Floats) -> Solved:
+def with_parameter_vector(model: ModelData, numbers: Floats) -> ModelData:
     """Return the model with other numbers, in the order of :func:`parameter_vector`."""
     at = iter(numbers.tolist())
     equations = []
@@ -320,18 +323,18 @@ def with_numbers(model: Solved, numbers: Floats) -> Solved:
         terms = [
             replace(t, order=replace(t.order, constant=next(at)), coefficient=next(at) / t.factor) for t in item.terms
         ]
-        equations.append(_unchecked(item, alpha, tuple(terms)))
+        equations.append(_replace_unchecked(item, alpha, tuple(terms)))
     return replace(model, structure=replace(model.structure, equations=tuple(equations)))
 
 
-def _unchecked(item: Equation, order: Order, terms: tuple[Term, ...]) -> Equation:
+def _replace_unchecked(item: Equation, order: Order, terms: tuple[Term, ...]) -> Equation:
     """Return an equation without range checks of its orders, for derivatives at an end of the range."""
     new = copy.copy(item)
     vars(new).update(order=order, terms=terms)
     return new
 
 
-def step_response(model: Solved, time: ArrayLike, *, tolerance: float = 1e-6) -> Floats:
+def step_response(model: ModelData, time: ArrayLike, *, tolerance: float = 1e-6) -> Floats:
     """Response of every output to a unit step of every input, from rest.
 
     Parameters
@@ -357,7 +360,7 @@ def step_response(model: Solved, time: ArrayLike, *, tolerance: float = 1e-6) ->
     ConvergenceError
         A model so unstable that the response leaves the range of numbers.
     """
-    check_unlimited(model, "a step response")
+    check_no_input_nonlinearity(model, "a step response")
     t = np.asarray(time, dtype=np.float64)
     if t.ndim != 1 or t.size < 3 or not np.all(np.isfinite(t)) or t[0] != 0:
         raise DataError("time must be a vector of at least three instants [s] that begins with 0, such as numpy.arange")

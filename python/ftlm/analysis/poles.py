@@ -11,37 +11,37 @@ from fractions import Fraction
 import numpy as np
 
 from ftlm.analysis.frequency_response import (
-    GRAIN,
+    POWER_TOLERANCE,
     Polynomial,
-    check_unlimited,
+    check_no_input_nonlinearity,
+    coupled_outputs,
     determinant,
+    equation_polynomials,
     is_coupled,
-    model_numbers,
+    parameter_vector,
     response_inputs,
-    row_of,
-    systems,
     transfer_functions,
-    with_numbers,
+    with_parameter_vector,
 )
 from ftlm.errors import ModelError
-from ftlm.model.model import Solved, check_solved
+from ftlm.model.model import ModelData, check_model
 from ftlm.utils.formatting import with_error
 from ftlm.utils.statistics import NORMAL_95
 from ftlm.utils.validation import Complex, Floats
 
 #: Maximum degree of a polynomial in s^q with accurate roots in double precision.
-LARGEST_DEGREE = 100
+MAX_ROOT_DEGREE = 100
 #: Minimum common base of orders.
-SMALLEST_BASE = 0.01
+MIN_ORDER_BASE = 0.01
 #: Relative size of all other terms at which the lowest or the highest power dominates.
-DECIDED = 1e-3
+DOMINANCE_RATIO = 1e-3
 #: Maximum angle between two points of the Nyquist curve, and maximum number of points.
-LARGEST_TURN = 0.2
-MOST_POINTS = 200_000
+MAX_TURN_RAD = 0.2
+MAX_NYQUIST_POINTS = 200_000
 #: Logarithm of the frequency used in case of overflow.
-FARTHEST_LOG = 600.0
+OVERFLOW_LOG_FREQUENCY = 600.0
 #: Distance of the Nyquist curve from 0, relative to its terms, below which a pole is on the axis.
-ON_AXIS = 1e-9
+AXIS_TOLERANCE = 1e-9
 
 
 @dataclass(frozen=True)
@@ -88,17 +88,17 @@ class Stability:
         return f"{verdict} ({how})"
 
 
-def characteristic(model: Solved, *, coupled: bool) -> list[Polynomial]:
+def characteristic(model: ModelData, *, coupled: bool) -> list[Polynomial]:
     """Characteristic sums of c s^p, one for each set of equations that act together."""
     return [
-        determinant([row_of(e, names)[0] for e in model.equations if e.output in names])
-        for names in systems(model, coupled=coupled)
+        determinant([equation_polynomials(e, names)[0] for e in model.equations if e.output in names])
+        for names in coupled_outputs(model, coupled=coupled)
     ]
 
 
 def common_base(powers: Sequence[float]) -> float | None:
     """Largest q of which all powers are multiples, or None where it is below 0.01."""
-    powers = [p for p in powers if abs(p) > GRAIN]
+    powers = [p for p in powers if abs(p) > POWER_TOLERANCE]
     fractions = [Fraction(p).limit_denominator(1000) for p in powers]
     if any(abs(float(f) - p) > 1e-8 for f, p in zip(fractions, powers, strict=True)):
         return None
@@ -106,16 +106,16 @@ def common_base(powers: Sequence[float]) -> float | None:
     base = Fraction(math.gcd(*(int(f * common) for f in fractions)), common)
     # Above 1 one root would stand for several poles.
     base /= max(math.ceil(base), 1)
-    return float(base) if base * 1000 >= 999 * SMALLEST_BASE else None
+    return float(base) if base * 1000 >= 999 * MIN_ORDER_BASE else None
 
 
 def roots_in_base(polynomial: Polynomial) -> tuple[float, Complex] | None:
     """Base q and the roots in s^q of a commensurate polynomial freed of its lowest power; None where there are none."""
     lowest, highest = min(polynomial), max(polynomial)
     base = common_base([p - lowest for p in polynomial])
-    if base is None or (highest - lowest) / base > LARGEST_DEGREE:
+    if base is None or (highest - lowest) / base > MAX_ROOT_DEGREE:
         return None
-    if highest - lowest < GRAIN:
+    if highest - lowest < POWER_TOLERANCE:
         return base or 1.0, np.empty(0, dtype=np.complex128)
     degree = round((highest - lowest) / base)
     # In units of the mean frequency all coefficients are of a size.
@@ -127,7 +127,7 @@ def roots_in_base(polynomial: Polynomial) -> tuple[float, Complex] | None:
     return base, np.asarray(np.roots(coefficients) * unit**base, dtype=np.complex128)
 
 
-def poles(model: Solved, *, coupling: str = "simulated") -> Complex:
+def poles(model: ModelData, *, coupling: str = "simulated") -> Complex:
     """Poles of a commensurate model on the principal sheet.
 
     Parameters
@@ -159,14 +159,14 @@ def poles(model: Solved, *, coupling: str = "simulated") -> Complex:
         base, values = roots
         angle = np.angle(values)
         kept = values[np.abs(angle) < base * math.pi - 1e-12]
-        if abs(base - 1) < GRAIN:
+        if abs(base - 1) < POWER_TOLERANCE:
             kept = values  # whole orders have one sheet, the negative real axis included
         # Principal logarithm: arg s = arg(lambda) / q lies within (-pi, pi) by the choice above.
         every += (np.abs(kept) ** (1 / base) * np.exp(1j * np.angle(kept) / base)).tolist()
     return np.array(sorted(every, key=lambda s: (abs(s), s.imag)), dtype=np.complex128)
 
 
-def stability(model: Solved, *, coupling: str = "simulated") -> Stability:
+def stability(model: ModelData, *, coupling: str = "simulated") -> Stability:
     """Whether a model is stable: by its poles where orders are commensurate, else by the argument principle.
 
     Parameters
@@ -223,7 +223,7 @@ def right_zeros(polynomial: Polynomial, angle: float = math.pi / 2) -> tuple[flo
     Another angle [rad] counts the zeros with a smaller argument; on the surface of ln s it may exceed pi.
     """
     lowest, highest = min(polynomial), max(polynomial)
-    if highest - lowest < GRAIN:
+    if highest - lowest < POWER_TOLERANCE:
         return 0.0, False
     powers = np.array(list(polynomial))
     values = np.array(list(polynomial.values()))
@@ -236,11 +236,11 @@ def right_zeros(polynomial: Polynomial, angle: float = math.pi / 2) -> tuple[flo
     try:
         centre = abs(polynomial[lowest] / polynomial[highest]) ** (1 / (highest - lowest))
     except OverflowError:  # coefficients that ran away, over powers close to one another
-        centre = math.exp(FARTHEST_LOG)
+        centre = math.exp(OVERFLOW_LOG_FREQUENCY)
     low, high = centre, centre
-    while shares(lowest, low) > DECIDED and low > 1e-300:
+    while shares(lowest, low) > DOMINANCE_RATIO and low > 1e-300:
         low /= 10
-    while shares(highest, high) > DECIDED and high < 1e300:
+    while shares(highest, high) > DOMINANCE_RATIO and high < 1e300:
         high *= 10
     log_omega = np.linspace(math.log(low), math.log(high), 2001)
 
@@ -254,17 +254,17 @@ def right_zeros(polynomial: Polynomial, angle: float = math.pi / 2) -> tuple[flo
         return np.asarray(np.einsum("j,jk->k", turns, sizes) / total), total
 
     points, _ = curve(log_omega)
-    while log_omega.size < MOST_POINTS:
+    while log_omega.size < MAX_NYQUIST_POINTS:
         turn = np.abs(np.angle(points[1:] * np.conj(points[:-1])))
-        wide = np.flatnonzero(turn > LARGEST_TURN)
-        if not wide.size or float(np.min(np.abs(points))) < ON_AXIS:
+        wide = np.flatnonzero(turn > MAX_TURN_RAD)
+        if not wide.size or float(np.min(np.abs(points))) < AXIS_TOLERANCE:
             break
         middle = (log_omega[wide] + log_omega[wide + 1]) / 2
         if np.any(np.diff(np.concatenate([log_omega[wide], middle]).reshape(2, -1), axis=0) <= 0):
             break
         log_omega = np.sort(np.concatenate([log_omega, middle]))
         points, _ = curve(log_omega)
-    near = float(np.min(np.abs(points))) < ON_AXIS
+    near = float(np.min(np.abs(points))) < AXIS_TOLERANCE
     turned = float(np.sum(np.angle(points[1:] * np.conj(points[:-1]))))
     count = (highest - lowest) * angle / math.pi - turned / math.pi
     if near or abs(count - round(count)) > 0.1:
@@ -273,22 +273,22 @@ def right_zeros(polynomial: Polynomial, angle: float = math.pi / 2) -> tuple[flo
 
 
 #: Angle from the negative axis, also bounded by its uncertainty, below which a zero is a relaxation.
-NEAR_REAL = 0.02 * math.pi
+REAL_AXIS_ANGLE_RAD = 0.02 * math.pi
 #: Maximum absolute ln of a frequency without overflow.
-RANGE = 700.0
+MAX_LOG_FREQUENCY = 700.0
 #: Half of the last printed digit of an order; smaller orders count as 0.
-SEEN_ORDER = 5e-5
+PRINTED_ORDER_TOLERANCE = 5e-5
 #: Maximum argument of zeros that give relaxations of a model without poles: D^0.5 y = -a y has one at arg s = 2 pi.
-SHEETS = 2.0 * math.pi
+MAX_SHEET_ANGLE_RAD = 2.0 * math.pi
 #: Increments of rounded orders whose polynomials give the seeds of Newton's method.
-BASES = (0.25, 0.2, 0.1, 0.08, 0.05, 0.04, 0.03, 0.025, 0.02)
-LARGEST_SEED_DEGREE = 90
+SEED_ORDER_BASES = (0.25, 0.2, 0.1, 0.08, 0.05, 0.04, 0.03, 0.025, 0.02)
+MAX_SEED_DEGREE = 90
 #: Maximum number of Newton iterations, and maximum step in ln s.
-NEWTON, LONGEST = 60, 0.5
+MAX_NEWTON_ITERATIONS, MAX_NEWTON_STEP = 60, 0.5
 #: Relative residual of the terms at a zero, and distance in ln s below which two zeros count as equal.
-CANCELS, SAME = 1e-10, 1e-7
+ZERO_TOLERANCE, DISTINCT_ZERO_TOLERANCE = 1e-10, 1e-7
 #: Relative step of numerical derivatives. Powers are rounded to nine decimals, a ten-thousandth of it.
-STEP = 1e-5
+POLE_DERIVATIVE_STEP_RATIO = 1e-5
 
 
 @dataclass(frozen=True)
@@ -316,19 +316,19 @@ class Mode:
     frequency: float
     damping: float
     time_constant: float
-    swings: bool
+    oscillatory: bool
     frequency_error: float | None = None
     damping_error: float | None = None
     time_constant_error: float | None = None
 
     @property
-    def grows(self) -> bool:
+    def unstable(self) -> bool:
         """Whether the mode is unstable."""
         return self.damping < 0
 
     def __str__(self) -> str:
-        end = ", grows" if self.grows else ""
-        if not self.swings:
+        end = ", grows" if self.unstable else ""
+        if not self.oscillatory:
             return f"time constant {with_error(self.time_constant, self.time_constant_error)} s{end}"
         hertz = self.frequency / (2 * math.pi)
         return (
@@ -337,7 +337,7 @@ class Mode:
         )
 
 
-def modes(model: Solved, *, coupling: str = "simulated") -> tuple[Mode, ...]:
+def modes(model: ModelData, *, coupling: str = "simulated") -> tuple[Mode, ...]:
     """Return the modes of a model for any orders, slowest first: frequency, damping and time constant of its poles.
 
     Parameters
@@ -365,13 +365,13 @@ def modes(model: Solved, *, coupling: str = "simulated") -> tuple[Mode, ...]:
     is a relaxation. A model with orders below 1 may have no pole and relax as a power of time. Then the zeros up to
     arg s = 2 pi give its time constants, as (c_0/c_p)^(-1/p) does for D^p y = -c_0/c_p y.
     """
-    check_solved(model)
+    check_model(model)
     coupled = is_coupled(coupling)
     found: list[Mode] = []
     for at, polynomial in enumerate(characteristic(model, coupled=coupled)):
         # Beyond the range of numbers a pole is one at the origin, or of nothing that ever shows.
-        sheet = [w for w in zeros_of(polynomial) or _nearest(polynomial) if abs(w.real) < RANGE]
-        spreads = _spreads(model, at, np.array(sheet), coupled=coupled)
+        sheet = [w for w in zeros_of(polynomial) or _relaxation_zeros(polynomial) if abs(w.real) < MAX_LOG_FREQUENCY]
+        spreads = _standard_deviations(model, at, np.array(sheet), coupled=coupled)
         found += [_mode(w, spread) for w, spread in zip(sheet, spreads, strict=True)]
     return tuple(sorted(found, key=lambda mode: (mode.frequency, mode.pole.imag)))
 
@@ -380,14 +380,14 @@ def _mode(w: complex, spread: tuple[float, float, float] | None) -> Mode:
     """Return the mode of a zero in ln s, with the standard deviations of its parts."""
     size, angle = math.exp(w.real), w.imag
     # Of a pole that hardly anything tells nobody may say that it is real, let alone that it dies away.
-    sure = min(NORMAL_95 * (0.0 if spread is None or not math.isfinite(spread[1]) else spread[1]), NEAR_REAL)
-    if angle >= math.pi - max(sure, SAME) or angle <= SAME:
-        sign = 1.0 if angle <= SAME else -1.0
+    sure = min(NORMAL_95 * (0.0 if spread is None or not math.isfinite(spread[1]) else spread[1]), REAL_AXIS_ANGLE_RAD)
+    if angle >= math.pi - max(sure, DISTINCT_ZERO_TOLERANCE) or angle <= DISTINCT_ZERO_TOLERANCE:
+        sign = 1.0 if angle <= DISTINCT_ZERO_TOLERANCE else -1.0
         error = None if spread is None else spread[0]
         scaled = (None, None) if error is None else (size * error, error / size)
         return Mode(complex(sign * size), size, -sign, 1.0 / size, False, scaled[0], None, scaled[1])
     slow, damping = abs(size * math.cos(angle)), -math.cos(angle)
-    if abs(damping) <= SAME:
+    if abs(damping) <= DISTINCT_ZERO_TOLERANCE:
         slow, damping = 0.0, 0.0
     pole = size * complex(math.cos(angle), math.sin(angle))
     constant = 1.0 / slow if slow > 0 else math.inf
@@ -397,39 +397,41 @@ def _mode(w: complex, spread: tuple[float, float, float] | None) -> Mode:
     return Mode(pole, size, damping, constant, True, size * radial, abs(math.sin(angle)) * turn, constant * share)
 
 
-def _nearest(polynomial: Polynomial) -> list[complex]:
+def _relaxation_zeros(polynomial: Polynomial) -> list[complex]:
     """Return zeros beyond the negative axis up to two turns, or up to the first one."""
     powers = np.array(list(polynomial))
     gap = float(np.min(np.diff(np.sort(powers)), initial=math.inf))
-    zeros = zeros_of(polynomial, max(SHEETS, math.pi / gap) + NEAR_REAL)
+    zeros = zeros_of(polynomial, max(MAX_SHEET_ANGLE_RAD, math.pi / gap) + REAL_AXIS_ANGLE_RAD)
     first = min((w.imag for w in zeros), default=0.0)
-    return [w for w in zeros if w.imag <= max(SHEETS, first) + NEAR_REAL]
+    return [w for w in zeros if w.imag <= max(MAX_SHEET_ANGLE_RAD, first) + REAL_AXIS_ANGLE_RAD]
 
 
-def zeros_of(polynomial: Polynomial, reach: float = math.pi + NEAR_REAL) -> list[complex]:
+def zeros_of(polynomial: Polynomial, reach: float = math.pi + REAL_AXIS_ANGLE_RAD) -> list[complex]:
     """Zeros of a sum of c s^p as ln s, slowest first, 0 <= Im <= reach; those at the origin are excluded."""
     powers = np.array(list(polynomial))
     lowest, highest = float(powers.min()), float(powers.max())
-    if highest - lowest < GRAIN:
+    if highest - lowest < POWER_TOLERANCE:
         return []
     exact = roots_in_base(polynomial)
     if exact is not None:
         base, roots = exact
         w = np.log(np.abs(roots)) / base + 1j * np.abs(np.angle(roots)) / base
         # A conjugate pair is one zero here, and so is each root on the positive axis or on the negative one.
-        kept = w[(np.angle(roots) >= -SAME) & (w.imag <= reach)]
-        if abs(base - 1) < GRAIN:
-            kept = kept[kept.imag <= math.pi + SAME]
+        kept = w[(np.angle(roots) >= -DISTINCT_ZERO_TOLERANCE) & (w.imag <= reach)]
+        if abs(base - 1) < POWER_TOLERANCE:
+            kept = kept[kept.imag <= math.pi + DISTINCT_ZERO_TOLERANCE]
         return sorted(kept.tolist(), key=lambda z: (z.real, z.imag))
     values = np.array(list(polynomial.values()))
     found: list[complex] = []
-    seeds = [_balanced(powers, values, reach)]
-    for base in BASES:
-        if (highest - lowest) / base > LARGEST_SEED_DEGREE:
+    seeds = [_two_term_zeros(powers, values, reach)]
+    for base in SEED_ORDER_BASES:
+        if (highest - lowest) / base > MAX_SEED_DEGREE:
             continue
         seeds.append(_seeds(polynomial, base, reach))
-    for z in _descended(np.concatenate(seeds), powers, values):
-        if -SAME <= z.imag <= reach and all(abs(z - other) > SAME for other in found):
+    for z in _newton_zeros(np.concatenate(seeds), powers, values):
+        if -DISTINCT_ZERO_TOLERANCE <= z.imag <= reach and all(
+            abs(z - other) > DISTINCT_ZERO_TOLERANCE for other in found
+        ):
             found.append(complex(z.real, max(z.imag, 0.0)))
     return sorted(found, key=lambda z: (z.real, z.imag))
 
@@ -449,7 +451,7 @@ def _seeds(polynomial: Polynomial, base: float, reach: float) -> Complex:
     return np.asarray(w[w.imag <= 1.2 * reach], dtype=np.complex128)
 
 
-def _balanced(powers: Floats, values: Floats, reach: float) -> Complex:
+def _two_term_zeros(powers: Floats, values: Floats, reach: float) -> Complex:
     """Zeros of the sum of each pair of terms, as ln s, for distant zeros with close orders."""
     out = []
     for i, j in itertools.combinations(range(powers.size), 2):
@@ -457,22 +459,22 @@ def _balanced(powers: Floats, values: Floats, reach: float) -> Complex:
         turn = np.angle(-values[i] / values[j] + 0j)
         angles = (turn + 2 * math.pi * np.arange(-1, math.ceil(reach * abs(apart) / math.pi) + 1)) / apart
         size = math.log(abs(values[i] / values[j])) / apart
-        out += [complex(size, a) for a in angles.tolist() if -SAME <= a <= reach]
+        out += [complex(size, a) for a in angles.tolist() if -DISTINCT_ZERO_TOLERANCE <= a <= reach]
     return np.array(out, dtype=np.complex128)
 
 
-def _descended(w: Complex, powers: Floats, values: Floats) -> list[complex]:
+def _newton_zeros(w: Complex, powers: Floats, values: Floats) -> list[complex]:
     """Zeros reached by Newton's method from these seeds."""
     if not w.size:
         return []
-    for _ in range(NEWTON):
+    for _ in range(MAX_NEWTON_ITERATIONS):
         terms, _ = _terms(w, powers, values)
         with np.errstate(divide="ignore", invalid="ignore"):
             step = np.sum(terms, axis=0) / np.sum(powers[:, None] * terms, axis=0)
         step = np.where(np.isfinite(step), step, 0.0)
-        w = w - step * np.minimum(1.0, LONGEST / np.maximum(np.abs(step), 1e-300))
+        w = w - step * np.minimum(1.0, MAX_NEWTON_STEP / np.maximum(np.abs(step), 1e-300))
     terms, _ = _terms(w, powers, values)
-    good = np.abs(np.sum(terms, axis=0)) <= CANCELS * np.sum(np.abs(terms), axis=0)
+    good = np.abs(np.sum(terms, axis=0)) <= ZERO_TOLERANCE * np.sum(np.abs(terms), axis=0)
     return [complex(z) for z in w[good]]
 
 
@@ -483,17 +485,19 @@ def _terms(w: Complex, powers: Floats, values: Floats) -> tuple[Complex, Floats]
     return np.asarray(values[:, None] * np.exp(exponents - largest)), largest
 
 
-def _spreads(model: Solved, at: int, zeros: Complex, *, coupled: bool) -> Sequence[tuple[float, float, float] | None]:
+def _standard_deviations(
+    model: ModelData, at: int, zeros: Complex, *, coupled: bool
+) -> Sequence[tuple[float, float, float] | None]:
     """Standard deviations of Re and Im of ln s at each zero, and of ln abs(Re s): d ln s = -dD / (dD/d ln s)."""
     covariance = None if model.estimate is None else model.estimate.covariance
     if covariance is None or not zeros.size:
         return [None] * zeros.size
     matrix = np.asarray(covariance, dtype=np.float64)
-    values = model_numbers(model)
+    values = parameter_vector(model)
     slopes = np.zeros((values.size, zeros.size), dtype=np.complex128)
 
     def value(numbers: Floats) -> tuple[Complex, Complex]:
-        polynomial = characteristic(with_numbers(model, numbers), coupled=coupled)[at]
+        polynomial = characteristic(with_parameter_vector(model, numbers), coupled=coupled)[at]
         powers = np.array(list(polynomial))
         terms, level = _terms(zeros, powers, np.array(list(polynomial.values())))
         scale = np.exp(level)
@@ -501,7 +505,7 @@ def _spreads(model: Solved, at: int, zeros: Complex, *, coupled: bool) -> Sequen
 
     _, slope = value(values)
     for k in np.flatnonzero(np.any(matrix != 0, axis=1)):
-        step = STEP * max(abs(values[k]), 1e-3)
+        step = POLE_DERIVATIVE_STEP_RATIO * max(abs(values[k]), 1e-3)
         shift = step * np.eye(values.size)[k]
         (above, _), (below, _) = value(values + shift), value(values - shift)
         with np.errstate(divide="ignore", invalid="ignore"):
@@ -543,7 +547,7 @@ class SteadyState:
     order_error: float | None = None
 
 
-def steady_states(model: Solved) -> tuple[SteadyState, ...]:
+def steady_states(model: ModelData) -> tuple[SteadyState, ...]:
     """Return the steady state of every output for every input that affects it, with coupled equations.
 
     Parameters
@@ -556,18 +560,18 @@ def steady_states(model: Solved) -> tuple[SteadyState, ...]:
     ModelError
         An input that saturates or has a dead zone, or friction.
     """
-    check_solved(model)
-    check_unlimited(model, "a steady state")
-    pairs = _final(model)
+    check_model(model)
+    check_no_input_nonlinearity(model, "a steady state")
+    pairs = _final_values(model)
     covariance = None if model.estimate is None else model.estimate.covariance
     errors: dict[tuple[str, str], tuple[float, float]] = {}
     if covariance is not None:
-        matrix, values = np.asarray(covariance, dtype=np.float64), model_numbers(model)
+        matrix, values = np.asarray(covariance, dtype=np.float64), parameter_vector(model)
         slopes = {pair: np.zeros((2, values.size)) for pair in pairs}
         for k in np.flatnonzero(np.any(matrix != 0, axis=1)):
-            step = STEP * max(abs(values[k]), 1e-3)
+            step = POLE_DERIVATIVE_STEP_RATIO * max(abs(values[k]), 1e-3)
             shift = step * np.eye(values.size)[k]
-            above, below = (_final(with_numbers(model, values + side)) for side in (shift, -shift))
+            above, below = (_final_values(with_parameter_vector(model, values + side)) for side in (shift, -shift))
             for pair, slope in slopes.items():
                 slope[:, k] = np.subtract(above[pair], below[pair]) / (2 * step)
         for pair, (turn, slope) in slopes.items():
@@ -575,13 +579,13 @@ def steady_states(model: Solved) -> tuple[SteadyState, ...]:
             errors[pair] = (math.sqrt(max(variances[0], 0.0)), math.sqrt(max(variances[1], 0.0)))
     out = []
     for (output, signal), (order, rate) in pairs.items():
-        gain = rate if abs(order) < SEEN_ORDER else 0.0 if order < 0 else math.copysign(math.inf, rate)
+        gain = rate if abs(order) < PRINTED_ORDER_TOLERANCE else 0.0 if order < 0 else math.copysign(math.inf, rate)
         turned, error = errors.get((output, signal), (None, None))
         out.append(SteadyState(output, signal, gain, error, order, rate, turned))
     return tuple(out)
 
 
-def _final(model: Solved) -> dict[tuple[str, str], tuple[float, float]]:
+def _final_values(model: ModelData) -> dict[tuple[str, str], tuple[float, float]]:
     """Order and coefficient of the final behavior of every response."""
     transfer = transfer_functions(model)
     sensor = model.structure.sensor_filter
@@ -597,11 +601,11 @@ def _final(model: Solved) -> dict[tuple[str, str], tuple[float, float]]:
                 (p, a), (q, b) = (min((o, c) for c, o in part) for part in (sensor.numerator, sensor.denominator))
                 side = 1 if output in sensor.signals else -1
                 order, rate = order + side * (q - p), rate * (a / b) ** side
-            out[output, signal] = (0.0 if abs(order) < GRAIN else order, rate)
+            out[output, signal] = (0.0 if abs(order) < POWER_TOLERANCE else order, rate)
     return out
 
 
-def dcgain(model: Solved) -> Floats:
+def dcgain(model: ModelData) -> Floats:
     """Steady-state gain of every output from every input that is not modelled.
 
     Parameters
@@ -628,7 +632,7 @@ def dcgain(model: Solved) -> Floats:
     return out
 
 
-def settling_time(model: Solved) -> float:
+def settling_time(model: ModelData) -> float:
     """Seconds in which a model shows what it does: some time constants of its slowest mode.
 
     No more than fifty periods of the fastest swing, so that a picture of it shows a swing.
@@ -637,6 +641,6 @@ def settling_time(model: Solved) -> float:
     if not found:
         return 10.0
     slowest = max(min(m.time_constant, 20.0 * 2 * math.pi / m.frequency) for m in found)
-    swings = [2 * math.pi / m.frequency for m in found if m.swings]
+    swings = [2 * math.pi / m.frequency for m in found if m.oscillatory]
     settled = min(6.0 * slowest, 50.0 * min(swings)) if swings else 6.0 * slowest
     return settled + max(model.structure.delay.values(), default=0.0)

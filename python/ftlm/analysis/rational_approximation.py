@@ -13,25 +13,25 @@ from typing import Any
 import numpy as np
 from numpy.typing import NDArray
 
-from ftlm.analysis.frequency_response import check_unlimited, frequency_response, response_inputs
+from ftlm.analysis.frequency_response import check_no_input_nonlinearity, frequency_response, response_inputs
 from ftlm.analysis.poles import stability
 from ftlm.errors import ModelError
-from ftlm.model.model import Solved
+from ftlm.model.model import ModelData
 from ftlm.simulation.discretization import check_linear
-from ftlm.utils.validation import Floats, real_number, shown, whole_number
+from ftlm.utils.validation import Floats, real_number, short_repr, whole_number
 
 #: Maximum errors of the approximation without a warning.
-GAIN_DB, PHASE_DEGREES = 1.0, 5.0
+MAX_GAIN_ERROR_DB, MAX_PHASE_ERROR_DEGREES = 1.0, 5.0
 #: Number of frequencies at which the approximation is compared with the model.
-COMPARED = 200
+COMPARISON_FREQUENCIES = 200
 #: Factor by which filters extend beyond the band on both sides, because their phase is inaccurate near their ends.
-REACH = 100.0
+BAND_EXTENSION_FACTOR = 100.0
 #: Distance of a pole from the imaginary axis, relative to the lower end of the band, below which it is on the axis.
-AT_ORIGIN = 1e-3
+ORIGIN_POLE_RATIO = 1e-3
 #: Maximum order of Oustaloup's filter. Beyond it neighboring zeros and poles nearly cancel.
 LARGEST_ORDER = 50
 #: Order of the Padé approximation of a delay.
-PADE = 4
+PADE_ORDER = 4
 
 
 def identifier(name: str) -> str:
@@ -145,7 +145,7 @@ def _dense(rows: Sequence[Mapping[int, float]], width: int) -> Floats:
 _Signal = tuple[dict[int, float], dict[int, float], dict[int, float]]
 
 
-def _scaled(signal: _Signal, factor: float) -> _Signal:
+def _scale_signal(signal: _Signal, factor: float) -> _Signal:
     x, u, y = ({i: factor * v for i, v in part.items()} for part in signal)
     return x, u, y
 
@@ -159,29 +159,32 @@ def _sum(signals: Iterable[_Signal]) -> _Signal:
     return total
 
 
-def _filtered(builder: _Builder, signal: _Signal, power: float, band: tuple[float, float], order: int) -> _Signal:
+def _filter_signal(builder: _Builder, signal: _Signal, power: float, band: tuple[float, float], order: int) -> _Signal:
     """Apply Oustaloup's filter for s^power to a signal, with one state per pole."""
     roots, residues, gain = oustaloup(power, band, order)
-    states, u, y = _scaled(signal, gain)
+    states, u, y = _scale_signal(signal, gain)
     for pole, residue in zip(roots.tolist(), residues.tolist(), strict=True):
-        row, row_u, row_y = _scaled(signal, pole)
+        row, row_u, row_y = _scale_signal(signal, pole)
         own = len(builder.a)
         row[own] = row.get(own, 0.0) - pole
         states[builder.state(row, row_u, row_y)] = residue / pole
     return states, u, y
 
 
-def _delayed(builder: _Builder, source: int, delay: float) -> _Signal:
+def _delay_input(builder: _Builder, source: int, delay: float) -> _Signal:
     """Apply Padé's approximation of a delay to an input, in observer form."""
     # Coefficients of sum (2n-k)! n! / ((2n)! k! (n-k)!) x^k, x = -s tau above and + below.
-    f, n = math.factorial, PADE
+    f, n = math.factorial, PADE_ORDER
     c = [f(2 * n - k) * f(n) / (f(2 * n) * f(k) * f(n - k)) for k in range(n + 1)]
-    below = [c[k] * delay**k / (c[PADE] * delay**PADE) for k in range(PADE)]
-    direct = (-1.0) ** PADE
-    above = [(-1.0) ** k * c[k] * delay**k / (c[PADE] * delay**PADE) - direct * below[k] for k in range(PADE)]
+    below = [c[k] * delay**k / (c[PADE_ORDER] * delay**PADE_ORDER) for k in range(PADE_ORDER)]
+    direct = (-1.0) ** PADE_ORDER
+    above = [
+        (-1.0) ** k * c[k] * delay**k / (c[PADE_ORDER] * delay**PADE_ORDER) - direct * below[k]
+        for k in range(PADE_ORDER)
+    ]
     first = len(builder.a)
-    last = first + PADE - 1
-    for k in range(PADE):
+    last = first + PADE_ORDER - 1
+    for k in range(PADE_ORDER):
         row = {last: -below[k]}
         if k:
             row[first + k - 1] = row.get(first + k - 1, 0.0) + 1.0
@@ -189,7 +192,7 @@ def _delayed(builder: _Builder, source: int, delay: float) -> _Signal:
     return {last: 1.0}, {source: direct}, {}
 
 
-def approximate(model: Solved, *, band: tuple[float, float], order: int = 5) -> Approximation:
+def approximate(model: ModelData, *, band: tuple[float, float], order: int = 5) -> Approximation:
     """Approximate a model by a rational state-space system.
 
     Parameters
@@ -219,21 +222,21 @@ def approximate(model: Solved, *, band: tuple[float, float], order: int = 5) -> 
     try:
         low, high = (real_number("band", b) for b in band)
     except (TypeError, ValueError):
-        raise ModelError(f"band = {shown(band)} is no pair of frequencies; give (low, high) in rad/s") from None
+        raise ModelError(f"band = {short_repr(band)} is no pair of frequencies; give (low, high) in rad/s") from None
     if not (math.isfinite(low) and math.isfinite(high) and 0 < low < high):
         raise ModelError(f"band = ({low:g}, {high:g}) rad/s is no interval; give 0 < low < high")
     count = whole_number(order)
     if count is None or not 1 <= count <= LARGEST_ORDER:
-        raise ModelError(f"order = {shown(order)} is no whole number from 1 to {LARGEST_ORDER}")
+        raise ModelError(f"order = {short_repr(order)} is no whole number from 1 to {LARGEST_ORDER}")
     check_linear(model.equations, "a linear system in state space")
-    check_unlimited(model, "a linear system in state space")
+    check_no_input_nonlinearity(model, "a linear system in state space")
     inputs, outputs = response_inputs(model, coupled=True), model.outputs
     builder = _Builder(len(inputs), len(outputs))
     delays = model.structure.delay
     sources: dict[str, _Signal] = {o: ({}, {}, {i: 1.0}) for i, o in enumerate(outputs)}
     for i, name in enumerate(inputs):
-        sources[name] = _delayed(builder, i, delays[name]) if delays.get(name) else ({}, {i: 1.0}, {})
-    reach = (low / REACH, high * REACH)
+        sources[name] = _delay_input(builder, i, delays[name]) if delays.get(name) else ({}, {i: 1.0}, {})
+    reach = (low / BAND_EXTENSION_FACTOR, high * BAND_EXTENSION_FACTOR)
     # D^alpha y = sum of c D^nu s becomes y = sum of c s^-ceil(eta) (filter for the rest) s. The integrators of an
     # equation form one chain that adds up what every term feeds in (observer form): none runs away by itself, and what
     # a model does at rest and far below the band stays exact.
@@ -247,8 +250,8 @@ def approximate(model: Solved, *, band: tuple[float, float], order: int = 5) -> 
             key = (term.signal, round(whole - eta, 9))
             if key not in filters:
                 source = sources[term.signal]
-                filters[key] = _filtered(builder, source, key[1], reach, count) if key[1] > 0 else source
-            fed.setdefault(whole, []).append(_scaled(filters[key], float(term.fixed or 0.0)))
+                filters[key] = _filter_signal(builder, source, key[1], reach, count) if key[1] > 0 else source
+            fed.setdefault(whole, []).append(_scale_signal(filters[key], float(term.fixed or 0.0)))
         behind: _Signal = ({}, {}, {})
         for level in range(max(fed), 0, -1):
             behind = ({builder.state(*_sum([*fed.get(level, []), behind])): 1.0}, {}, {})
@@ -267,13 +270,13 @@ def approximate(model: Solved, *, band: tuple[float, float], order: int = 5) -> 
     d: Floats = np.asarray(np.linalg.solve(solved, direct), dtype=np.float64)
     a, b = a + feedback @ c, b + feedback @ d
     unjudged = Approximation(a, b, c, d, outputs, inputs, (low, high), count, {}, {}, stable=True, warnings=())
-    return _judged(model, unjudged)
+    return _with_errors(model, unjudged)
 
 
-def _judged(model: Solved, system: Approximation) -> Approximation:
+def _with_errors(model: ModelData, system: Approximation) -> Approximation:
     """Return the approximation with its errors and warnings on its stability."""
     low, high = system.band
-    omega = np.geomspace(low, high, COMPARED)
+    omega = np.geomspace(low, high, COMPARISON_FREQUENCIES)
     exact = frequency_response(model, omega, sensor=False)
     got = system.frequency_response(omega)
     gain, phase = {}, {}
@@ -286,16 +289,16 @@ def _judged(model: Solved, system: Approximation) -> Approximation:
                 gain[output, signal] = float(np.max(np.abs(20 * np.log10(np.abs(quotient)))))
                 phase[output, signal] = float(np.degrees(np.max(np.abs(np.angle(quotient)))))
     roots = np.linalg.eigvals(system.a)
-    stable = bool(np.all(roots.real < -AT_ORIGIN * low))
+    stable = bool(np.all(roots.real < -ORIGIN_POLE_RATIO * low))
     words = []
     worst_gain, worst_phase = max(gain.values(), default=0.0), max(phase.values(), default=0.0)
-    if not (worst_gain <= GAIN_DB and worst_phase <= PHASE_DEGREES):
+    if not (worst_gain <= MAX_GAIN_ERROR_DB and worst_phase <= MAX_PHASE_ERROR_DEGREES):
         words.append(
             f"over {low:g} to {high:g} rad/s the approximation is off by up to {worst_gain:.2g} dB "
             f"and {worst_phase:.2g} degrees: a gain or phase margin smaller than that means nothing; raise order, or "
             "change the band"
         )
-    if stability(model).unstable_poles != np.sum(roots.real > AT_ORIGIN * low):
+    if stability(model).unstable_poles != np.sum(roots.real > ORIGIN_POLE_RATIO * low):
         words.append(
             "the approximation does not have as many unstable poles as the model: no stability margin of it holds for "
             "the model; raise order, or move the band"
@@ -303,7 +306,7 @@ def _judged(model: Solved, system: Approximation) -> Approximation:
     return replace(system, gain_error=gain, phase_error=phase, stable=stable, warnings=tuple(words))
 
 
-def to_control(model: Solved, *, band: tuple[float, float], order: int = 5) -> Any:
+def to_control(model: ModelData, *, band: tuple[float, float], order: int = 5) -> Any:
     """Return a python-control system that approximates a model within a band.
 
     Parameters

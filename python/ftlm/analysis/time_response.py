@@ -7,19 +7,19 @@ from dataclasses import dataclass, replace
 import numpy as np
 from numpy.typing import ArrayLike
 
-from ftlm.analysis.frequency_response import model_numbers, response_inputs, step_response, with_numbers
+from ftlm.analysis.frequency_response import parameter_vector, response_inputs, step_response, with_parameter_vector
 from ftlm.analysis.poles import settling_time
 from ftlm.errors import FtlmError
-from ftlm.model.model import Solved, check_solved
+from ftlm.model.model import ModelData, check_model
 from ftlm.utils.validation import Floats
 
 #: Default number of time points.
-INSTANTS = 401
+DEFAULT_TIME_POINTS = 401
 #: Step of the difference quotient along each direction of the covariance, in standard deviations. It is far above the
 #: refinement tolerance (1e-6), and small enough for a significant parameter to keep its sign.
-SHARE = 0.1
+DEVIATION_STEP_RATIO = 0.1
 #: Variance of a direction, relative to the largest in normalized units, below which it is neglected.
-LEAST = 1e-12
+MIN_VARIANCE_RATIO = 1e-12
 
 
 @dataclass(frozen=True)
@@ -49,7 +49,7 @@ class Response:
     deviation: Floats | None
 
 
-def response(model: Solved, time: ArrayLike | None = None, *, kind: str = "step") -> Response:
+def response(model: ModelData, time: ArrayLike | None = None, *, kind: str = "step") -> Response:
     """Response of a model to unit steps or impulses, from rest, with coupled equations.
 
     Parameters
@@ -70,11 +70,11 @@ def response(model: Solved, time: ArrayLike | None = None, *, kind: str = "step"
     ConvergenceError
         A model so unstable that the response leaves the range of numbers.
     """
-    check_solved(model)
+    check_model(model)
     if time is None:
         # Friction has no poles, and no time of its own that a program could tell.
         span = 10.0 if model.structure.has_friction else settling_time(model)
-        time = np.linspace(0.0, span, INSTANTS)
+        time = np.linspace(0.0, span, DEFAULT_TIME_POINTS)
     instants = np.asarray(time, dtype=np.float64)
     centre = step_response(model, instants)
     deviation = _deviation(model, instants, impulse=kind == "impulse")
@@ -84,12 +84,12 @@ def response(model: Solved, time: ArrayLike | None = None, *, kind: str = "step"
     return Response(kind, model.outputs, response_inputs(model, coupled=True), instants, centre, deviation)
 
 
-def _deviation(model: Solved, time: Floats, *, impulse: bool) -> Floats | None:
+def _deviation(model: ModelData, time: Floats, *, impulse: bool) -> Floats | None:
     """Standard deviation from changes of one standard deviation along each direction of the covariance."""
     covariance = None if model.estimate is None else model.estimate.covariance
     if covariance is None or model.structure.has_friction:
         return None
-    matrix, numbers = np.asarray(covariance, dtype=np.float64), model_numbers(model)
+    matrix, numbers = np.asarray(covariance, dtype=np.float64), parameter_vector(model)
     if matrix.shape != (numbers.size, numbers.size) or not np.all(np.isfinite(matrix)):
         return None
     size = np.sqrt(np.maximum(np.diag(matrix), 0.0))
@@ -102,15 +102,17 @@ def _deviation(model: Solved, time: Floats, *, impulse: bool) -> Floats | None:
     # Of the model alone, lest every step is refined with the covariance of another one.
     bare = replace(model, estimate=None)
     for weight, direction in zip(weights.tolist(), directions.T, strict=True):
-        if weight <= LEAST * float(weights[-1]):
+        if weight <= MIN_VARIANCE_RATIO * float(weights[-1]):
             continue
         shift = np.zeros(numbers.size)
-        shift[used] = SHARE * np.sqrt(weight) * direction * size[used]
+        shift[used] = DEVIATION_STEP_RATIO * np.sqrt(weight) * direction * size[used]
         try:
-            above, below = (step_response(with_numbers(bare, numbers + side), time) for side in (shift, -shift))
+            above, below = (
+                step_response(with_parameter_vector(bare, numbers + side), time) for side in (shift, -shift)
+            )
         except FtlmError:
             # So vague that a tenth of a standard deviation is no model any more: there is no band to be drawn.
             return None
-        change = (above - below) / (2 * SHARE)
+        change = (above - below) / (2 * DEVIATION_STEP_RATIO)
         total = total + (np.diff(change) / (time[1] - time[0]) if impulse else change) ** 2
     return np.sqrt(total)

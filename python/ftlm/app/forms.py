@@ -16,31 +16,31 @@ from ftlm.estimation.identify import identify
 from ftlm.estimation.result import Identification
 from ftlm.estimation.verdict import Validation
 from ftlm.io.load import load
-from ftlm.progress import WONDER, left_in_words
+from ftlm.progress import ANNOUNCEMENT_THRESHOLD_S, format_time_left
 from ftlm.structure.parser import equation
 from ftlm.structure.structure import Structure
 from ftlm.structure_selection.result import Selection
 from ftlm.structure_selection.select import select
-from ftlm.utils.resources import by_output_error, expected
+from ftlm.utils.resources import estimate_duration, output_error_cost
 from ftlm.utils.validation import check_threads
 
 #: Structures with a name of their own, as Python calls.
-NAMED: dict[str, Callable[[], Structure]] = {
+NAMED_STRUCTURES: dict[str, Callable[[], Structure]] = {
     "flexible_link(stage=1)": lambda: flexible_link(stage=1),
     "flexible_link(stage=2)": lambda: flexible_link(stage=2),
 }
 #: Origin of the structure: fit as given, selected inside one, selected among several, or automatic.
-WAYS = ("fit", "inside", "offered", "auto")
-METHODS = ("output-error", "instrumental-variables", "multi-innovation", "least-squares")
-OFFSETS = ("none", "constant", "ramp", "auto")
-LOSSES = ("squares", "huber")
+SELECTION_MODES = ("fit", "inside", "offered", "auto")
+METHOD_NAMES = ("output-error", "instrumental-variables", "multi-innovation", "least-squares")
+OFFSET_KINDS = ("none", "constant", "ramp", "auto")
+LOSS_NAMES = ("squares", "huber")
 #: Progress phase of a structure selection.
-CHOOSING = "choosing a structure"
+SELECTION_PHASE = "choosing a structure"
 #: Longest line of a script.
-LINE = 100
+MAX_SCRIPT_LINE_CHARACTERS = 100
 
 
-class Told(Protocol):
+class ProgressListener(Protocol):
     """Receiver of progress reports."""
 
     def phase(self, words: str) -> None:
@@ -51,7 +51,7 @@ class Told(Protocol):
 
 
 @dataclass(frozen=True)
-class Reading:
+class RunSource:
     """File with the arguments of `ftlm.load` that turn it into a run.
 
     Parameters
@@ -71,11 +71,11 @@ class Reading:
 
     def script(self, name: str) -> list[str]:
         """Script lines that load the run."""
-        return call(name, "ftlm.load", [quoted(self.file)], self.options)
+        return format_call(name, "ftlm.load", [format_string(self.file)], self.options)
 
 
 @dataclass(frozen=True)
-class Recipe:
+class FitRequest:
     """Complete definition of a fit: runs, structure and options.
 
     Parameters
@@ -94,8 +94,8 @@ class Recipe:
         Arguments of :func:`ftlm.identify`; "" for its defaults.
     """
 
-    estimation: Reading
-    validation: Reading | None = None
+    estimation: RunSource
+    validation: RunSource | None = None
     share: float = 0.0
     structure: tuple[str, ...] = ()
     way: str = "fit"
@@ -104,11 +104,11 @@ class Recipe:
     loss: str = ""
 
     @classmethod
-    def of(cls, told: Mapping[str, Any]) -> Recipe:
+    def of(cls, told: Mapping[str, Any]) -> FitRequest:
         """Build a request from the dictionary of :meth:`to_dict`."""
         other = told["validation"]
-        parts = {**told, "structure": tuple(told["structure"]), "estimation": Reading(**told["estimation"])}
-        return cls(**{**parts, "validation": None if other is None else Reading(**other)})
+        parts = {**told, "structure": tuple(told["structure"]), "estimation": RunSource(**told["estimation"])}
+        return cls(**{**parts, "validation": None if other is None else RunSource(**other)})
 
     def to_dict(self) -> dict[str, Any]:
         """Return the request as a dictionary for JSON."""
@@ -144,7 +144,7 @@ class Recipe:
         """Whether a structure is selected, which takes long enough to need a checkpoint."""
         return self.way != "fit"
 
-    def made(self, told: Told, store: str | None = None) -> Made:
+    def fit_model(self, told: ProgressListener, store: str | None = None) -> FittedModel:
         """Fit the model.
 
         Parameters
@@ -162,7 +162,7 @@ class Recipe:
         wanted = self.structures()
         told.phase("reading")
         own, other, cut = self._runs()
-        told.phase(CHOOSING if self.is_choice else f"fitting{self._takes(own, wanted[0])}")
+        told.phase(SELECTION_PHASE if self.is_choice else f"fitting{self._time_estimate(own, wanted[0])}")
         choice = None
         if not self.is_choice:
             result = identify(own, wanted[0], progress=told, **self.settings())
@@ -173,15 +173,19 @@ class Recipe:
             told.phase("fitting what was chosen")
             result = identify(own, choice.winner.structure, progress=told)
         told.phase("validating")
-        return Made(result, own, other, None if other is None else result.validate(other), choice, self._script(cut))
+        return FittedModel(
+            result, own, other, None if other is None else result.validate(other), choice, self._script(cut)
+        )
 
-    def _takes(self, run: Run, structure: Structure) -> str:
+    def _time_estimate(self, run: Run, structure: Structure) -> str:
         """Time estimate of a fit as text; empty for a short fit."""
         numbers = len(structure.order_names) + len(structure.coefficient_names) + len(structure.free_inputs)
-        seconds = expected(by_output_error(run.length * len(structure.outputs), numbers), check_threads(None))
-        if seconds < WONDER or self.method not in ("", METHODS[0]):
+        seconds = estimate_duration(
+            output_error_cost(run.length * len(structure.outputs), numbers), check_threads(None)
+        )
+        if seconds < ANNOUNCEMENT_THRESHOLD_S or self.method not in ("", METHOD_NAMES[0]):
             return ""
-        return f", {left_in_words(seconds).removesuffix(' left')} in all"
+        return f", {format_time_left(seconds).removesuffix(' left')} in all"
 
     def _runs(self) -> tuple[Run, Run | None, float | None]:
         """Estimation run, validation run, and the time at which one run was split [s]."""
@@ -190,13 +194,17 @@ class Recipe:
             return run, self.validation.run(), None
         if not self.share:
             return run, None, None
-        cut = cut_at(run.length, run.step, self.share)
-        return run.slice(None, cut), run.slice(cut, None), cut
+        cut = split_time(run.length, run.step, self.share)
+        return run.window(None, cut), run.window(cut, None), cut
 
     def _script(self, cut: float | None) -> str:
         """Python script of the whole fit."""
         stem = Path(self.estimation.file).stem
-        lines = [f'"""A model of {docstring(self.estimation.file)}, as the page of ftlm {__version__} made it."""', ""]
+        lines = [
+            f'"""A model of {sanitize_for_docstring(self.estimation.file)}, as made by the page of ftlm '
+            f'{__version__}."""',
+            "",
+        ]
         lines += ["import ftlm", ""]
         if cut is None:
             lines += self.estimation.script("run")
@@ -206,46 +214,49 @@ class Recipe:
         if self.validation is not None:
             lines += self.validation.script("other")
         if not self.is_choice:
-            lines.append(f"structure = {written(self.structure[0])}")
-            lines += call("result", "ftlm.identify", ["run", "structure"], self.settings())
+            lines.append(f"structure = {structure_expression(self.structure[0])}")
+            lines += format_call("result", "ftlm.identify", ["run", "structure"], self.settings())
         else:
             if self.way == "offered":
-                lines += ["candidates = [", *(f"    {written(text)}," for text in self.structure), "]"]
+                lines += ["candidates = [", *(f"    {structure_expression(text)}," for text in self.structure), "]"]
             else:
-                lines.append(f"candidates = {quoted('auto') if self.way == 'auto' else written(self.structure[0])}")
+                lines.append(
+                    "candidates = "
+                    f"{format_string('auto') if self.way == 'auto' else structure_expression(self.structure[0])}"
+                )
             lines += ["choice = ftlm.select(run, candidates)", "print(choice.reason)"]
             lines.append("result = ftlm.identify(run, choice.winner.structure)")
         tried = cut is not None or self.validation is not None
         lines.append("print(result.summary(result.validate(other)))" if tried else "print(result.summary())")
-        lines.append(f"result.model.save({quoted(stem + '-model.json')})")
-        lines.append(f"result.report({quoted(stem + '-report.html')}{', validation=other' if tried else ''})")
+        lines.append(f"result.model.save({format_string(stem + '-model.json')})")
+        lines.append(f"result.report({format_string(stem + '-report.html')}{', validation=other' if tried else ''})")
         return "\n".join(lines) + "\n"
 
 
 @dataclass(frozen=True)
-class Made:
+class FittedModel:
     """Model of a fit with its runs and the script that reproduces it."""
 
     result: Identification
     run: Run
     other: Run | None
-    checked: Validation | None
+    validation: Validation | None
     choice: Selection | None
     script: str
 
 
 def structure_of(text: str) -> Structure:
     """Return the structure of an equation or of a key of :data:`NAMED_STRUCTURES`."""
-    return NAMED[text]() if text in NAMED else equation(text)
+    return NAMED_STRUCTURES[text]() if text in NAMED_STRUCTURES else equation(text)
 
 
-def checked_structures(recipe: Recipe) -> list[Structure]:
+def parse_structures(recipe: FitRequest) -> list[Structure]:
     """Return the structures of a request; raise for options that contradict each other."""
     for name, value, known in (
-        ("way", recipe.way, WAYS),
-        ("method", recipe.method, ("", *METHODS)),
-        ("offset", recipe.offset, ("", *OFFSETS)),
-        ("loss", recipe.loss, ("", *LOSSES)),
+        ("way", recipe.way, SELECTION_MODES),
+        ("method", recipe.method, ("", *METHOD_NAMES)),
+        ("offset", recipe.offset, ("", *OFFSET_KINDS)),
+        ("loss", recipe.loss, ("", *LOSS_NAMES)),
     ):
         if value not in known:
             raise ModelError(f"{name} = {value!r} is not known; use {' or '.join(filter(None, known))}")
@@ -263,53 +274,56 @@ def checked_structures(recipe: Recipe) -> list[Structure]:
     return recipe.structures()
 
 
-def cut_at(rows: int, step: float, share: float) -> float:
+def split_time(rows: int, step: float, share: float) -> float:
     """Time [s] at which a run is split so that this share of its samples comes after it."""
     return float(f"{round(rows * (1.0 - share)) * step:.9g}")
 
 
-def written(structure: str) -> str:
+def structure_expression(structure: str) -> str:
     """Python expression of a structure."""
-    return f"ftlm.{structure}" if structure in NAMED else f"ftlm.equation({quoted(structure)})"
+    return f"ftlm.{structure}" if structure in NAMED_STRUCTURES else f"ftlm.equation({format_string(structure)})"
 
 
-def call(target: str, function: str, values: list[str], named: Mapping[str, Any]) -> list[str]:
+def format_call(target: str, function: str, values: list[str], named: Mapping[str, Any]) -> list[str]:
     """Python call; one line per argument if one line is too long."""
-    parts = [*values, *(f"{name}={literal(value)}" for name, value in named.items())]
+    parts = [*values, *(f"{name}={format_literal(value)}" for name, value in named.items())]
     line = f"{target} = {function}({', '.join(parts)})"
-    if len(line) <= LINE:
+    if len(line) <= MAX_SCRIPT_LINE_CHARACTERS:
         return [line]
     return [f"{target} = {function}(", *(f"    {part}," for part in parts), ")"]
 
 
-def literal(value: Any) -> str:
+def format_literal(value: Any) -> str:
     """Python expression of a JSON value."""
     if isinstance(value, str):
-        return quoted(value)
+        return format_string(value)
     if isinstance(value, Mapping):
-        return "{" + ", ".join(f"{quoted(k)}: {literal(v)}" for k, v in value.items()) + "}"
-    return f"[{', '.join(map(literal, value))}]" if isinstance(value, (list, tuple)) else repr(value)
+        return "{" + ", ".join(f"{format_string(k)}: {format_literal(v)}" for k, v in value.items()) + "}"
+    return f"[{', '.join(map(format_literal, value))}]" if isinstance(value, (list, tuple)) else repr(value)
 
 
-def quoted(text: str) -> str:
+def format_string(text: str) -> str:
     """Python string literal in double quotes, without control characters of a terminal."""
     if text.isprintable():
         return json.dumps(text, ensure_ascii=False)
     return repr(text).encode("ascii", "backslashreplace").decode()
 
 
-def docstring(text: str) -> str:
+def sanitize_for_docstring(text: str) -> str:
     """Return a file name reduced to characters that are safe inside a docstring."""
     return "".join(c if c.isalnum() or c in " ._-()" else "?" for c in text)[:100]
 
 
 #: Form fields of a file's layout with integer values, and those with text values.
-NUMBERS, WORDS = ("skip", "header"), ("encoding", "separator", "decimal", "thousands", "dates", "sheet")
-ROLES = ("", "time", "input", "output")
-MOST_SIGNALS = 500
+INTEGER_LAYOUT_FIELDS, TEXT_LAYOUT_FIELDS = (
+    ("skip", "header"),
+    ("encoding", "separator", "decimal", "thousands", "dates", "sheet"),
+)
+COLUMN_ROLES = ("", "time", "input", "output")
+MAX_SIGNALS = 500
 
 
-def asked_of(said: Mapping[str, Any]) -> dict[str, Any]:
+def parse_fields(said: Mapping[str, Any]) -> dict[str, Any]:
     """Convert form fields to arguments; an empty field is omitted.
 
     Parameters
@@ -326,15 +340,15 @@ def asked_of(said: Mapping[str, Any]) -> dict[str, Any]:
     asked: dict[str, Any] = {}
     for name in ("step", "resample"):
         if _text(said, name):
-            asked[name] = number(name, _text(said, name))
+            asked[name] = parse_number(name, _text(said, name))
     for name in ("time_unit", "missing"):
         if _text(said, name):
             asked[name] = _text(said, name)
-    ends = [number(name, _text(said, name)) if _text(said, name) else None for name in ("from", "to")]
+    ends = [parse_number(name, _text(said, name)) if _text(said, name) else None for name in ("from", "to")]
     if ends != [None, None]:
         asked["slice"] = ends
-    layout: dict[str, Any] = {name: _text(said, name) for name in WORDS if _text(said, name)}
-    layout |= {name: _whole(name, _text(said, name)) for name in NUMBERS if _text(said, name)}
+    layout: dict[str, Any] = {name: _text(said, name) for name in TEXT_LAYOUT_FIELDS if _text(said, name)}
+    layout |= {name: _parse_line_count(name, _text(said, name)) for name in INTEGER_LAYOUT_FIELDS if _text(said, name)}
     if layout:
         asked["layout"] = layout
     return asked | _roles(said.get("columns"))
@@ -344,15 +358,15 @@ def _roles(columns: Any) -> dict[str, Any]:
     """Time, inputs, outputs and units; empty without a list of columns."""
     if columns is None:
         return {}
-    if not isinstance(columns, list) or len(columns) > MOST_SIGNALS:
-        raise DataError(f"columns is no list of at most {MOST_SIGNALS} columns")
+    if not isinstance(columns, list) or len(columns) > MAX_SIGNALS:
+        raise DataError(f"columns is no list of at most {MAX_SIGNALS} columns")
     asked: dict[str, Any] = {}
     for entry in columns:
         if not isinstance(entry, Mapping):
             raise DataError("a column is no object with name, role, signal and unit")
         name, role = _text(entry, "name"), _text(entry, "role")
         signal, unit = _text(entry, "signal") or name, _text(entry, "unit")
-        if role not in ROLES:
+        if role not in COLUMN_ROLES:
             raise DataError(f"the role {role!r} of column {name!r} is not known; take time, input, output or none")
         if role == "time":
             if "time" in asked:
@@ -368,7 +382,7 @@ def _roles(columns: Any) -> dict[str, Any]:
     return asked
 
 
-def number(name: str, text: str) -> float:
+def parse_number(name: str, text: str) -> float:
     """Return the number of a form field."""
     try:
         return float(text)
@@ -376,7 +390,7 @@ def number(name: str, text: str) -> float:
         raise DataError(f"{name}: {text[:40]!r} is no number; write one such as 0.5") from None
 
 
-def _whole(name: str, text: str) -> int:
+def _parse_line_count(name: str, text: str) -> int:
     """Return the number of lines in a form field."""
     if not (text.isascii() and text.isdigit() and len(text) < 10):
         raise DataError(f"{name}: {text[:40]!r} is no number of lines; write one such as 2")
@@ -393,14 +407,14 @@ def _text(said: Mapping[str, Any], name: str) -> str:
 
 
 #: Outputs and inputs for which structures are suggested; longer lists are not readable.
-MOST = 6
+MAX_SUGGESTED_SIGNALS = 6
 
 
-def offers(inputs: Sequence[str], outputs: Sequence[str]) -> list[dict[str, str]]:
+def suggest_structures(inputs: Sequence[str], outputs: Sequence[str]) -> list[dict[str, str]]:
     """Structures suggested for each output: name, purpose, equation, output."""
     made: list[dict[str, str]] = []
-    driven = list(inputs)[:MOST]
-    for output in list(outputs)[:MOST]:
+    driven = list(inputs)[:MAX_SUGGESTED_SIGNALS]
+    for output in list(outputs)[:MAX_SUGGESTED_SIGNALS]:
         drives = "".join(f" + b{k} {name}" for k, name in enumerate(driven))
         for name, why, left, own in (
             ("Lag", "first order: heating, filling, a motor's speed", "D", "a0 {y}"),

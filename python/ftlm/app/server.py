@@ -19,8 +19,8 @@ from typing import TYPE_CHECKING, Any
 from urllib.parse import parse_qs
 
 from ftlm.app import views as view
-from ftlm.app.forms import asked_of
-from ftlm.app.session import MADE, Desk
+from ftlm.app.forms import parse_fields
+from ftlm.app.session import STATE_MADE, Session
 from ftlm.errors import DataError, FtlmError, ModelError
 
 if TYPE_CHECKING:
@@ -31,16 +31,16 @@ Receive = Callable[[], Awaitable[MutableMapping[str, Any]]]
 Send = Callable[[MutableMapping[str, Any]], Awaitable[None]]
 
 #: Longest body of a request that uploads no file.
-MOST_WORDS = 64 << 10
+MAX_BODY_BYTES = 64 << 10
 #: Allows only the page's own script, style and server, and no embedding in frames.
-POLICY = (
+CONTENT_SECURITY_POLICY = (
     "default-src 'none'; script-src 'self'; style-src 'self'; connect-src 'self'; img-src data:; base-uri 'none'; "
     "form-action 'none'; frame-ancestors 'none'"
 )
 #: Reports are sandboxed: their scripts cannot access the application.
 REPORT_POLICY = "sandbox allow-scripts; frame-ancestors 'none'"
-ALWAYS = {
-    "content-security-policy": POLICY,
+SECURITY_HEADERS = {
+    "content-security-policy": CONTENT_SECURITY_POLICY,
     "x-content-type-options": "nosniff",
     "referrer-policy": "no-referrer",
     "cache-control": "no-store",
@@ -48,11 +48,11 @@ ALWAYS = {
     "cross-origin-opener-policy": "same-origin",
     "cross-origin-resource-policy": "same-origin",
 }
-HTML, JSON, TEXT = "text/html; charset=utf-8", "application/json", "text/plain; charset=utf-8"
+HTML_TYPE, JSON_TYPE, TEXT_TYPE = "text/html; charset=utf-8", "application/json", "text/plain; charset=utf-8"
 
 
 @dataclass(frozen=True)
-class Answer:
+class HttpResponse:
     """HTTP response.
 
     Parameters
@@ -69,8 +69,8 @@ class Answer:
 
     status: int
     body: str | bytes = ""
-    kind: str = JSON
-    more: Mapping[str, str] | None = None
+    content_type: str = JSON_TYPE
+    extra_headers: Mapping[str, str] | None = None
 
 
 class RefusedError(Exception):
@@ -102,13 +102,13 @@ class Request:
             if not message.get("more_body"):
                 return
 
-    async def words(self) -> dict[str, Any]:
+    async def read_json(self) -> dict[str, Any]:
         """Return the body as a JSON object."""
         body = b""
         async for chunk in self.chunks():
             body += chunk
-            if len(body) > MOST_WORDS:
-                raise RefusedError(413, f"the request is longer than {MOST_WORDS >> 10} kB")
+            if len(body) > MAX_BODY_BYTES:
+                raise RefusedError(413, f"the request is longer than {MAX_BODY_BYTES >> 10} kB")
         try:
             said = json.loads(body)
         except (ValueError, RecursionError):
@@ -118,7 +118,7 @@ class Request:
         return said
 
 
-class Door:
+class WebApplication:
     """ASGI application of the page.
 
     Parameters
@@ -133,7 +133,7 @@ class Door:
         Secret of the one-time address that redirects to the permanent one.
     """
 
-    def __init__(self, desk: Desk, token: str, hosts: tuple[str, ...], key: str = "") -> None:
+    def __init__(self, desk: Session, token: str, hosts: tuple[str, ...], key: str = "") -> None:
         self._desk = desk
         self._token = token
         self._hosts = hosts
@@ -144,19 +144,24 @@ class Door:
         if scope["type"] != "http":
             return
         try:
-            answer = await self._answered(self._checked(scope, receive))
-        except _LetInError:
-            answer = Answer(303, more={"location": f"/{self._token}/"})
+            answer = await self._dispatch(self._check_request(scope, receive))
+        except _RedirectError:
+            answer = HttpResponse(303, extra_headers={"location": f"/{self._token}/"})
         except RefusedError as refused:
-            answer = Answer(refused.status, json.dumps({"error": str(refused)}))
+            answer = HttpResponse(refused.status, json.dumps({"error": str(refused)}))
         except FtlmError as error:
             words = view.page_words(self._desk.without_paths(str(error)))
-            answer = Answer(400, json.dumps({"error": words}))
+            answer = HttpResponse(400, json.dumps({"error": words}))
         except Exception as error:
             # The page must be told; a traceback would name folders of this machine.
-            answer = Answer(500, json.dumps({"error": f"a fault in ftlm itself ({type(error).__name__})"}))
+            answer = HttpResponse(500, json.dumps({"error": f"a fault in ftlm itself ({type(error).__name__})"}))
         body = answer.body.encode("utf-8", "replace") if isinstance(answer.body, str) else answer.body
-        headers = {**ALWAYS, "content-type": answer.kind, "content-length": str(len(body)), **(answer.more or {})}
+        headers = {
+            **SECURITY_HEADERS,
+            "content-type": answer.content_type,
+            "content-length": str(len(body)),
+            **(answer.extra_headers or {}),
+        }
         if answer.status in (403, 404, 413, 415):
             # What is left of a refused body is not waited for.
             headers["connection"] = "close"
@@ -164,7 +169,7 @@ class Door:
         await send({"type": "http.response.start", "status": answer.status, "headers": pairs})
         await send({"type": "http.response.body", "body": b"" if scope["method"] == "HEAD" else body})
 
-    def _checked(self, scope: Scope, receive: Receive) -> Request:
+    def _check_request(self, scope: Scope, receive: Receive) -> Request:
         """Check the head of a request and parse it."""
         headers: dict[str, str] = {}
         for name, value in scope["headers"]:
@@ -183,7 +188,7 @@ class Door:
             raise RefusedError(403, "only the page itself may change what is on it")
         path = scope["path"].split("/")[1:]
         if method == "GET" and len(path) == 2 and path[0] == "open":
-            self._first(path[1])
+            self._redeem_key(path[1])
         if not secrets.compare_digest(path[0].encode("utf-8", "replace"), self._token.encode()):
             raise RefusedError(404, "there is nothing here; use the address that ftlm app printed")
         try:
@@ -192,39 +197,39 @@ class Door:
             raise RefusedError(400, "the address has too many fields") from None
         return Request(method, path[1:], {k: v[0] for k, v in query.items()}, headers, receive)
 
-    def _first(self, key: str) -> None:
+    def _redeem_key(self, key: str) -> None:
         """Redirect the first visitor with the one-time key. The key is visible in the command line of the browser."""
         good = bool(self._key) and secrets.compare_digest(key.encode("utf-8", "replace"), self._key.encode())
         if not good:
             raise RefusedError(404, "this address was good once; the one that lasts is in the terminal of ftlm app")
         self._key = ""
-        raise _LetInError(303, "")
+        raise _RedirectError(303, "")
 
-    async def _answered(self, request: Request) -> Answer:
+    async def _dispatch(self, request: Request) -> HttpResponse:
         """Return the response of the route."""
         method = "GET" if request.method == "HEAD" else request.method
         match method, request.path:
             case "GET", []:
-                raise _LetInError(303, "")
+                raise _RedirectError(303, "")
             case "GET", [""]:
-                return Answer(200, view.page(self._desk), HTML)
+                return HttpResponse(200, view.page(self._desk), HTML_TYPE)
             case "GET", ["app.js"]:
-                return Answer(200, view.script(), "text/javascript; charset=utf-8")
+                return HttpResponse(200, view.script(), "text/javascript; charset=utf-8")
             case "GET", ["app.css"]:
-                return Answer(200, view.style(), "text/css; charset=utf-8")
+                return HttpResponse(200, view.style(), "text/css; charset=utf-8")
             case "GET", ["state"]:
-                return Answer(200, json.dumps(view.state(self._desk)))
+                return HttpResponse(200, json.dumps(view.state(self._desk)))
             case "POST", ["files"]:
                 return await self._upload(request)
             case _, ["files", key]:
                 return await self._file(method, key, request)
             case "POST", ["models"]:
-                model = self._desk.start(self._desk.recipe(await request.words()))
-                return Answer(200, view.model(model), HTML)
+                model = self._desk.start(self._desk.parse_request(await request.read_json()))
+                return HttpResponse(200, view.model(model), HTML_TYPE)
             case "POST", ["check"]:
-                return Answer(200, json.dumps({"error": self._wrong(await request.words())}))
+                return HttpResponse(200, json.dumps({"error": self._request_problem(await request.read_json())}))
             case "GET", ["comparison"]:
-                return Answer(200, view.comparison(self._desk), HTML)
+                return HttpResponse(200, view.comparison(self._desk), HTML_TYPE)
             case _, ["models", key, *what]:
                 return self._model(method, key, what)
         known = request.path in (
@@ -239,15 +244,15 @@ class Door:
         )
         raise RefusedError(405 if known else 404, "there is nothing here" if not known else "not in this way")
 
-    def _wrong(self, wanted: Mapping[str, Any]) -> str:
+    def _request_problem(self, wanted: Mapping[str, Any]) -> str:
         """Return the error message of a fit request, or "" if it is valid."""
         try:
-            self._desk.recipe(wanted)
+            self._desk.parse_request(wanted)
         except FtlmError as error:
             return view.page_words(self._desk.without_paths(str(error)))
         return ""
 
-    async def _upload(self, request: Request) -> Answer:
+    async def _upload(self, request: Request) -> HttpResponse:
         if request.headers.get("content-type", "").partition(";")[0].strip() != "application/octet-stream":
             raise RefusedError(415, "a file is sent as it is (application/octet-stream), not as a form")
         said = request.headers.get("content-length")
@@ -259,9 +264,9 @@ class Door:
             file = await self._desk.take(name, size, request.chunks())
         except FtlmError as error:
             raise RefusedError(413, self._desk.without_paths(str(error))) from None
-        return Answer(200, view.file(file), HTML)
+        return HttpResponse(200, view.file(file), HTML_TYPE)
 
-    async def _file(self, method: str, key: str, request: Request) -> Answer:
+    async def _file(self, method: str, key: str, request: Request) -> HttpResponse:
         file = self._desk.files.get(key)
         if file is None:
             raise RefusedError(404, "this file is no longer on the page")
@@ -269,44 +274,44 @@ class Door:
             case "GET":
                 pass
             case "POST":
-                file.asked = asked_of(await request.words())
+                file.user_options = parse_fields(await request.read_json())
                 await self._desk.open(file)
             case "DELETE":
                 self._desk.remove_file(key)
-                return Answer(200, "{}")
+                return HttpResponse(200, "{}")
             case _:
                 raise RefusedError(405, "not in this way")
-        return Answer(200, view.file(file), HTML)
+        return HttpResponse(200, view.file(file), HTML_TYPE)
 
-    def _model(self, method: str, key: str, what: list[str]) -> Answer:
+    def _model(self, method: str, key: str, what: list[str]) -> HttpResponse:
         model = self._desk.models.get(key)
         if model is None:
             raise RefusedError(404, "this model is no longer on the page")
         match method, what:
             case "GET", []:
-                return Answer(200, view.model(model), HTML)
+                return HttpResponse(200, view.model(model), HTML_TYPE)
             case "POST", ["stop"]:
                 self._desk.stop(key)
-                return Answer(200, view.model(model), HTML)
+                return HttpResponse(200, view.model(model), HTML_TYPE)
             case "POST", ["resume"]:
-                return Answer(200, view.model(self._desk.resume(key)), HTML)
+                return HttpResponse(200, view.model(self._desk.resume(key)), HTML_TYPE)
             case "DELETE", []:
                 self._desk.remove_model(key)
-                return Answer(200, "{}")
+                return HttpResponse(200, "{}")
             case "GET", ["report" | "model" | "script" | "page"]:
-                if model.state != MADE or model.told is None:
+                if model.state != STATE_MADE or model.told is None:
                     raise RefusedError(404, "this model is not made yet")
                 return self._download(key, what[0], Path(model.recipe.estimation.file).stem)
         raise RefusedError(405 if what in ([], ["stop"], ["resume"]) else 404, "not in this way")
 
-    def _download(self, key: str, what: str, stem: str) -> Answer:
+    def _download(self, key: str, what: str, stem: str) -> HttpResponse:
         """Return a file of a model. Its path never comes from the request."""
         model = self._desk.models[key]
         ending, kind = {
-            "report": ("report.html", HTML),
-            "page": ("report.html", HTML),
-            "model": ("model.json", JSON),
-            "script": ("script.py", TEXT),
+            "report": ("report.html", HTML_TYPE),
+            "page": ("report.html", HTML_TYPE),
+            "model": ("model.json", JSON_TYPE),
+            "script": ("script.py", TEXT_TYPE),
         }[what]
         if what == "script":
             content = str((model.told or {})["script"]).encode("utf-8", "replace")
@@ -318,21 +323,21 @@ class Door:
                 raise RefusedError(404, "its file is no longer there") from None
         policy = {"content-security-policy": REPORT_POLICY}
         if what == "page":
-            return Answer(200, content, kind, policy)
+            return HttpResponse(200, content, kind, policy)
         plain = "".join(c if c.isascii() and (c.isalnum() or c in "._-") else "_" for c in stem)[:80] or "ftlm"
         name = f'attachment; filename="{plain}-{model.number}-{ending}"'
-        return Answer(200, content, kind, {"content-disposition": name, **policy})
+        return HttpResponse(200, content, kind, {"content-disposition": name, **policy})
 
 
-class _LetInError(RefusedError):
+class _RedirectError(RefusedError):
     """Redirect to the permanent address."""
 
 
 #: Time that a client may take for a request head, between two parts of a body, and to read a part of an answer.
-PATIENCE = 20.0
+CLIENT_TIMEOUT_S = 20.0
 
 
-def patient() -> type[H11Protocol]:
+def make_connection_class() -> type[H11Protocol]:
     """Return a connection class of uvicorn that checks its client twice per :data:`CLIENT_TIMEOUT_S`.
 
     The keep-alive limit of uvicorn only covers connections that are idle after an answer.
@@ -351,7 +356,7 @@ def patient() -> type[H11Protocol]:
             """Start the timeout."""
             super().connection_made(transport)
             self._since = self.loop.time()
-            self._again()
+            self._schedule_check()
 
         def data_received(self, data: bytes) -> None:
             """Restart the timeout at each part of a body, and at the end of a head."""
@@ -371,29 +376,29 @@ def patient() -> type[H11Protocol]:
                 self._next.cancel()
             super().connection_lost(exc)
 
-        def _again(self) -> None:
-            self._next = self.loop.call_later(PATIENCE / 2, self._look)
+        def _schedule_check(self) -> None:
+            self._next = self.loop.call_later(CLIENT_TIMEOUT_S / 2, self._check_timeout)
 
-        def _look(self) -> None:
+        def _check_timeout(self) -> None:
             """Abort the connection if the client sends nothing or does not read its answer."""
             unread, before = self.transport.get_write_buffer_size(), self._unread
             self._unread = unread
             if unread < before or (unread and not before):
                 self._since = self.loop.time()
             owes = bool(unread) or self.conn.their_state in (h11.IDLE, h11.SEND_BODY)
-            if owes and self.loop.time() - self._since >= PATIENCE:
+            if owes and self.loop.time() - self._since >= CLIENT_TIMEOUT_S:
                 # Not closed: that would wait for what was sent to be read.
                 self.transport.abort()
             else:
-                self._again()
+                self._schedule_check()
 
     return Connection
 
 
 #: Default address and port, limit of connections, and chunk size of files read from disk.
-PORT, ADDRESS = 8347, "127.0.0.1"
-MOST_CONNECTIONS = 100
-CHUNK = 1 << 20
+DEFAULT_PORT, LOOPBACK_ADDRESS = 8347, "127.0.0.1"
+MAX_CONNECTIONS = 100
+READ_CHUNK_BYTES = 1 << 20
 
 
 def check_installed() -> None:
@@ -402,7 +407,7 @@ def check_installed() -> None:
         raise ModelError("ftlm app needs uvicorn; run: pip install 'ftlm[app]'")
 
 
-def listening(port: int | None) -> tuple[socket.socket, str]:
+def open_socket(port: int | None) -> tuple[socket.socket, str]:
     """Open a socket on the loopback address; return it with a note about its port.
 
     Parameters
@@ -419,19 +424,21 @@ def listening(port: int | None) -> tuple[socket.socket, str]:
     """
     if port is not None and not 0 <= port <= 65535:
         raise ModelError(f"--port {port} is none; take one from 1024 to 65535, or 0 for any")
-    wanted = PORT if port is None else port
+    wanted = DEFAULT_PORT if port is None else port
     sock = socket.socket(socket.AF_INET, socket.SOCK_STREAM)
     if sys.platform != "win32":
         # There it would let two programs share the port.
         sock.setsockopt(socket.SOL_SOCKET, socket.SO_REUSEADDR, 1)
     try:
-        sock.bind((ADDRESS, wanted))
-        sock.listen(MOST_CONNECTIONS)
+        sock.bind((LOOPBACK_ADDRESS, wanted))
+        sock.listen(MAX_CONNECTIONS)
     except OSError as error:
         sock.close()
         taken = error.errno == errno.EADDRINUSE
         if port is None and taken:
-            return listening(0)[0], f"port {PORT} is taken, perhaps by another ftlm app; this one has a port of its own"
+            return open_socket(0)[
+                0
+            ], f"port {DEFAULT_PORT} is taken, perhaps by another ftlm app; this one has a port of its own"
         why = "is taken, perhaps by another ftlm app" if taken else f"cannot be used ({error.strerror})"
         raise DataError(f"--port {wanted} {why}; take another one, or leave it out") from None
     return sock, ""
@@ -461,7 +468,7 @@ def serve(files: Sequence[str] = (), *, port: int | None = None, browser: bool =
     for path in paths:
         if not path.is_file():
             raise DataError(f"{str(path)!r} is no file; check the path")
-    sock, note = listening(port)
+    sock, note = open_socket(port)
     if note:
         print(f"ftlm: {note}", file=sys.stderr)
     with sock, contextlib.suppress(KeyboardInterrupt):
@@ -474,21 +481,21 @@ async def _serve(sock: socket.socket, paths: Sequence[Path], browser: bool) -> N
 
     token, key = secrets.token_urlsafe(24), secrets.token_urlsafe(24)
     own = sock.getsockname()[1]
-    hosts = (f"{ADDRESS}:{own}", f"localhost:{own}")
-    desk = Desk()
+    hosts = (f"{LOOPBACK_ADDRESS}:{own}", f"localhost:{own}")
+    desk = Session()
     config = uvicorn.Config(
-        Door(desk, token, hosts, key if browser else ""),
+        WebApplication(desk, token, hosts, key if browser else ""),
         log_config=None,
         log_level="critical",
         access_log=False,
         lifespan="off",
         server_header=False,
         ws="none",
-        http=patient(),
+        http=make_connection_class(),
         loop="asyncio",
         timeout_keep_alive=15,
         timeout_graceful_shutdown=1,
-        limit_concurrency=MOST_CONNECTIONS,
+        limit_concurrency=MAX_CONNECTIONS,
         proxy_headers=False,
     )
     server = uvicorn.Server(config)
@@ -498,7 +505,7 @@ async def _serve(sock: socket.socket, paths: Sequence[Path], browser: bool) -> N
     address = f"http://{hosts[0]}/{token}/"
     try:
         for path in paths:
-            await desk.take(path.name, path.stat().st_size, _pieces(path))
+            await desk.take(path.name, path.stat().st_size, _read_chunks(path))
         print(f"ftlm app: {address}\nCtrl-C ends it. Who knows this address can use it: do not pass it on.", flush=True)
         opener = None
         if browser:
@@ -513,8 +520,8 @@ async def _serve(sock: socket.socket, paths: Sequence[Path], browser: bool) -> N
         await desk.close()
 
 
-async def _pieces(path: Path) -> AsyncIterator[bytes]:
+async def _read_chunks(path: Path) -> AsyncIterator[bytes]:
     """Yield the chunks of a file on this machine."""
     with open(path, "rb") as stream:
-        while piece := stream.read(CHUNK):
+        while piece := stream.read(READ_CHUNK_BYTES):
             yield piece

@@ -15,26 +15,32 @@ from dataclasses import dataclass, field
 from pathlib import Path
 from typing import Any
 
-from ftlm.app.forms import CHOOSING, Reading, Recipe, checked_structures
+from ftlm.app.forms import SELECTION_PHASE, FitRequest, RunSource, parse_structures
 from ftlm.app.subprocess_task import Task, TaskError
 from ftlm.errors import DataError, ModelError
-from ftlm.progress import left_in_words
+from ftlm.progress import format_time_left
 from ftlm.structure.structure import Structure
 from ftlm.utils.validation import nearest, real_number
 
 #: Limits: bytes of one file and of all files, number of files, of models and of queued models, time to open a file.
-MOST_BYTES, MOST_BYTES_IN_ALL = 256 << 20, 1 << 30
-MOST_FILES, MOST_MODELS, MOST_WAITING = 20, 40, 8
-SECONDS_TO_OPEN = 600.0
+MAX_FILE_BYTES, MAX_TOTAL_BYTES = 256 << 20, 1 << 30
+MAX_FILES, MAX_MODELS, MAX_QUEUED_MODELS = 20, 40, 8
+OPEN_TIMEOUT_S = 600.0
 #: Time after which the page is told that a file is still being read.
-PATIENCE = 2.0
+OPEN_REPLY_TIMEOUT_S = 2.0
 #: Files that are opened at the same time.
-MOST_OPENING = 2
+MAX_CONCURRENT_OPENS = 2
 #: Longest file name [bytes].
-MOST_LETTERS = 200
+MAX_NAME_BYTES = 200
 #: Characters that Windows refuses in file names.
-_REFUSED = ':*?"<>|' if os.name == "nt" else ""
-WAITING, RUNNING, MADE, FAILED, STOPPED = "waiting", "running", "made", "failed", "stopped"
+_RESERVED_CHARACTERS = ':*?"<>|' if os.name == "nt" else ""
+STATE_WAITING, STATE_RUNNING, STATE_MADE, STATE_FAILED, STATE_STOPPED = (
+    "waiting",
+    "running",
+    "made",
+    "failed",
+    "stopped",
+)
 
 
 @dataclass
@@ -58,8 +64,8 @@ class File:
     key: str
     name: str
     size: int
-    asked: dict[str, Any] = field(default_factory=dict)
-    told: dict[str, Any] | None = None
+    user_options: dict[str, Any] = field(default_factory=dict)
+    preview: dict[str, Any] | None = None
     error: str = ""
     version: int = 0
     task: Task | None = None
@@ -67,13 +73,13 @@ class File:
     @property
     def is_run(self) -> bool:
         """Whether the file can be loaded as a run."""
-        return self.told is not None and not self.told["problem"]
+        return self.preview is not None and not self.preview["problem"]
 
     @property
-    def reading(self) -> Reading:
+    def run_source(self) -> RunSource:
         """File and arguments of `ftlm.load`, all options included."""
-        assert self.told is not None
-        return Reading(self.name, self.told["options"])
+        assert self.preview is not None
+        return RunSource(self.name, self.preview["options"])
 
 
 @dataclass
@@ -100,12 +106,12 @@ class Model:
 
     key: str
     number: int
-    recipe: Recipe
-    state: str = WAITING
+    recipe: FitRequest
+    state: str = STATE_WAITING
     phase: str = "waiting"
     share: float | None = None
-    begun: float = 0.0
-    begun_phase: float = 0.0
+    started_at: float = 0.0
+    phase_started_at: float = 0.0
     left: str = ""
     took: float = 0.0
     told: dict[str, Any] | None = None
@@ -117,10 +123,10 @@ class Model:
     @property
     def is_busy(self) -> bool:
         """Whether the model is queued or running."""
-        return self.state in (WAITING, RUNNING)
+        return self.state in (STATE_WAITING, STATE_RUNNING)
 
 
-class Desk:
+class Session:
     """State of one browser session; only the server's thread may use it.
 
     Parameters
@@ -134,7 +140,7 @@ class Desk:
         self.files: dict[str, File] = {}
         self.models: dict[str, Model] = {}
         self._turn = asyncio.Lock()
-        self._openings = asyncio.Semaphore(MOST_OPENING)
+        self._openings = asyncio.Semaphore(MAX_CONCURRENT_OPENS)
         self._jobs: set[asyncio.Task[None]] = set()
         self._count = 0
 
@@ -142,20 +148,21 @@ class Desk:
 
     def check_room(self, name: str, size: int | None) -> str:
         """Return the name under which a file will be stored; refuse a file beyond the limits."""
-        if len(self.files) >= MOST_FILES:
-            raise DataError(f"{MOST_FILES} files are open, as many as there may be; remove one")
+        if len(self.files) >= MAX_FILES:
+            raise DataError(f"{MAX_FILES} files are open, as many as there may be; remove one")
         if size is not None:
             self._check_size(name, size)
         return self._free_name(safe_name(name))
 
     def _check_size(self, name: str, size: int, own: File | None = None) -> None:
-        if size > MOST_BYTES:
+        if size > MAX_FILE_BYTES:
             raise DataError(
-                f"{safe_name(name)!r} is larger than {MOST_BYTES >> 20} MB, the most that the page takes; load it in "
+                f"{safe_name(name)!r} is larger than {MAX_FILE_BYTES >> 20} MB, the most that the page takes; load "
+                "it in "
                 "Python, or take fewer rows"
             )
-        if size + sum(f.size for f in self.files.values() if f is not own) > MOST_BYTES_IN_ALL:
-            raise DataError(f"the files together are larger than {MOST_BYTES_IN_ALL >> 20} MB; remove one")
+        if size + sum(f.size for f in self.files.values() if f is not own) > MAX_TOTAL_BYTES:
+            raise DataError(f"the files together are larger than {MAX_TOTAL_BYTES >> 20} MB; remove one")
 
     def _free_name(self, name: str) -> str:
         taken = {f.name.casefold() for f in self.files.values()}
@@ -192,10 +199,10 @@ class Desk:
         except BaseException:
             self.remove_file(file.key)
             raise
-        await asyncio.wait({self._begun(self.open(file))}, timeout=PATIENCE)
+        await asyncio.wait({self._start_job(self.open(file))}, timeout=OPEN_REPLY_TIMEOUT_S)
         return file
 
-    def _begun(self, work: Coroutine[Any, Any, None]) -> asyncio.Task[None]:
+    def _start_job(self, work: Coroutine[Any, Any, None]) -> asyncio.Task[None]:
         """Start a background job and keep a reference to it."""
         job = asyncio.create_task(work)
         self._jobs.add(job)
@@ -206,16 +213,16 @@ class Desk:
         """Read the preview of a file with the user's options; an earlier reading is stopped."""
         if file.task is not None:
             file.task.stop()
-        asked = {"do": "open", "file": file.name, "options": file.asked}
+        asked = {"do": "open", "file": file.name, "options": file.user_options}
         file.task = task = Task(asked, self.folder, lambda _: None)
         try:
             async with self._openings:
-                told, error = await task.answer(SECONDS_TO_OPEN), ""
+                told, error = await task.answer(OPEN_TIMEOUT_S), ""
         except TaskError as failed:
             told, error = None, self.without_paths(str(failed))
         if file.task is not task:
             return
-        file.task, file.told, file.error = None, told, error
+        file.task, file.preview, file.error = None, told, error
         file.version += 1
 
     def remove_file(self, key: str) -> None:
@@ -227,7 +234,7 @@ class Desk:
             A queued or running model needs the file.
         """
         file = self.files[key]
-        if any(m.is_busy and file.name in _names(m.recipe) for m in self.models.values()):
+        if any(m.is_busy and file.name in _file_names(m.recipe) for m in self.models.values()):
             raise DataError(f"{file.name!r} is in use by a model that is being made; stop that first")
         del self.files[key]
         if file.task is not None:
@@ -237,7 +244,7 @@ class Desk:
 
     # ----------------------------------------------------------------------------------------------------------- models
 
-    def recipe(self, told: Mapping[str, Any]) -> Recipe:
+    def parse_request(self, told: Mapping[str, Any]) -> FitRequest:
         """Return the fit request of the page's form.
 
         Raises
@@ -253,7 +260,7 @@ class Desk:
             raise ModelError("structure is no equation; write one, such as D y = a0 y + b0 u")
         if sum(map(len, texts)) > 4000:
             raise ModelError("the equation has more than 4000 letters; write a shorter one")
-        recipe = Recipe(
+        recipe = FitRequest(
             self._run(str(told.get("estimation") or "")),
             self._run(other) if other else None,
             0.0 if other else share,
@@ -263,22 +270,22 @@ class Desk:
                 for name, default in (("way", "fit"), ("method", ""), ("offset", ""), ("loss", ""))
             ),
         )
-        for structure in checked_structures(recipe):
+        for structure in parse_structures(recipe):
             for reading in filter(None, (recipe.estimation, recipe.validation)):
                 _check_signals(structure, reading)
         return recipe
 
-    def _run(self, key: str) -> Reading:
+    def _run(self, key: str) -> RunSource:
         file = self.files.get(key)
         if file is None:
             raise DataError("no file is chosen; drop one first")
-        if file.task is not None or (file.told is None and not file.error):
+        if file.task is not None or (file.preview is None and not file.error):
             raise DataError(f"{file.name!r} is still being read; wait until its columns are shown")
         if not file.is_run:
-            raise DataError(f"{file.name!r} is no run yet: {file.told['problem'] if file.told else file.error}")
-        return file.reading
+            raise DataError(f"{file.name!r} is no run yet: {file.preview['problem'] if file.preview else file.error}")
+        return file.run_source
 
-    def start(self, recipe: Recipe) -> Model:
+    def start(self, recipe: FitRequest) -> Model:
         """Queue a model.
 
         Raises
@@ -286,19 +293,19 @@ class Desk:
         DataError
             Too many models, or too many in the queue.
         """
-        if len(self.models) >= MOST_MODELS:
-            raise DataError(f"{MOST_MODELS} models are kept, as many as there may be; remove one")
-        self._check_turn()
+        if len(self.models) >= MAX_MODELS:
+            raise DataError(f"{MAX_MODELS} models are kept, as many as there may be; remove one")
+        self._check_queue()
         self._count += 1
         model = Model(secrets.token_hex(8), self._count, recipe)
-        model.files = tuple(f.key for f in self.files.values() if f.name in _names(recipe))
+        model.files = tuple(f.key for f in self.files.values() if f.name in _file_names(recipe))
         self.models[model.key] = model
-        self._begun(self._make(model))
+        self._start_job(self._make(model))
         return model
 
-    def _check_turn(self) -> None:
-        if sum(m.is_busy for m in self.models.values()) >= MOST_WAITING:
-            raise DataError(f"{MOST_WAITING} models wait already; stop one, or wait")
+    def _check_queue(self) -> None:
+        if sum(m.is_busy for m in self.models.values()) >= MAX_QUEUED_MODELS:
+            raise DataError(f"{MAX_QUEUED_MODELS} models wait already; stop one, or wait")
 
     def resume(self, key: str) -> Model:
         """Continue a stopped model: a structure selection from its checkpoint, a fit from the beginning.
@@ -309,23 +316,23 @@ class Desk:
             One of its files was removed, or the queue is full.
         """
         model = self.models[key]
-        if model.state not in (STOPPED, FAILED):
+        if model.state not in (STATE_STOPPED, STATE_FAILED):
             return model
         if any(file not in self.files for file in model.files):
             raise DataError(
-                f"{' or '.join(sorted(_names(model.recipe)))} is no longer on the page; drop it, and ask anew"
+                f"{' or '.join(sorted(_file_names(model.recipe)))} is no longer on the page; drop it, and ask anew"
             )
-        self._check_turn()
-        model.state, model.phase, model.error, model.share, model.left = WAITING, "waiting", "", None, ""
+        self._check_queue()
+        model.state, model.phase, model.error, model.share, model.left = STATE_WAITING, "waiting", "", None, ""
         model.version += 1
-        self._begun(self._make(model))
+        self._start_job(self._make(model))
         return model
 
     async def _make(self, model: Model) -> None:
         async with self._turn:
-            if model.state != WAITING:
+            if model.state != STATE_WAITING:
                 return
-            model.state, model.phase, model.begun = RUNNING, "starting", time.monotonic()
+            model.state, model.phase, model.started_at = STATE_RUNNING, "starting", time.monotonic()
             model.version += 1
             asked = {
                 "do": "model",
@@ -334,16 +341,16 @@ class Desk:
                 "report": f"{model.key}.html",
                 "store": f"{model.key}.ftlm" if model.recipe.is_choice else None,
             }
-            model.task = Task(asked, self.folder, lambda said: _note(model, said))
+            model.task = Task(asked, self.folder, lambda said: _record_progress(model, said))
             try:
                 told = await model.task.answer()
             except TaskError as failed:
-                if model.state == RUNNING:
-                    model.state, model.error = FAILED, self.without_paths(str(failed))
+                if model.state == STATE_RUNNING:
+                    model.state, model.error = STATE_FAILED, self.without_paths(str(failed))
             else:
-                if model.state == RUNNING:
-                    model.state, model.told = MADE, told
-            model.took += time.monotonic() - model.begun
+                if model.state == STATE_RUNNING:
+                    model.state, model.told = STATE_MADE, told
+            model.took += time.monotonic() - model.started_at
             model.task = None
             model.version += 1
 
@@ -351,7 +358,7 @@ class Desk:
         """Stop a queued or running model; finished files stay."""
         model = self.models[key]
         if model.is_busy:
-            model.state = STOPPED
+            model.state = STATE_STOPPED
             model.version += 1
             if model.task is not None:
                 model.task.stop()
@@ -386,7 +393,7 @@ class Desk:
             shutil.rmtree(self.folder, ignore_errors=True)
 
 
-def _check_signals(structure: Structure, reading: Reading) -> None:
+def _check_signals(structure: Structure, reading: RunSource) -> None:
     """Raise if the run lacks a signal of the structure, before a process is started."""
     there = [name for role in ("outputs", "inputs") for name in reading.options.get(role, {})]
     for name in structure.signals:
@@ -397,34 +404,34 @@ def _check_signals(structure: Structure, reading: Reading) -> None:
             )
 
 
-def _names(recipe: Recipe) -> set[str]:
+def _file_names(recipe: FitRequest) -> set[str]:
     return {recipe.estimation.file, *(() if recipe.validation is None else (recipe.validation.file,))}
 
 
-def _note(model: Model, said: Mapping[str, Any]) -> None:
+def _record_progress(model: Model, said: Mapping[str, Any]) -> None:
     """Store a progress report of a task process in its model."""
     if "phase" in said:
         model.phase, model.share, model.left = str(said["phase"]), None, ""
-        model.begun_phase = time.monotonic()
-    elif said.get("total") and model.phase.startswith(CHOOSING):
+        model.phase_started_at = time.monotonic()
+    elif said.get("total") and model.phase.startswith(SELECTION_PHASE):
         # Candidates come up as others are fitted: a share of those known so far would go back.
         model.left = f"{said['done']} of {said['total']} candidates known so far are fitted"
     elif said.get("total"):
         share = min(max(float(said["done"]) / float(said["total"]), 0.0), 1.0)
-        passed = time.monotonic() - model.begun_phase
+        passed = time.monotonic() - model.phase_started_at
         model.share = share
         if share > 0.02 and passed > 1.0:
             # What is measured takes the place of what was expected.
             model.phase = model.phase.partition(", about")[0]
-            model.left = left_in_words(passed * (1.0 - share) / share)
+            model.left = format_time_left(passed * (1.0 - share) / share)
 
 
 def safe_name(name: str) -> str:
     """Return a file name without folders and without characters that a file system refuses."""
     last = re.split(r"[/\\]", name)[-1]
-    bare = "".join(c if c.isprintable() and c not in _REFUSED else "_" for c in last).strip(" .") or "file"
+    bare = "".join(c if c.isprintable() and c not in _RESERVED_CHARACTERS else "_" for c in last).strip(" .") or "file"
     stem, dot, suffix = bare.rpartition(".")
-    while len(bare.encode("utf-8", "replace")) > MOST_LETTERS and (stem or suffix):
+    while len(bare.encode("utf-8", "replace")) > MAX_NAME_BYTES and (stem or suffix):
         stem, suffix = (stem[:-1], suffix) if stem else (stem, suffix[:-1])
         bare = f"{stem}{dot}{suffix}"
     return bare

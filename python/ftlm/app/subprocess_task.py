@@ -15,7 +15,7 @@ from typing import Any
 from ftlm.errors import DataError
 
 #: Longest line of a task's answer. A page of charts takes some hundred kilobytes.
-LONGEST = 64 << 20
+MAX_ANSWER_LINE_BYTES = 64 << 20
 
 
 class TaskError(DataError):
@@ -67,7 +67,7 @@ class Task:
             stdout=asyncio.subprocess.PIPE,
             stderr=asyncio.subprocess.DEVNULL,
             cwd=self._folder,
-            limit=LONGEST,
+            limit=MAX_ANSWER_LINE_BYTES,
             start_new_session=True,
         )
         self._process = process
@@ -75,14 +75,14 @@ class Task:
             if self._ended:
                 raise TaskError("stopped")
             async with asyncio.timeout(seconds):
-                return await self._listened(process)
+                return await self._read_answer(process)
         except TimeoutError:
             raise TaskError(f"it took more than {seconds:g} s and was ended; take a smaller file") from None
         finally:
             self._kill()
             await process.wait()
 
-    async def _listened(self, process: asyncio.subprocess.Process) -> dict[str, Any]:
+    async def _read_answer(self, process: asyncio.subprocess.Process) -> dict[str, Any]:
         """Return the answer of the process and forward its reports."""
         assert process.stdin is not None
         assert process.stdout is not None
@@ -95,7 +95,7 @@ class Task:
             except ValueError:
                 raise TaskError("its answer is too long for a page; take fewer columns") from None
             if not line:
-                raise TaskError("stopped" if self._ended else _ending(await process.wait()))
+                raise TaskError("stopped" if self._ended else _describe_exit(await process.wait()))
             try:
                 said = json.loads(line)
             except ValueError:
@@ -123,7 +123,7 @@ class Task:
                 process.kill()
 
 
-def _ending(code: int) -> str:
+def _describe_exit(code: int) -> str:
     """Describe the exit of a process that gave no answer."""
     if code >= 0:
         return f"the process that worked on it ended with code {code}, without an answer; try a smaller file"

@@ -12,22 +12,22 @@ from jinja2 import Environment, FunctionLoader, StrictUndefined
 from markupsafe import Markup
 
 from ftlm._core import __version__
-from ftlm.app.forms import LOSSES, METHODS, OFFSETS, Made
-from ftlm.app.session import MADE, MOST_BYTES, RUNNING, Desk, File, Model
+from ftlm.app.forms import LOSS_NAMES, METHOD_NAMES, OFFSET_KINDS, FittedModel
+from ftlm.app.session import MAX_FILE_BYTES, STATE_MADE, STATE_RUNNING, File, Model, Session
 from ftlm.data.run import Run
-from ftlm.data.units import TIME_UNITS, UNITS
-from ftlm.io.dialect import DATES, DECIMALS, GROUPS, SEPARATORS
+from ftlm.data.units import SIGNAL_UNITS, TIME_UNITS
+from ftlm.io.dialect import DATE_ORDERS, DECIMAL_CHARACTERS, SEPARATOR_CHARACTERS, THOUSANDS_CHARACTERS
 from ftlm.plot.comparison_charts import comparison_charts
-from ftlm.report.html_report import behaviour_tables, first_warnings, title_of, verdict_box
+from ftlm.report.html_report import behavior_tables, first_warnings, title_of, verdict_box
 from ftlm.report.typesetting import equations_html, parameter_table
 from ftlm.svg.figure import Figure
-from ftlm.svg.html_page import chart_script, look
+from ftlm.svg.html_page import chart_script, style_sheet
 from ftlm.svg.line_chart import chart_css
 from ftlm.utils.formatting import number
 from ftlm.validation.comparison import finite
 
 #: Label of the form field of each Python argument.
-_FIELDS = {
+_FIELD_LABELS = {
     "step": "Step",
     "resample": "Put on the step",
     "time_unit": "Unit of time",
@@ -43,20 +43,20 @@ _FIELDS = {
     "slice": "From” and “To",
 }
 #: Python argument with its value, or with a placeholder in capitals.
-_ARGUMENT = re.compile(
+_ARGUMENT_PATTERN = re.compile(
     r"\b(resample|time_unit|missing|step|time|slice)=(?:'([\w-]+)'|(\d[\w.+-]*\w|\d)|[A-Z]+\b)?|layout=dict\((\w+)=[^)]*\)"
 )
-_PLAIN = (
+_PHRASE_REPLACEMENTS = (
     (re.compile(r" \(commands: [^)]*\)"), ""),
     (re.compile(r"inputs=\{name: column\} and outputs=\{name: column\}"), "the roles below"),
 )
-_ORDER = {"trust": 0, "with care": 1, "do not use": 2}
+_VERDICT_RANKS = {"trust": 0, "with care": 1, "do not use": 2}
 
 
-def _field(found: re.Match[str]) -> str:
+def _field_label(found: re.Match[str]) -> str:
     """Label of the form field of an argument, with its value."""
     name, value = found[1] or found[4], found[2] or found[3]
-    shown = "the role “time”" if name == "time" else f"the field “{_FIELDS.get(name, name)}”"
+    shown = "the role “time”" if name == "time" else f"the field “{_FIELD_LABELS.get(name, name)}”"
     return f"{shown} {value}" if value else shown
 
 
@@ -73,7 +73,7 @@ def _templates() -> Environment:
     return environment
 
 
-def _rendered(template: str, **told: Any) -> str:
+def _render_template(template: str, **told: Any) -> str:
     return _templates().get_template(template).render(**told)
 
 
@@ -86,38 +86,38 @@ def script() -> str:
 @cache
 def style() -> str:
     """Return the style of reports and of the page."""
-    return f"{look()}\n{chart_css()}\n{_read('app.css')}"
+    return f"{style_sheet()}\n{chart_css()}\n{_read('app.css')}"
 
 
 def page_words(text: str) -> str:
     """Return an error message with form labels in place of Python arguments."""
-    for pattern, words in _PLAIN:
+    for pattern, words in _PHRASE_REPLACEMENTS:
         text = pattern.sub(words, text)
-    return _ARGUMENT.sub(_field, text)
+    return _ARGUMENT_PATTERN.sub(_field_label, text)
 
 
-def page(desk: Desk) -> str:
+def page(desk: Session) -> str:
     """Return the whole page in its current state."""
     parts = {
         "files": Markup("").join(Markup(file(f)) for f in desk.files.values()),  # escaped by its template
         "models": Markup("").join(Markup(model(m)) for m in reversed(desk.models.values())),
         "comparison": Markup(comparison(desk)),
     }
-    return _rendered(
+    return _render_template(
         "page.html.j2",
         **parts,
         version=__version__,
-        most=MOST_BYTES,
-        units=[u for u in UNITS if u],
-        methods=METHODS,
-        offsets=OFFSETS,
-        losses=LOSSES,
+        most=MAX_FILE_BYTES,
+        units=[u for u in SIGNAL_UNITS if u],
+        methods=METHOD_NAMES,
+        offsets=OFFSET_KINDS,
+        losses=LOSS_NAMES,
     )
 
 
 def file(shown: File) -> str:
     """Return a file with its columns and assumptions."""
-    told = shown.told
+    told = shown.preview
     chosen = {} if told is None else told["options"]
     facts = {
         "name": shown.name,
@@ -125,43 +125,43 @@ def file(shown: File) -> str:
         "offers": [] if told is None else told["offers"],
         "outputs": list(chosen.get("outputs", {})),
     }
-    return _rendered(
+    return _render_template(
         "file.html.j2",
         file=shown,
         told=told,
         chosen=chosen,
         layout=chosen.get("layout", {}),
         facts=json.dumps(facts),
-        separators=list(SEPARATORS),
-        decimals=list(DECIMALS),
-        groups=list(GROUPS),
-        dates=DATES,
+        separators=list(SEPARATOR_CHARACTERS),
+        decimals=list(DECIMAL_CHARACTERS),
+        groups=list(THOUSANDS_CHARACTERS),
+        dates=DATE_ORDERS,
         time_units=list(TIME_UNITS),
-        asked=shown.asked,
+        asked=shown.user_options,
     )
 
 
 def model(shown: Model) -> str:
     """Return a model in any state."""
-    return _rendered("model.html.j2", model=shown, told=shown.told, recipe=shown.recipe)
+    return _render_template("model.html.j2", model=shown, told=shown.told, recipe=shown.recipe)
 
 
-def comparison(desk: Desk) -> str:
+def comparison(desk: Session) -> str:
     """Return a table of the models, the most trustworthy first."""
-    made = [m for m in desk.models.values() if m.state == MADE and m.told is not None]
-    made.sort(key=lambda m: (_ORDER.get((m.told or {})["verdict"]["level"], 3), -_worst(m)))
+    made = [m for m in desk.models.values() if m.state == STATE_MADE and m.told is not None]
+    made.sort(key=lambda m: (_VERDICT_RANKS.get((m.told or {})["verdict"]["level"], 3), -_worst_fit(m)))
     outputs = list(dict.fromkeys(f["output"] for m in made for f in (m.told or {})["fits"]))
     fits = {m.key: {f["output"]: f for f in (m.told or {})["fits"]} for m in made}
-    return _rendered("comparison.html.j2", models=made, outputs=outputs, fits=fits)
+    return _render_template("comparison.html.j2", models=made, outputs=outputs, fits=fits)
 
 
-def _worst(shown: Model) -> float:
+def _worst_fit(shown: Model) -> float:
     """Worst fit of a model, on validation data if there are any."""
     fits = [f["estimation"] if f["validation"] is None else f["validation"] for f in (shown.told or {})["fits"]]
     return min((-1e300 if f is None else float(f) for f in fits), default=-1e300)
 
 
-def state(desk: Desk) -> dict[str, Any]:
+def state(desk: Session) -> dict[str, Any]:
     """Return versions and progress of files and models, for polling by the page."""
     return {
         "files": {f.key: f.version for f in desk.files.values()},
@@ -169,7 +169,7 @@ def state(desk: Desk) -> dict[str, Any]:
             m.key: {
                 "version": m.version,
                 "busy": m.is_busy,
-                "phase": m.phase if m.state == RUNNING else m.state,
+                "phase": m.phase if m.state == STATE_RUNNING else m.state,
                 "share": m.share,
                 "left": m.left,
             }
@@ -179,27 +179,29 @@ def state(desk: Desk) -> dict[str, Any]:
 
 
 #: Points per line of a chart, and charts per model or run.
-POINTS = 1500
-MOST = 12
+MAX_CHART_POINTS = 1500
+MAX_FIGURES = 12
 
 
-def shown(made: Made) -> dict[str, Any]:
+def model_summary(made: FittedModel) -> dict[str, Any]:
     """Return the page content of a model; markup consists of escaped parts."""
-    result, checked = made.result, made.checked
+    result, checked = made.result, made.validation
     judged = result.verdict(checked)
     warnings, left = first_warnings(list(dict.fromkeys([*result.warnings, *(checked.warnings if checked else ())])))
     figures = []
     if checked is not None:
-        figures += comparison_charts(checked, units=result.model.units, label="validation", points=POINTS)
-    figures += comparison_charts(result.comparison, units=result.model.units, label="estimation", points=POINTS)
-    tables = [parameter_table(result.model, result.joint), *behaviour_tables(result.model)]
+        figures += comparison_charts(checked, units=result.model.units, label="validation", points=MAX_CHART_POINTS)
+    figures += comparison_charts(
+        result.comparison, units=result.model.units, label="estimation", points=MAX_CHART_POINTS
+    )
+    tables = [parameter_table(result.model, result.fit), *behavior_tables(result.model)]
     choice = made.choice
     return {
         "title": title_of(result.model),
         "verdict": judged.to_dict(),
         "box": str(verdict_box(judged)),
         "equations": [str(e) for e in equations_html(result.model, result.comparison.offsets)],
-        "numbers": len(result.joint.names) if result.joint is not None else len(result.coefficients),
+        "numbers": len(result.fit.names) if result.fit is not None else len(result.coefficients),
         "fits": [
             {
                 "output": output,
@@ -213,20 +215,21 @@ def shown(made: Made) -> dict[str, Any]:
         "runs": [made.run.name, None if made.other is None else made.other.name],
         "warnings": [str(Markup("{}").format(w)) for w in warnings],
         "more": [str(Markup("{}").format(w)) for w in left],
-        "figures": drawn(figures),
+        "figures": figure_markup(figures),
         "tables": [str(t.to_html()) for t in tables],
         "choice": None if choice is None else {"reason": choice.reason, "table": str(choice.table().to_html())},
         "script": made.script,
     }
 
 
-def drawn(figures: list[Figure]) -> list[dict[str, str]]:
+def figure_markup(figures: list[Figure]) -> list[dict[str, str]]:
     """Return the markup of figures for wide and narrow screens."""
     return [
-        {"title": f.title, "wide": str(f.svg), "narrow": str(f.narrow), "caption": f.caption} for f in figures[:MOST]
+        {"title": f.title, "wide": str(f.svg), "narrow": str(f.narrow), "caption": f.caption}
+        for f in figures[:MAX_FIGURES]
     ]
 
 
-def pictures(run: Run) -> list[dict[str, str]]:
+def run_figures(run: Run) -> list[dict[str, str]]:
     """Return charts of a run's signals over time, outputs first."""
-    return drawn(list(run.plot(*[*run.outputs, *run.inputs][:MOST])))
+    return figure_markup(list(run.plot(*[*run.outputs, *run.inputs][:MAX_FIGURES])))

@@ -17,17 +17,17 @@ import time
 from collections.abc import Mapping
 from typing import Any, TextIO
 
-from ftlm.app.forms import Recipe, offers
-from ftlm.app.views import pictures, shown
+from ftlm.app.forms import FitRequest, suggest_structures
+from ftlm.app.views import model_summary, run_figures
 from ftlm.errors import FtlmError
 from ftlm.io.preview import OpenedFile, open_file
 from ftlm.progress import Progress
 
 #: Memory limit of the process [bytes], and time between two progress reports.
 MEMORY_LIMIT = 6 << 30
-PAUSE = 0.1
+REPORT_INTERVAL_S = 0.1
 #: Columns of a file that the page shows.
-MOST_COLUMNS = 200
+MAX_SHOWN_COLUMNS = 200
 
 
 class Reports(Progress):
@@ -53,7 +53,7 @@ class Reports(Progress):
     def __call__(self, done: int, total: int, pruned: int | None = None) -> None:
         """Report progress at most once per interval."""
         now = time.monotonic()
-        if now - self._last >= PAUSE or done >= total:
+        if now - self._last >= REPORT_INTERVAL_S or done >= total:
             self._last = now
             self.send(done=int(done), total=int(total))
 
@@ -68,7 +68,7 @@ def main() -> None:
     threading.Thread(target=_end_with_parent, daemon=True).start()
     _limit_memory()
     try:
-        answer = opened(task) if task["do"] == "open" else modelled(task, reports)
+        answer = describe_file(task) if task["do"] == "open" else make_model(task, reports)
     except FtlmError as error:
         reports.send(error=str(error))
     except MemoryError:
@@ -99,22 +99,22 @@ def _limit_memory() -> None:
         return
 
 
-def opened(task: Mapping[str, Any]) -> dict[str, Any]:
+def describe_file(task: Mapping[str, Any]) -> dict[str, Any]:
     """Return the preview of a file for the page."""
     found = open_file(task["file"], **task["options"])
     told = found.to_dict()
     return {
         "kind": found.kind,
         "rows": found.rows,
-        "columns": told["columns"][:MOST_COLUMNS],
-        "hidden": max(len(found.columns) - MOST_COLUMNS, 0),
+        "columns": told["columns"][:MAX_SHOWN_COLUMNS],
+        "hidden": max(len(found.columns) - MAX_SHOWN_COLUMNS, 0),
         "assumed": [a.words for a in found.assumed],
         "options": told["options"],
         "step": found.step,
         "problem": found.problem,
         "notes": list(found.notes),
-        "offers": [] if found.problem else offers(*_signals(found)),
-        **_seen(found),
+        "offers": [] if found.problem else suggest_structures(*_signals(found)),
+        **_run_preview(found),
     }
 
 
@@ -123,22 +123,22 @@ def _signals(found: OpenedFile) -> tuple[list[str], list[str]]:
     return inputs, outputs
 
 
-def _seen(found: OpenedFile) -> dict[str, Any]:
+def _run_preview(found: OpenedFile) -> dict[str, Any]:
     """Return charts and advice of a file's run."""
     if found.problem:
         return {"figures": [], "advice": [], "length": 0}
     # The file is read again with all options fixed, so that the fit uses the rows of the preview.
     run = found.load()
-    return {"figures": pictures(run), "advice": [a.sentence for a in run.advice()], "length": run.length}
+    return {"figures": run_figures(run), "advice": [a.sentence for a in run.advice()], "length": run.length}
 
 
-def modelled(task: Mapping[str, Any], reports: Reports) -> dict[str, Any]:
+def make_model(task: Mapping[str, Any], reports: Reports) -> dict[str, Any]:
     """Fit a model, write its files, and return its summary for the page."""
-    made = Recipe.of(task["recipe"]).made(reports, task["store"])
+    made = FitRequest.of(task["recipe"]).fit_model(reports, task["store"])
     reports.phase("writing the report")
     made.result.model.save(task["model"])
     made.result.report(task["report"], validation=made.other)
-    return shown(made)
+    return model_summary(made)
 
 
 if __name__ == "__main__":

@@ -9,7 +9,7 @@ from dataclasses import dataclass
 import numpy as np
 
 from ftlm import _core
-from ftlm.arm.flexible_link import PARAMETERS, LinkParameters, order_law, whole_order
+from ftlm.arm.flexible_link import PARAMETER_SETS, LinkParameters, integer_order, order_law
 from ftlm.data.run import Run
 from ftlm.errors import DataError, ModelError
 from ftlm.fractional_calculus import fractional_derivative
@@ -17,15 +17,15 @@ from ftlm.utils.validation import Floats
 
 #: Range of the relaxation rates whose sum gives a force of order nu: this factor times 1/T to this factor times 1/h.
 #: Slower relaxations equal a spring and faster ones a dashpot.
-SLOWEST, FASTEST = 1e-3, 1e3
+MIN_RATE_TIMES_DURATION, MAX_RATE_TIMES_STEP = 1e-3, 1e3
 #: Difference in ln(rate) of neighboring relaxations. The sum then equals the integral to 1e-6.
-APART = 0.5
+RATE_LOG_SPACING = 0.5
 #: An angle counts as at rest if its first value is within this fraction of its largest one, and its first increment
 #: within a fraction of the largest increment or, in short runs, of the second one. From rest t^alpha has a ratio of
 #: first to second increment of 1/3 for alpha = 2 and of 0.55 for alpha = 1.5.
-STARTS, MOVES_OFF, SPEEDS_UP = 0.01, 0.1, 2 / 3
+REST_ANGLE_FRACTION, REST_INCREMENT_FRACTION, REST_INCREMENT_RATIO = 0.01, 0.1, 2 / 3
 #: Minimum number of samples for differences of third order.
-FEWEST = 4
+MIN_SAMPLES = 4
 
 
 @dataclass(frozen=True)
@@ -131,19 +131,19 @@ def energies(
     for name in orders or {}:
         if name not in free:
             raise ModelError(f"order {name!r} is not known; the stage's free orders are {', '.join(free)}")
-    at = {n: float((orders or {}).get(n, whole_order(n))) for n in free}
+    at = {n: float((orders or {}).get(n, integer_order(n))) for n in free}
     for name in free[2:]:
         if not 0.0 <= at[name] <= 1.0:
             raise ModelError(
                 f"{name} = {at[name]:g} is outside [0, 1], where a force stores and loses, and gives nothing"
             )
-    link = parameters or PARAMETERS["effective"][stage]
+    link = parameters or PARAMETER_SETS["effective"][stage]
     hub, bend, current = (
         np.asarray(run[n], dtype=np.float64) for n in (f"theta{stage}1", f"theta{stage}2", f"I{stage}")
     )
     step = run.step
-    if run.length < FEWEST:
-        raise DataError(f"run {run.name!r} has {run.length} rows; energies need at least {FEWEST}")
+    if run.length < MIN_SAMPLES:
+        raise DataError(f"run {run.name!r} has {run.length} rows; energies need at least {MIN_SAMPLES}")
     for name, angle in ((f"theta{stage}1", hub), (f"theta{stage}2", bend)):
         _check_rest(run.name, name, angle)
 
@@ -181,9 +181,9 @@ def _check_rest(run: str, name: str, angle: Floats) -> None:
     way_out = (
         "energies are those of a run from rest, with angles from 0: slice it where it rests, and take that angle off"
     )
-    if abs(angle[0]) > STARTS * np.max(np.abs(angle)):
+    if abs(angle[0]) > REST_ANGLE_FRACTION * np.max(np.abs(angle)):
         raise DataError(f"run {run!r}: {name} starts at {angle[0]:.4g} rad, not at 0; {way_out}")
-    if abs(moves[0]) > max(MOVES_OFF * np.max(np.abs(moves)), SPEEDS_UP * abs(moves[1])):
+    if abs(moves[0]) > max(REST_INCREMENT_FRACTION * np.max(np.abs(moves)), REST_INCREMENT_RATIO * abs(moves[1])):
         raise DataError(f"run {run!r}: {name} moves by {moves[0]:.4g} rad in its first step; {way_out}")
 
 
@@ -217,8 +217,8 @@ def power(angle: Floats, coefficient: float, order: float, step: float) -> Power
     if order == 1.0:
         return Power(coefficient * rate**2, nothing, coefficient * rate**2)
     duration = step * (angle.size - 1)
-    low, high = math.log(SLOWEST / duration), math.log(FASTEST / step)
-    count = max(2, round((high - low) / APART))
+    low, high = math.log(MIN_RATE_TIMES_DURATION / duration), math.log(MAX_RATE_TIMES_STEP / step)
+    count = max(2, round((high - low) / RATE_LOG_SPACING))
     share = math.sin(math.pi * order) / math.pi
     # Ends of the range lie between two rates, where those of the sum's weight end.
     width = (high - low) / count

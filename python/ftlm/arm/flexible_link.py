@@ -14,7 +14,7 @@ from ftlm.structure.equation import Equation, Friction, Stribeck, Term
 from ftlm.structure.order import Order
 from ftlm.structure.sensor_filter import SensorFilter
 from ftlm.structure.structure import Hints, Structure, check_offset
-from ftlm.utils.validation import shown
+from ftlm.utils.validation import short_repr
 
 
 @dataclass(frozen=True)
@@ -73,7 +73,7 @@ class LinkParameters:
 #: Named parameter sets, by stage. "effective" reproduces the integer-order rows of the paper's Tables 4 and 5: the
 #: torque per ampere holds gear efficiency, gear ratio and torque constant. "table-3" is the paper's Table 3 as printed,
 #: whose stiffnesses are about 14.8 times smaller and whose torque constants lack gear and efficiency.
-PARAMETERS: dict[str, dict[int, LinkParameters]] = {
+PARAMETER_SETS: dict[str, dict[int, LinkParameters]] = {
     "effective": {
         1: LinkParameters(39.9572, 0.0635362, 0.170434, 4.0, 0.0, 0.75 * 100 * 0.119),
         2: LinkParameters(6.85775, 0.00301955, 0.0064387, 1.5, 0.085608, 0.75 * 50 * 0.0232),
@@ -87,7 +87,7 @@ PARAMETERS: dict[str, dict[int, LinkParameters]] = {
 INTEGER_ORDERS = {"gamma": 1.0, "beta": 0.0, "mu": 1.0}
 
 
-def whole_order(name: str) -> float:
+def integer_order(name: str) -> float:
     """Return the integer order of the manual for an order name such as gamma1."""
     return INTEGER_ORDERS.get(name.rstrip("0123456789"), 2.0)
 
@@ -95,27 +95,27 @@ def whole_order(name: str) -> float:
 #: Orders of the cross-stage terms: torques of the other stage act through its angles and its current as they are.
 CROSS_ORDER = 0.0
 #: Range of the highest order of an equation: a link is of second order or slightly below.
-HIGHEST = (1.2, 2.0)
+HIGHEST_ORDER_RANGE = (1.2, 2.0)
 #: Typical orders near the integer ones: damping on the rate or slightly below, stiffness on the angle.
-NATURAL = {"alpha": (2.0,), "gamma": (0.9, 1.0), "beta": (0.0, 0.15), "mu": (0.8, 1.0)}
+TYPICAL_ORDERS = {"alpha": (2.0,), "gamma": (0.9, 1.0), "beta": (0.0, 0.15), "mu": (0.8, 1.0)}
 #: Ranges (low, high, increment) of the elasticity and damping orders if no other equation identifies them.
-APART = {"beta": (0.0, 0.5, 0.05), "mu": (0.5, 1.95, 0.05)}
+DEFLECTION_ORDER_RANGES = {"beta": (0.0, 0.5, 0.05), "mu": (0.5, 1.95, 0.05)}
 #: Orders by the letter of the coefficient whose term they differentiate, as in (22)-(25).
 ORDER_OF = {"a": "beta", "b": "gamma", "d": "mu"}
 Form: TypeAlias = Literal["lagrange", "published"]
 InputOrder: TypeAlias = Literal["published", "derived"]
 CrossStage: TypeAlias = Literal["torques", "inertial"] | bool
-Rubs: TypeAlias = Literal["coulomb", "stribeck"] | bool
+FrictionLaw: TypeAlias = Literal["coulomb", "stribeck"] | bool
 Law: TypeAlias = Literal["orders", "coefficients", "velocities"]
 #: Names of the physical laws that can be imposed.
-LAWS = ("orders", "coefficients", "velocities")
+LAW_NAMES = ("orders", "coefficients", "velocities")
 
 
 def _hints(form: Form) -> Hints:
     """Hints for estimation: ranges and names of the orders, and lower bounds of the inertia ratios."""
     return Hints(
-        HIGHEST,
-        {f"{order}{n}": values for order, values in NATURAL.items() for n in range(1, 5)},
+        HIGHEST_ORDER_RANGE,
+        {f"{order}{n}": values for order, values in TYPICAL_ORDERS.items() for n in range(1, 5)},
         {f"{letter}{n}": f"{order}{n}" for letter, order in ORDER_OF.items() for n in range(1, 5)},
         {"j1": 0.0, "j2": 0.0} if form == "lagrange" else {"r1": 1.0, "r2": 1.0},
         ("a1", "d1", "a3", "d3") if form == "lagrange" else (),
@@ -123,7 +123,7 @@ def _hints(form: Form) -> Hints:
     )
 
 
-def _form(form: Form | None, input_order: InputOrder | None) -> tuple[Form, InputOrder]:
+def _resolve_form(form: Form | None, input_order: InputOrder | None) -> tuple[Form, InputOrder]:
     """Return the requested form; an input order implies the published form."""
     if form is None:
         form = "lagrange" if input_order is None else "published"
@@ -174,7 +174,7 @@ def order_law(
     """
     if stage not in (1, 2):
         raise ModelError(f"stage = {stage!r} is not known; use 1, 2 or 'both'")
-    form, input_order = _form(form, input_order)
+    form, input_order = _resolve_form(form, input_order)
     h, d = 2 * stage - 1, 2 * stage
     law = {
         f"alpha{h}": f"alpha{h}",
@@ -201,7 +201,7 @@ def flexible_link(
     input_order: InputOrder | None = None,
     coupling: Literal["simulated", "measured"] | None = None,
     cross_stage: CrossStage = False,
-    friction: Rubs = False,
+    friction: FrictionLaw = False,
     cross_sensitivity: bool = False,
     cross_damping: bool = False,
     hub: bool = True,
@@ -300,9 +300,9 @@ def flexible_link(
     """
     if stage not in (1, 2, "both"):
         raise ModelError(f"stage = {stage!r} is not known; use 1, 2 or 'both'")
-    form, input_order = _form(form, input_order)
+    form, input_order = _resolve_form(form, input_order)
     for law in laws:
-        if law not in LAWS:
+        if law not in LAW_NAMES:
             raise ModelError(f"law {law!r} is not known; use 'orders', 'coefficients', both or ()")
     if "velocities" in laws and (form != "lagrange" or "orders" not in laws):
         raise ModelError(
@@ -312,14 +312,14 @@ def flexible_link(
         raise ModelError(f"cross_stage = {cross_stage!r} is not known; use False, 'torques' or 'inertial'")
     if cross_stage == "inertial" and form != "lagrange":
         raise ModelError("cross_stage='inertial' follows from the energies, as form='lagrange' does; use that form")
-    if parameters not in PARAMETERS:
-        raise ModelError(f"parameters = {parameters!r} is not known; use {' or '.join(map(repr, PARAMETERS))}")
+    if parameters not in PARAMETER_SETS:
+        raise ModelError(f"parameters = {parameters!r} is not known; use {' or '.join(map(repr, PARAMETER_SETS))}")
     if not (isinstance(friction, bool) or friction in ("coulomb", "stribeck")):
-        raise ModelError(f"friction = {shown(friction)} is not known; use False, 'coulomb' or 'stribeck'")
+        raise ModelError(f"friction = {short_repr(friction)} is not known; use False, 'coulomb' or 'stribeck'")
     flags = {"cross_sensitivity": cross_sensitivity, "cross_damping": cross_damping, "hub": hub}
     for name, flag in flags.items():
         if not isinstance(flag, bool):
-            raise ModelError(f"{name} = {shown(flag)} is neither True nor False; use one of them")
+            raise ModelError(f"{name} = {short_repr(flag)} is neither True nor False; use one of them")
     if coupling is None:
         coupling = "measured" if form == "lagrange" else "simulated"
     if friction == "stribeck" and coupling != "simulated":
@@ -350,16 +350,20 @@ def flexible_link(
     for j in stages:
         named = input_order if form == "published" else None
         orders = order_law(j, form=form, input_order=named, velocities="velocities" in laws)
-        made = _stage(j, form, orders, laws, bool(friction) and coupling == "measured")
+        made = _joint_equations(j, form, orders, laws, bool(friction) and coupling == "measured")
         if friction and coupling == "simulated":
             near = Stribeck(f"fs{j}", f"vs{j}") if friction == "stribeck" else UNSET
             made = (replace(made[0], coulomb=Friction(f"fc{j}", more=near)), made[1])
         if cross_stage:
-            made = _pushed(made, j, laws, stage == "both") if cross_stage == "inertial" else _twisted(made, j)
+            made = (
+                _add_cross_inertia(made, j, laws, stage == "both")
+                if cross_stage == "inertial"
+                else _add_cross_torques(made, j)
+            )
         if cross_damping:
-            made = (made[0], _added(made[1], [Term(f"theta{3 - j}2", Order(1.0), f"w{2 * j}")]))
+            made = (made[0], _append_terms(made[1], [Term(f"theta{3 - j}2", Order(1.0), f"w{2 * j}")]))
         if cross_sensitivity:
-            made = (made[0], _followed(made[1], j, other=cross_stage == "inertial"))
+            made = (made[0], _add_cross_sensitivity(made[1], j, other=cross_stage == "inertial"))
         equations += made if hub else made[1:]
         h, d = 2 * j - 1, 2 * j
         ratio = f"j{j}" if form == "lagrange" else f"r{j}"
@@ -370,7 +374,7 @@ def flexible_link(
         if cross_stage == "inertial" and j == 2:
             # Both angles of stage 1 turn what stands on its tip.
             coefficient_law += [(f"q{n}", 1.0, (f"p{n}",)) for n in (h, d)]
-        link = PARAMETERS[parameters][j]
+        link = PARAMETER_SETS[parameters][j]
         known = link.lagrange_coefficients(j) if form == "lagrange" else link.coefficients(j)
         reference |= {n: v for n, v in known.items() if any(n in e.coefficient_names for e in equations)}
     if sensor_filter == "stock":
@@ -392,11 +396,13 @@ def flexible_link(
         structure = structure.with_orders({f"alpha{2 * j}": 2.0 for j in stages})
     if not hub:
         # Nothing else tells the link's two own terms apart: exchanged, they are the same equation.
-        structure = structure.with_orders({f"{n}{2 * j}": APART[n] for j in stages for n in APART})
+        structure = structure.with_orders(
+            {f"{n}{2 * j}": DEFLECTION_ORDER_RANGES[n] for j in stages for n in DEFLECTION_ORDER_RANGES}
+        )
     return structure
 
 
-def _stage(
+def _joint_equations(
     stage: int, form: Form, law: Mapping[str, Order], laws: Sequence[str], friction: bool
 ) -> tuple[Equation, Equation]:
     """Return the equations of the hub and of the deflection of one joint."""
@@ -428,24 +434,26 @@ def _stage(
     return equation(hub, h, Order()), equation(deflection, d, drive)
 
 
-def _added(item: Equation, terms: Sequence[Term]) -> Equation:
+def _append_terms(item: Equation, terms: Sequence[Term]) -> Equation:
     """Return an equation with further terms inserted before its friction terms."""
     rubs = tuple(t for t in item.terms if t.signal.startswith("coulomb_"))
     return replace(item, terms=(*item.terms[: len(item.terms) - len(rubs)], *terms, *rubs))
 
 
-def _twisted(made: tuple[Equation, Equation], stage: int) -> tuple[Equation, Equation]:
+def _add_cross_torques(made: tuple[Equation, Equation], stage: int) -> tuple[Equation, Equation]:
     """Add the torques of the other joint: terms in its angles and its current, of order 0."""
     other, first = 3 - stage, 2 * stage - 1
     signals = (f"theta{other}1", f"theta{other}2", f"I{other}")
     hub, deflection = (
-        _added(item, [Term(s, Order(CROSS_ORDER), f"{c}{n}") for c, s in zip("pqs", signals, strict=True)])
+        _append_terms(item, [Term(s, Order(CROSS_ORDER), f"{c}{n}") for c, s in zip("pqs", signals, strict=True)])
         for n, item in enumerate(made, first)
     )
     return hub, deflection
 
 
-def _pushed(made: tuple[Equation, Equation], stage: int, laws: Sequence[str], both: bool) -> tuple[Equation, Equation]:
+def _add_cross_inertia(
+    made: tuple[Equation, Equation], stage: int, laws: Sequence[str], both: bool
+) -> tuple[Equation, Equation]:
     """Add the inertial terms of the other joint, from the energies of the planar arm with the absolute rates of (8).
 
     T = (J_11 w_1^2 + J_12 w_2^2 + J_21 w_3^2 + J_22 w_4^2)/2 + H w_2 w_4 with w_1 = D theta_11, w_2 = w_1 + D theta_12,
@@ -464,13 +472,13 @@ def _pushed(made: tuple[Equation, Equation], stage: int, laws: Sequence[str], bo
     hub, deflection = made
     # The order of D that makes of the rate of a hub its acceleration is alpha_3 - gamma_3, of a link alpha_2 - mu_2.
     own = f"mu{d}" if "velocities" in laws else f"gamma{h}"
-    return hub if stage == 1 else _added(hub, terms(h, own)), _added(deflection, terms(d, f"mu{d}"))
+    return hub if stage == 1 else _append_terms(hub, terms(h, own)), _append_terms(deflection, terms(d, f"mu{d}"))
 
 
-def _followed(item: Equation, stage: int, *, other: bool) -> Equation:
+def _add_cross_sensitivity(item: Equation, stage: int, *, other: bool) -> Equation:
     """Add hub angles to the equation of the measured deflection."""
     signals = (f"theta{stage}1", f"theta{3 - stage}1")[: 1 + other]
-    return _added(item, [Term(s, Order(), f"{c}{2 * stage}") for c, s in zip("ef", signals, strict=False)])
+    return _append_terms(item, [Term(s, Order(), f"{c}{2 * stage}") for c, s in zip("ef", signals, strict=False)])
 
 
 def link_model(
@@ -512,7 +520,7 @@ def link_model(
         A name that is not known, orders out of range.
     """
     named = parameters if isinstance(parameters, str) else "effective"
-    form, order = _form(form, input_order)
+    form, order = _resolve_form(form, input_order)
     structure = flexible_link(
         stage=stage, form=form, input_order=order if form == "published" else None, coupling=coupling, parameters=named
     )

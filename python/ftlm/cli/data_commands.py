@@ -16,7 +16,7 @@ from typer import Argument, Option
 
 from ftlm import _core
 from ftlm.arm.flexible_link import flexible_link
-from ftlm.cli.framework import command, numbers, say, several, show
+from ftlm.cli.framework import command, numbers, parse_numbers, print_text, show
 from ftlm.cli.options import Files, Force, Json, Number, ReadingOptions, Text, Texts
 from ftlm.errors import ModelError
 from ftlm.estimation.linear import Streaming
@@ -29,7 +29,7 @@ from ftlm.utils.validation import available_threads
 from ftlm.validation.data_advice import inspect_run
 
 #: Reader packages with their file types and the extra that installs them.
-_READERS = {
+_READER_PACKAGES = {
     "scipy": (".mat files", "mat"),
     "h5py": (".mat files of version 7.3 and HDF5", "hdf5"),
     "pyarrow": ("parquet and feather", "parquet"),
@@ -45,7 +45,7 @@ def open_(
     as_json: Json = False,
 ) -> None:
     """Preview a file: columns, units, roles, step, assumptions with contrary evidence, next command."""
-    show(reading.opened(file), as_json=as_json)
+    show(reading.preview_file(file), as_json=as_json)
 
 
 @command
@@ -56,7 +56,7 @@ def inspect(*, files: Files, reading: ReadingOptions, as_json: Json = False) -> 
         data = [{**figures.to_dict(), "advice": advice.to_dict()} for figures, advice in inspected]
         print(json.dumps(data, indent=1, ensure_ascii=False))
     else:
-        say("\n\n".join(f"{figures}\n{advice}" for figures, advice in inspected))
+        print_text("\n\n".join(f"{figures}\n{advice}" for figures, advice in inspected))
 
 
 @command
@@ -69,8 +69,8 @@ def doctor(*, as_json: Json = False) -> None:
         "platform": platform.platform(),
         "cores": available_threads(),
         "simd": _core.SIMD,
-        "numpy": _installed("numpy"),
-        **{package: _installed(package) for package in _READERS},
+        "numpy": _installed_version("numpy"),
+        **{package: _installed_version(package) for package in _READER_PACKAGES},
         "rig driver": driver_state(),
     }
     if as_json:
@@ -78,12 +78,12 @@ def doctor(*, as_json: Json = False) -> None:
         return
     for name, value in about.items():
         print(f"{name:<17}{value if value is not None else 'not installed'}")
-    for package, (files, extra) in _READERS.items():
+    for package, (files, extra) in _READER_PACKAGES.items():
         if about[package] is None:
             print(f"{package} is needed for {files}: pip install 'ftlm[{extra}]'")
 
 
-def _installed(package: str) -> str | None:
+def _installed_version(package: str) -> str | None:
     try:
         return metadata.version(package)
     except metadata.PackageNotFoundError:
@@ -168,9 +168,9 @@ def record(
     as_json: Json = False,
 ) -> None:
     """Run an experiment on a rig, simulated by default, and record it as a run."""
-    currents = several("--amplitude", amplitude, 1, 2)
-    low, high = several("--band", band, 2)
-    shift = None if offset is None else several("--offset", offset, 2)
+    currents = parse_numbers("--amplitude", amplitude, 1, 2)
+    low, high = parse_numbers("--band", band, 2)
+    shift = None if offset is None else parse_numbers("--offset", offset, 2)
     stream = live.stream(rig, parameters, rate, limit)
     try:
         with Progress("recording", quiet=as_json) as progress:
@@ -196,10 +196,10 @@ def record(
                 out=out,
                 force=force,
                 live=stream,
-                progress=each_second(stream, rate, progress),
+                progress=live_reporter(stream, rate, progress),
             )
     except (KeyboardInterrupt, SystemExit) as ended:
-        what = experiment.stopped_by(ended)
+        what = experiment.describe_interruption(ended)
         motors = "; ".join(getattr(ended, "__notes__", [])) or "the motors are at 0 V"
         print(f"ftlm: {what}; {motors}; what was recorded is in {out}", file=sys.stderr)
         code = ended.code if isinstance(ended, SystemExit) else 130
@@ -207,20 +207,20 @@ def record(
     if stream is not None:
         print(f"live, after {stream.pulses} rows: {stream}", file=sys.stderr)
     if as_json:
-        told = {"written": out, "rows": run.length, "step": run.step, "about": run.about}
+        told = {"written": out, "rows": run.length, "step": run.step, "about": run.metadata}
         print(json.dumps(told, indent=1, ensure_ascii=False))
     else:
         print(f"{run}\nwritten to {out}")
-    missed = run.about["missed_deadlines"]
+    missed = run.metadata["missed_deadlines"]
     if missed:
         print(f"ftlm: {missed} deadlines were missed", file=sys.stderr)
 
 
-def each_second(stream: Streaming | None, rate: float, progress: Progress) -> Callable[[int, int], None]:
+def live_reporter(stream: Streaming | None, rate: float, progress: Progress) -> Callable[[int, int], None]:
     """Return a callback that updates the bar and prints the live estimate once per second of the run."""
     due = 1.0
 
-    def shown(done: int, total: int) -> None:
+    def report_progress(done: int, total: int) -> None:
         nonlocal due
         progress(done, total)
         seconds = done / rate
@@ -228,4 +228,4 @@ def each_second(stream: Streaming | None, rate: float, progress: Progress) -> Ca
             print(f"{seconds:7.2f} s: {stream}", file=sys.stderr, flush=True)
             due = math.floor(seconds) + 1.0
 
-    return shown
+    return report_progress

@@ -11,14 +11,14 @@ from typer import Option
 
 from ftlm import control as designs
 from ftlm.cli.framework import (
+    announce_design,
     check_ending,
     command,
-    expect_designing,
     figure_kind,
     numbers,
-    say,
+    parse_numbers,
+    print_text,
     say_written,
-    several,
     show,
     show_json,
     write_figure,
@@ -29,11 +29,11 @@ from ftlm.experiment_design import design_input as experiment
 from ftlm.model.model import load_model
 from ftlm.plot import matplotlib_figures as design_plots
 from ftlm.progress import Progress
-from ftlm.utils.files import COMMAND, check_free, write_atomically
+from ftlm.utils.files import COMMAND_MESSAGES, check_free, write_atomically
 
 #: Options of one design only.
-OF_PID = ("crossover", "phase_margin")
-OF_LQG = ("allowed", "effort", "drift", "noise", "measured", "band", "poles")
+PID_OPTIONS = ("crossover", "phase_margin")
+LQG_OPTIONS = ("allowed", "effort", "drift", "noise", "measured", "band", "poles")
 
 
 @command
@@ -81,14 +81,14 @@ def control(
 ) -> None:
     """Design a controller on a model: margins, their ranges over the model's uncertainty, controller file."""
     given = dict(locals())
-    check_free(out, plan, force=force, words=COMMAND)
+    check_free(out, plan, force=force, words=COMMAND_MESSAGES)
     check_ending(out, ".json")
     check_ending(plan, ".csv")
     if plan is not None and move is None:
         raise ModelError("--plan is of a move; give --move SIZE:SECONDS")
     if of is not None and move is None:
         raise ModelError("--of is of a move; give --move SIZE:SECONDS")
-    wrong = [n for n in (OF_LQG if design == "pid" else OF_PID) if given[n] not in (None, [])]
+    wrong = [n for n in (LQG_OPTIONS if design == "pid" else PID_OPTIONS) if given[n] not in (None, [])]
     if wrong:
         other = "lqg" if design == "pid" else "pid"
         shown = ", ".join("--" + n.replace("_", "-") for n in wrong)
@@ -97,22 +97,22 @@ def control(
     most = np.inf if limit is None else limit
     common: dict[str, Any] = {"input": signal, "output": output, "rate": rate, "samples": samples, "seed": seed}
     found: designs.PidDesign | designs.LqgDesign
-    running: designs.Realised | designs.Lqg
+    running: designs.DiscretePid | designs.Lqg
     if design == "pid":
         if crossover is None:
             raise ModelError("--crossover is missing: where the loop's gain is to be 1 [rad/s]")
-        expect_designing(design, samples)
+        announce_design(design, samples)
         found = designs.fractional_pid(
             loaded, crossover=crossover, phase_margin=60.0 if phase_margin is None else phase_margin, **common
         )
-        running = designs.Realised(found.pid, rate, limit=most)
+        running = designs.DiscretePid(found.pid, rate, limit=most)
     else:
         if effort is None or not allowed:
             raise ModelError(
                 "--allowed OUTPUT=A and --effort A are missing: which deviations are as dear as which input"
             )
-        low_high = None if band is None else several("--band", band, 2)
-        expect_designing(design, samples)
+        low_high = None if band is None else parse_numbers("--band", band, 2)
+        announce_design(design, samples)
         found = designs.lqg(
             loaded,
             allowed=numbers("--allowed", allowed),
@@ -128,19 +128,19 @@ def control(
         running = found.controller
     planned = None
     if move is not None:
-        size, seconds = several("--move", move, 2)
-        path = designs.smooth_move(size, seconds, rate)
+        size, seconds = parse_numbers("--move", move, 2)
+        path = designs.point_to_point(size, seconds, rate)
         told = found.plants[0].output if design == "pid" else running.tracked  # type: ignore[union-attr]
-        planned = designs.inverse(found, path, of=of or told, limit=most, samples=min(samples, 40), seed=seed)
+        planned = designs.inverse_dynamics(found, path, of=of or told, limit=most, samples=min(samples, 40), seed=seed)
     if out is not None:
         designs.save_controller(running, out, model=f"{loaded.structure.name} ({Path(model).name})", force=force)
     if plan is not None and planned is not None:
-        _written(planned, rate, plan, force=force)
+        _write_trajectory(planned, rate, plan, force=force)
     if as_json:
         show_json(found.to_dict() | {"planned": None if planned is None else planned.to_dict()})
         return
     for line in (found, *([running] if design == "pid" else []), *([planned] if planned is not None else [])):
-        say(str(line))
+        print_text(str(line))
     say_written(out, plan)
 
 
@@ -161,28 +161,28 @@ def shape(
     as_json: Json = False,
 ) -> None:
     """Design an input shaper from the poles of a model."""
-    check_free(out, force=force, words=COMMAND)
+    check_free(out, force=force, words=COMMAND_MESSAGES)
     check_ending(out, ".csv")
     made = designs.input_shaper(load_model(model), kind, modes_shaped=modes, coupling=coupling)
     taps = made.impulses(rate)
     if out is not None:
         rows = np.column_stack([np.arange(taps.size) / rate, taps])
-        _table(rows, ("time_s", "share"), out, force=force)
+        _write_table(rows, ("time_s", "share"), out, force=force)
     if as_json:
         show_json(made.to_dict() | {"rate": rate, "samples": taps})
         return
-    say(str(made))
+    print_text(str(made))
     say_written(out)
 
 
-def _written(planned: designs.PlannedMove, rate: float, path: str, *, force: bool) -> None:
+def _write_trajectory(planned: designs.Trajectory, rate: float, path: str, *, force: bool) -> None:
     """Write a trajectory as csv rows."""
     time = np.arange(len(planned.path)) / rate
     rows = np.column_stack([time, planned.reference, planned.command, planned.path, *planned.outputs.values()])
-    _table(rows, ("time_s", "reference", "command", "path", *planned.outputs), path, force=force)
+    _write_table(rows, ("time_s", "reference", "command", "path", *planned.outputs), path, force=force)
 
 
-def _table(rows: np.ndarray[Any, Any], names: tuple[str, ...], path: str, *, force: bool) -> None:
+def _write_table(rows: np.ndarray[Any, Any], names: tuple[str, ...], path: str, *, force: bool) -> None:
     text = io.StringIO()
     text.write(",".join(names) + "\n")
     np.savetxt(text, rows, fmt="%.12g", delimiter=",")
@@ -224,7 +224,7 @@ def design_input(
     as_json: Json = False,
 ) -> None:
     """Design the input that determines the parameters best within the limits of the machine."""
-    check_free(out, picture, force=force, words=COMMAND)
+    check_free(out, picture, force=force, words=COMMAND_MESSAGES)
     check_ending(out, ".csv", ", as a run for a rig does")
     figure_kind(picture)
     loaded = load_model(model)

@@ -12,7 +12,7 @@ from typing import Annotated, Any, Literal
 import typer
 from typer import Argument, Option
 
-from ftlm.cli.framework import EXIT_INTERRUPTED, command, numbers, pairs, ranges, say, show, show_json
+from ftlm.cli.framework import EXIT_INTERRUPTED, command, numbers, pairs, print_text, ranges, show, show_json
 from ftlm.cli.options import (
     CandidateTexts,
     Decimal,
@@ -27,7 +27,7 @@ from ftlm.cli.options import (
     SearchOptions,
     Separator,
     Sheet,
-    Skipped,
+    SkippedLines,
     StructureOptions,
     StructureText,
     Text,
@@ -35,7 +35,7 @@ from ftlm.cli.options import (
     Thousands,
     Threads,
     Verbose,
-    layout_of,
+    layout_options,
 )
 from ftlm.data.frequency_data import FrequencyData
 from ftlm.data.run import Run
@@ -47,16 +47,16 @@ from ftlm.io.load_frequency import load_frequency
 from ftlm.model.model import load_model
 from ftlm.order_search.certificate import certify_job, check_certifiable
 from ftlm.order_search.checkpoint import Store
-from ftlm.order_search.options import check_used
+from ftlm.order_search.options import check_options_used
 from ftlm.order_search.result import SearchResult
-from ftlm.order_search.search import announce, job_of, make_job, resume_job, run_job, search_status
+from ftlm.order_search.search import announce_time, job_of, make_job, resume_job, run_job, search_status
 from ftlm.progress import Progress
-from ftlm.structure.order_grid import Lattice
+from ftlm.structure.order_grid import OrderGrid
 from ftlm.structure.structure import Structure
 from ftlm.structure_selection import select as choice
-from ftlm.structure_selection.select import automatic
-from ftlm.utils.files import COMMAND, check_free
-from ftlm.utils.resources import between, by_output_error, expected
+from ftlm.structure_selection.select import automatic_structures
+from ftlm.utils.files import COMMAND_MESSAGES, check_free
+from ftlm.utils.resources import duration_bounds, estimate_duration, output_error_cost
 from ftlm.utils.validation import check_threads
 
 Method = Literal["output-error", "instrumental-variables", "multi-innovation", "least-squares", "genetic"]
@@ -68,7 +68,7 @@ def fit_seconds(runs: Sequence[Run], structure: Structure, threads: int | None, 
     """Time estimate [s] of output-error fits of all parameters, the runs distributed among the fits."""
     samples = sum(run.length for run in runs) * len(structure.outputs)
     numbers = len(structure.order_names) + len(structure.coefficient_names) + len(structure.free_inputs)
-    return expected(fits * by_output_error(samples // max(fits, 1), numbers), check_threads(threads))
+    return estimate_duration(fits * output_error_cost(samples // max(fits, 1), numbers), check_threads(threads))
 
 
 @command
@@ -107,17 +107,17 @@ def identify(
     as_json: Json = False,
 ) -> None:
     """Identify a model: verdict, equations, parameters, gain and modes, fit, warnings."""
-    check_free(out, report, force=force, words=COMMAND)
+    check_free(out, report, force=force, words=COMMAND_MESSAGES)
     shape.structure(structure)
     begin = None if start is None else load_model(start)
     runs = reading.runs(files)
-    wanted = shape.measured(structure, runs)
+    wanted = shape.structure_for_runs(structure, runs)
     # The slice is of the runs that are identified from.
     others = replace(reading, sliced=None).runs([validation]) if validation is not None else []
     label = "fitting" if method == "output-error" else "searching orders"
     with resumable(store, "the same command"), Progress(label, quiet=as_json) as progress:
         if method == "output-error":
-            progress.expect("the fit", *between(fit_seconds(runs, wanted, threads)))
+            progress.expect("the fit", *duration_bounds(fit_seconds(runs, wanted, threads)))
         result = estimation.identify(
             runs,
             wanted,
@@ -144,14 +144,14 @@ def identify(
         show_json({**judged, **result.to_dict(), "validation": None if checked is None else checked.to_dict()})
         return
     # What Python has as a method, the command line has as an option.
-    say(result.summary(checked).replace("print(result.details())", "--verbose shows all"))
+    print_text(result.summary(checked).replace("print(result.details())", "--verbose shows all"))
     if verbose:
-        say(f"\n{result.details()}")
+        print_text(f"\n{result.details()}")
     if verbose and checked is not None:
-        say(f"\nvalidation on {', '.join(r.name for r in others)}\n{checked}")
+        print_text(f"\nvalidation on {', '.join(r.name for r in others)}\n{checked}")
     elif checked is not None:
         print(f"validation on {', '.join(r.name for r in others)}")
-        say("\n".join(f"! {w}" for w in checked.warnings), end="\n" if checked.warnings else "")
+        print_text("\n".join(f"! {w}" for w in checked.warnings), end="\n" if checked.warnings else "")
 
 
 @command
@@ -178,16 +178,21 @@ def search(
     """Rank the orders of each equation, or of a stage under its order law, and account for every candidate."""
     shape.structure(structure)
     runs = reading.runs(files)
-    wanted = shape.measured(structure, runs)
-    parts = wanted.parts() or {e.output: wanted.equation(e.output) for e in wanted.equations}
-    lattice = options.lattice() or Lattice()
-    check_named(lattice, wanted)
-    check_used(coefficients, options.settings(), argument="coefficients")
+    wanted = shape.structure_for_runs(structure, runs)
+    parts = wanted.independent_groups() or {e.output: wanted.equation(e.output) for e in wanted.equations}
+    lattice = options.lattice() or OrderGrid()
+    check_order_names(lattice, wanted)
+    check_options_used(coefficients, options.settings(), argument="coefficients")
     results = {}
     with resumable(store), contextlib.ExitStack() as stack:
         jobs = {
             name: make_job(
-                runs, part, lattice_of(lattice, part), coefficients=coefficients, threads=threads, **options.settings()
+                runs,
+                part,
+                restrict_grid(lattice, part),
+                coefficients=coefficients,
+                threads=threads,
+                **options.settings(),
             )
             for name, part in parts.items()
         }
@@ -198,18 +203,18 @@ def search(
         if store is not None:
             kept = stack.enter_context(Store(store, [job.request(name) for name, job in jobs.items()]))
             show_notes(kept)
-        announce(Progress("", quiet=as_json), list(jobs.values()), kept)
+        announce_time(Progress("", quiet=as_json), list(jobs.values()), kept)
         for number, (name, job) in enumerate(jobs.items()):
             with Progress(f"searching orders of {name}", quiet=as_json) as progress:
                 results[name] = run_job(replace(job, progress=progress), store=kept, number=number)
             if certify is not None:
                 with Progress(f"proving what lies between of {name}", quiet=as_json) as progress:
-                    proved = certify_job(job, within=certify, apart=lattice.step, progress=progress.so_far)
+                    proved = certify_job(job, within=certify, apart=lattice.increment, progress=progress.so_far)
                 results[name] = replace(results[name], certificate=proved)
     show_searches(results, as_json=as_json)
 
 
-def check_named(lattice: Lattice, structure: Structure) -> None:
+def check_order_names(lattice: OrderGrid, structure: Structure) -> None:
     """Raise for an order of the grid that is not free in any equation."""
     for name in lattice.orders:
         if name not in {"alpha", *structure.order_names}:
@@ -217,7 +222,7 @@ def check_named(lattice: Lattice, structure: Structure) -> None:
             raise ModelError(f"--lattice {name!r} is no free order; free are {free}")
 
 
-def lattice_of(lattice: Lattice, part: Structure) -> Lattice:
+def restrict_grid(lattice: OrderGrid, part: Structure) -> OrderGrid:
     """Return the part of an order grid that concerns one structure."""
     return replace(lattice, orders={n: v for n, v in lattice.orders.items() if n == "alpha" or n in part.order_names})
 
@@ -227,7 +232,7 @@ def show_searches(results: Mapping[str, SearchResult], *, as_json: bool) -> None
     if as_json:
         show_json({name: result.to_dict() for name, result in results.items()})
     else:
-        say("\n\n".join(f"{name}\n{result}" for name, result in results.items()))
+        print_text("\n\n".join(f"{name}\n{result}" for name, result in results.items()))
 
 
 @contextlib.contextmanager
@@ -264,7 +269,7 @@ def resume(
         show_notes(kept)
         told = Progress("", quiet=as_json)
         if not told.quiet:
-            announce(told, [job_of(kept, n, threads) for n in range(len(kept.contents.requests))], kept)
+            announce_time(told, [job_of(kept, n, threads) for n in range(len(kept.contents.requests))], kept)
         for number, request in enumerate(kept.contents.requests):
             with Progress(f"searching orders of {request.name}", quiet=as_json) as progress:
                 results[request.name] = resume_job(kept, number, threads=threads, progress=progress)
@@ -311,7 +316,7 @@ class ResponseOptions:
     separator: Separator = None
     decimal: Decimal = None
     thousands: Thousands = None
-    skip: Skipped = None
+    skip: SkippedLines = None
     header: HeaderLines = None
     sheet: Sheet = None
 
@@ -327,7 +332,7 @@ class ResponseOptions:
             negated=self.negated,
             output=self.output or "",
             input=self.input or "",
-            layout=layout_of(self),
+            layout=layout_options(self),
         )
 
 
@@ -355,7 +360,7 @@ def identify_frequency(
     as_json: Json = False,
 ) -> None:
     """Identify a model from a frequency response or impedance, with 95 % intervals."""
-    check_free(out, report, force=force, words=COMMAND)
+    check_free(out, report, force=force, words=COMMAND_MESSAGES)
     if structure.startswith(("flexible-link", "arm:")) or structure == "auto":
         raise ModelError(f"--structure {structure!r}: a frequency response takes an equation in words")
     records = [reading.load(file) for file in files]
@@ -379,13 +384,13 @@ def identify_frequency(
         judged = {"verdict": result.verdict(checked).to_dict()}
         show_json({**judged, **result.to_dict(), "validation": None if checked is None else checked.to_dict()})
         return
-    say(result.summary(checked).replace("result.warnings", "--verbose shows all"))
+    print_text(result.summary(checked).replace("result.warnings", "--verbose shows all"))
     if verbose:
-        say("\n".join(f"warning: {w}" for w in result.warnings))
+        print_text("\n".join(f"warning: {w}" for w in result.warnings))
 
 
 #: Range of a selection's duration relative to one fit per structure: from a list, and stepwise.
-LISTED, GROWN = (1.0, 8.0), (1.5, 20.0)
+LIST_TIME_FACTORS, STEPWISE_TIME_FACTORS = (1.0, 8.0), (1.5, 20.0)
 
 
 @command
@@ -412,11 +417,11 @@ def select(
     as_json: Json = False,
 ) -> None:
     """Select terms and orders that improve the score on validation data."""
-    check_free(out, report, force=force, words=COMMAND)
+    check_free(out, report, force=force, words=COMMAND_MESSAGES)
     if "auto" in structures and len(structures) > 1:
         raise ModelError("--structure auto is searched by itself; leave the others out, or give them without it")
     if structures == ["auto"]:
-        given = shape.given()
+        given = shape.given_options()
         if given:
             raise ModelError(f"{', '.join(given)}: of a structure that is given, not used with --structure auto")
         candidates: str | Structure | list[Structure] = "auto"
@@ -425,17 +430,17 @@ def select(
         candidates = made[0] if len(made) == 1 else made
     runs = reading.runs(files)
     if structures != ["auto"]:
-        made = [shape.measured(text, runs) for text in structures]
+        made = [shape.structure_for_runs(text, runs) for text in structures]
         candidates = made[0] if len(made) == 1 else made
     # The slice is of the runs that are fitted to.
     of_its_own = validation not in (None, "runs", "blocks")
     judges = replace(reading, sliced=None).runs([str(validation)]) if of_its_own else validation
     with resumable(store, "the same command"), Progress("fitting candidates", quiet=as_json) as progress:
         tried = [candidates] if isinstance(candidates, Structure) else candidates
-        grown = automatic(runs) if isinstance(tried, str) else tried
+        grown = automatic_structures(runs) if isinstance(tried, str) else tried
         seconds = sum(fit_seconds(runs, one, threads) for one in grown)
         listed = isinstance(candidates, list)
-        progress.expect("choosing", *between(seconds, LISTED if listed else GROWN))
+        progress.expect("choosing", *duration_bounds(seconds, LIST_TIME_FACTORS if listed else STEPWISE_TIME_FACTORS))
         # How many candidates come up turns with what earns its place.
         told = progress if listed else progress.so_far
         found = choice.select(runs, candidates, validation=judges, threads=threads, progress=told, store=store)
@@ -465,14 +470,14 @@ def agreement(
     as_json: Json = False,
 ) -> None:
     """Identify segments of a run separately, and list the parameters that differ significantly."""
-    check_free(report, force=force, words=COMMAND)
+    check_free(report, force=force, words=COMMAND_MESSAGES)
     shape.structure(structure)
     runs = reading.runs(files)
-    wanted = shape.measured(structure, runs)
+    wanted = shape.structure_for_runs(structure, runs)
     with Progress("fitting parts", quiet=as_json) as progress:
         count = max(parts or 0, 2) if len(runs) == 1 else len(runs)
-        progress.expect("fitting all parts", *between(fit_seconds(runs, wanted, threads, count)))
-        found = parts_of_runs.agreement(runs, wanted, parts=parts, loss=loss, threads=threads, progress=progress)
+        progress.expect("fitting all parts", *duration_bounds(fit_seconds(runs, wanted, threads, count)))
+        found = parts_of_runs.consistency(runs, wanted, parts=parts, loss=loss, threads=threads, progress=progress)
     if report is not None:
         found.report(report, force=force)
     show(found, as_json=as_json)

@@ -22,11 +22,11 @@ from ftlm.data.run import Run
 from ftlm.errors import FtlmError, InternalError, ModelError, RigFault
 from ftlm.progress import Progress
 from ftlm.utils.files import write_atomically
-from ftlm.utils.formatting import columns, wrapped
-from ftlm.utils.resources import between, expected
+from ftlm.utils.formatting import columns, wrap_text
+from ftlm.utils.resources import duration_bounds, estimate_duration
 
 #: Option of each Python argument, for messages.
-OPTIONS = {
+OPTION_BY_ARGUMENT = {
     "method": "--method",
     "coefficients": "--coefficients",
     "criterion": "--criterion",
@@ -109,26 +109,30 @@ OPTIONS = {
     "sheet": "--sheet",
 }
 #: Python argument followed by its option, such as ``force=True (--force)``.
-_BESIDE = re.compile(r"\b\w+=\S* \((--[a-z-]+)\)")
+_OPTION_HINT_PATTERN = re.compile(r"\b\w+=\S* \((--[a-z-]+)\)")
 #: Call of ``slice``, whose ends an option takes joined by a colon.
-_CUT = re.compile(r"\bslice\((\S+), (?:None|(\S+?))\)")
+_SLICE_PATTERN = re.compile(r"\bwindow\((\S+), (?:None|(\S+?))\)")
 #: Layout argument of Python, whose keys are options.
-_LAYOUT = re.compile(r"layout=dict\(([^()]*)\)")
-_COMMANDS = re.compile(r" \(commands: [^)]*\)")
+_LAYOUT_PATTERN = re.compile(r"layout=dict\(([^()]*)\)")
+_COMMAND_HINT_PATTERN = re.compile(r" \(commands: [^)]*\)")
 #: Python argument; ``-u m=3`` is a signal name of the user.
-_ARGUMENT = re.compile(r"(--?[\w-]+ )?(?<![^\s(])(" + "|".join(OPTIONS) + r")=(?:'([^']*)'|([\w.+-]+))?(?![\w{])")
-_BARE = re.compile(r"\b(innovation_length|prior_covariance|time_unit)\b(?!=)")
+_ARGUMENT_PATTERN = re.compile(
+    r"(--?[\w-]+ )?(?<![^\s(])(" + "|".join(OPTION_BY_ARGUMENT) + r")=(?:'([^']*)'|([\w.+-]+))?(?![\w{])"
+)
+_BARE_ARGUMENT_PATTERN = re.compile(r"\b(innovation_length|prior_covariance|time_unit)\b(?!=)")
 
 
 def in_options(text: str) -> str:
     """Replace Python arguments in a message by options of the command line."""
     text = text.replace("inputs={name: column}", "-u NAME=COLUMN").replace("outputs={name: column}", "-y NAME=COLUMN")
     text = text.replace("columns={part: column}", "--column PART=COLUMN")
-    text = _LAYOUT.sub(lambda found: found[1].replace(", ", " "), text).replace("layout=: ", "")
+    text = _LAYOUT_PATTERN.sub(lambda found: found[1].replace(", ", " "), text).replace("layout=: ", "")
     text = text.replace("in a columns file", "in a file for --columns")
-    text = _CUT.sub(lambda found: f"--slice {found[1]}:{found[2] or ''}", text)
-    text = _BESIDE.sub(r"\1", _COMMANDS.sub("", text))
-    return _BARE.sub(lambda found: OPTIONS[found[1]], _ARGUMENT.sub(_as_option, text))
+    text = _SLICE_PATTERN.sub(lambda found: f"--slice {found[1]}:{found[2] or ''}", text)
+    text = _OPTION_HINT_PATTERN.sub(r"\1", _COMMAND_HINT_PATTERN.sub("", text))
+    return _BARE_ARGUMENT_PATTERN.sub(
+        lambda found: OPTION_BY_ARGUMENT[found[1]], _ARGUMENT_PATTERN.sub(_as_option, text)
+    )
 
 
 def _as_option(found: re.Match[str]) -> str:
@@ -136,7 +140,7 @@ def _as_option(found: re.Match[str]) -> str:
     if before:
         return found[0]
     value = quoted or bare or ""
-    return OPTIONS[name] if value in ("", "True") else f"{OPTIONS[name]} {value}"
+    return OPTION_BY_ARGUMENT[name] if value in ("", "True") else f"{OPTION_BY_ARGUMENT[name]} {value}"
 
 
 def pairs(option: str, given: list[str] | None) -> dict[str, str]:
@@ -174,7 +178,7 @@ def ranges(option: str, given: list[str] | None) -> dict[str, float | tuple[floa
     what, example = ("seconds", "0:0.02") if option == "--delay" else ("a number", "0.5:1.5")
     values: dict[str, float | tuple[float, float]] = {}
     for name, value in pairs(option, given).items():
-        ends = joined(value)
+        ends = split_numbers(value)
         if len(ends) not in (1, 2):
             raise ModelError(f"{option} {name}={value}: {value!r} is neither {what} nor LEAST:LARGEST, as in {example}")
         values[name] = ends[0] if len(ends) == 1 else (ends[0], ends[1])
@@ -193,15 +197,15 @@ def interval(text: str, option: str, example: str) -> tuple[float | None, float 
     return start, stop
 
 
-def several(option: str, text: str, *counts: int) -> list[float]:
+def parse_numbers(option: str, text: str, *counts: int) -> list[float]:
     """Parse numbers joined by a colon; raise unless there are as many as allowed."""
-    values = joined(text)
+    values = split_numbers(text)
     if len(values) not in counts:
         raise ModelError(f"{option} {text!r} is not {' or '.join(str(c) for c in counts)} numbers joined by a colon")
     return values
 
 
-def joined(text: str) -> list[float]:
+def split_numbers(text: str) -> list[float]:
     """Parse numbers joined by a colon; empty if one is invalid."""
     try:
         return [float(part) for part in text.split(":")]
@@ -210,11 +214,15 @@ def joined(text: str) -> list[float]:
 
 
 #: Options of other programs, or argument names, with the options that are meant.
-MEANT = {"--equation": "--structure"}
+OPTION_ALIASES = {"--equation": "--structure"}
 #: Gaps between cells from which a line counts as a table row, and patterns of gaps and list entries.
-ROW, _GAPS, _ENTRY = 3, re.compile(" {2,}"), re.compile(r" *(?:[\w ]+\S {2,}|! |-> |\* |warning: |note: |assumed: )")
+MIN_TABLE_GAPS, _GAP_PATTERN, _ENTRY_PATTERN = (
+    3,
+    re.compile(" {2,}"),
+    re.compile(r" *(?:[\w ]+\S {2,}|! |-> |\* |warning: |note: |assumed: )"),
+)
 #: Type names in help texts.
-KINDS = {
+TYPE_LABELS = {
     "<str>": "TEXT",
     "<list[str]>": "TEXT",
     "<float>": "NUMBER",
@@ -235,21 +243,21 @@ class Command(TyperCommand):
             # An argument is named by what it is of, and what no option names is a text or a number to a person.
             told: Any = parameter
             told.display_type_rich = functools.partial(
-                _kind, told.display_type_rich, argument=told.param_type_name == "argument"
+                _type_label, told.display_type_rich, argument=told.param_type_name == "argument"
             )
 
     def parse_args(self, ctx: Any, args: list[str]) -> list[str]:
         """Parse options; raise for an alias with the option that is meant."""
         known = {name for parameter in self.params for name in parameter.opts}
         for given in (a.partition("=")[0] for a in args):
-            if given not in known and MEANT.get(given) in known:
-                ctx.fail(f"No such option: {given}; {MEANT[given]} takes equations in words, too.")
+            if given not in known and OPTION_ALIASES.get(given) in known:
+                ctx.fail(f"No such option: {given}; {OPTION_ALIASES[given]} takes equations in words, too.")
         return super().parse_args(ctx, args)
 
 
-def _kind(kind: Callable[..., str], *, ctx: Any, argument: bool) -> str:
+def _type_label(kind: Callable[..., str], *, ctx: Any, argument: bool) -> str:
     """Type of an option's value in plain words."""
-    return "" if argument else KINDS.get(kind(ctx=ctx), kind(ctx=ctx))
+    return "" if argument else TYPE_LABELS.get(kind(ctx=ctx), kind(ctx=ctx))
 
 
 def command(work: Callable[..., None]) -> Callable[..., None]:
@@ -325,10 +333,10 @@ def show(result: Any, *, as_json: bool) -> None:
     if as_json:
         show_json(result.to_dict())
     else:
-        say(str(result))
+        print_text(str(result))
 
 
-def say(text: str, end: str = "\n") -> None:
+def print_text(text: str, end: str = "\n") -> None:
     """Print text, wrapped between words at the width of the terminal.
 
     Table rows and commands to copy are not wrapped.
@@ -342,30 +350,30 @@ def say(text: str, end: str = "\n") -> None:
 def broken_line(line: str) -> list[str]:
     """Return a line wrapped to the width of the terminal."""
     lead = line[: len(line) - len(line.lstrip())]
-    if len(line) <= columns() or line.startswith("next: ") or len(_GAPS.findall(line.strip())) >= ROW:
+    if len(line) <= columns() or line.startswith("next: ") or len(_GAP_PATTERN.findall(line.strip())) >= MIN_TABLE_GAPS:
         return [line]
     # An entry such as "  mode  of so much": what follows stands under its words.
-    entry = _ENTRY.match(line)
-    return wrapped(line.strip(), lead, " " * (entry.end() if entry else len(lead) + 2))
+    entry = _ENTRY_PATTERN.match(line)
+    return wrap_text(line.strip(), lead, " " * (entry.end() if entry else len(lead) + 2))
 
 
 def show_json(document: Any) -> None:
     """Print a document of Python and NumPy values as JSON."""
-    print(json.dumps(document, indent=1, ensure_ascii=False, allow_nan=False, default=_plain))
+    print(json.dumps(document, indent=1, ensure_ascii=False, allow_nan=False, default=_to_json_value))
 
 
-def tell(sentence: str, *, as_json: bool, **facts: Any) -> None:
+def print_outcome(sentence: str, *, as_json: bool, **facts: Any) -> None:
     """Print an outcome as a sentence or as one line of JSON."""
     print(json.dumps(facts, ensure_ascii=False) if as_json else sentence)
 
 
-def _plain(value: Any) -> Any:
+def _to_json_value(value: Any) -> Any:
     """Convert NumPy scalars and arrays for JSON."""
     return value.tolist() if hasattr(value, "tolist") else str(value)
 
 
 #: File extensions of figures.
-FIGURES = ("png", "pdf", "svg")
+FIGURE_FORMATS = ("png", "pdf", "svg")
 
 
 def check_ending(path: str | None, ending: str, why: str = "") -> None:
@@ -377,7 +385,7 @@ def check_ending(path: str | None, ending: str, why: str = "") -> None:
 def figure_kind(path: str | None) -> str:
     """Return the format of a figure from its file extension; "" for None."""
     kind = "" if path is None else Path(path).suffix.removeprefix(".").lower()
-    if path is not None and kind not in FIGURES:
+    if path is not None and kind not in FIGURE_FORMATS:
         raise ModelError(f"{path} ends in {kind or 'nothing'!r}; write .png, .pdf or .svg")
     return kind
 
@@ -398,12 +406,12 @@ def say_written(*paths: str | None) -> None:
 
 #: Time to read a byte and to simulate a sample of an output on the reference machine [s], and range of the actual
 #: durations. Numbers with few digits need more time per byte, and oscillating simulations are refined.
-OF_BYTE, OF_SAMPLE, CAME_TO = 8e-8, 4e-6, (0.4, 4.0)
+READ_TIME_PER_BYTE_S, SIMULATION_TIME_PER_SAMPLE_S, DURATION_FACTORS = 8e-8, 4e-6, (0.4, 4.0)
 #: Time of a controller design, and of the loop analysis for one sample of the parameters [s].
-OF_DESIGN, OF_JUDGED = {"pid": 0.1, "lqg": 1.2}, {"pid": 0.005, "lqg": 0.01}
+DESIGN_TIME_S, LOOP_ANALYSIS_TIME_S = {"pid": 0.1, "lqg": 1.2}, {"pid": 0.005, "lqg": 0.01}
 
 
-def expect_reading(files: Sequence[str]) -> None:
+def announce_reading(files: Sequence[str]) -> None:
     """Announce the duration of reading these files, if it is long."""
     size = 0
     for file in files:
@@ -412,18 +420,23 @@ def expect_reading(files: Sequence[str]) -> None:
         except (OSError, ValueError):
             # Who reads it says so in words.
             return
-    if OF_BYTE * size > 0.2:
-        Progress("").expect("reading", *between(expected(OF_BYTE * size, 1), CAME_TO))
+    if READ_TIME_PER_BYTE_S * size > 0.2:
+        Progress("").expect(
+            "reading", *duration_bounds(estimate_duration(READ_TIME_PER_BYTE_S * size, 1), DURATION_FACTORS)
+        )
 
 
-def expect_judging(runs: Sequence[Run], outputs: int, *, quiet: bool) -> None:
+def announce_simulation(runs: Sequence[Run], outputs: int, *, quiet: bool) -> None:
     """Announce the duration of simulating a model on these runs, if it is long."""
     samples = outputs * sum(run.length for run in runs)
-    if OF_SAMPLE * samples > 0.2:
-        Progress("", quiet=quiet).expect("running the model", *between(expected(OF_SAMPLE * samples, 1), CAME_TO))
+    if SIMULATION_TIME_PER_SAMPLE_S * samples > 0.2:
+        Progress("", quiet=quiet).expect(
+            "running the model",
+            *duration_bounds(estimate_duration(SIMULATION_TIME_PER_SAMPLE_S * samples, 1), DURATION_FACTORS),
+        )
 
 
-def expect_designing(design: str, samples: int) -> None:
+def announce_design(design: str, samples: int) -> None:
     """Announce the duration of a design with so many parameter samples, if it is long."""
-    seconds = OF_DESIGN[design] + OF_JUDGED[design] * max(samples, 0)
-    Progress("").expect("designing", *between(expected(seconds, 1), CAME_TO))
+    seconds = DESIGN_TIME_S[design] + LOOP_ANALYSIS_TIME_S[design] * max(samples, 0)
+    Progress("").expect("designing", *duration_bounds(estimate_duration(seconds, 1), DURATION_FACTORS))

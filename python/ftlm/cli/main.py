@@ -41,7 +41,7 @@ def version(
 
 
 #: Short help of each command in `ftlm -h`; its docstring is its own help.
-COMMANDS = {
+COMMAND_HELP = {
     demo: "Identify a simulated arm, and draw what came out.",
     page: "From a file to a model, in a browser.",
     record: "Drive a rig, simulated by default, and record a run.",
@@ -67,7 +67,7 @@ COMMANDS = {
     export: "Write a saved model for another tool.",
     doctor: "Show versions, cores, and what is installed.",
 }
-for _command, _short in COMMANDS.items():
+for _command, _short in COMMAND_HELP.items():
     name = _command.__name__.rstrip("_").replace("_", "-")
     app.command(name, cls=Command, short_help=_short)(_command)
 

@@ -10,14 +10,23 @@ import typer
 from typer import Argument, Option
 
 from ftlm.analysis.conversion import export_text
-from ftlm.cli.framework import EXIT_VALIDATION, command, expect_judging, figure_kind, interval, show, tell, write_figure
+from ftlm.cli.framework import (
+    EXIT_VALIDATION,
+    announce_simulation,
+    command,
+    figure_kind,
+    interval,
+    print_outcome,
+    show,
+    write_figure,
+)
 from ftlm.cli.options import BlockPulses, Files, Force, Json, Number, Page, ReadingOptions, SavedModel, Text, Texts
 from ftlm.data.run import Run
 from ftlm.errors import ModelError
 from ftlm.model.model import Model, load_model
 from ftlm.plot import matplotlib_figures as plots
 from ftlm.report.html_report import model_page
-from ftlm.utils.files import COMMAND, check_free, write_atomically
+from ftlm.utils.files import COMMAND_MESSAGES, check_free, write_atomically
 
 
 def _with_runs(
@@ -26,7 +35,7 @@ def _with_runs(
     """Load a saved model and its runs."""
     loaded = load_model(model)
     runs = reading.runs(files)
-    expect_judging(runs, len(loaded.outputs), quiet=quiet)
+    announce_simulation(runs, len(loaded.outputs), quiet=quiet)
     return loaded, runs
 
 
@@ -82,12 +91,12 @@ def simulate(
     as_json: Json = False,
 ) -> None:
     """Simulate a saved model on the inputs of a run and write the outputs as csv."""
-    check_free(out, force=force, words=COMMAND)
+    check_free(out, force=force, words=COMMAND_MESSAGES)
     loaded, runs = _with_runs(model, reading, [file], quiet=as_json)
     free = loaded.simulate(runs[0], tolerance=tolerance)
     free.to_csv(out, force=force)
     sentence = f"{free.length} rows of {', '.join(free.outputs)} written to {out}"
-    tell(sentence, as_json=as_json, written=out, rows=free.length, outputs=list(free.outputs))
+    print_outcome(sentence, as_json=as_json, written=out, rows=free.length, outputs=list(free.outputs))
 
 
 @command
@@ -101,10 +110,10 @@ def report(
     as_json: Json = False,
 ) -> None:
     """Write the HTML report of a saved model, with validation runs."""
-    check_free(out, force=force, words=COMMAND)
+    check_free(out, force=force, words=COMMAND_MESSAGES)
     loaded, runs = _with_runs(model, reading, validation, quiet=as_json)
     page = model_page(loaded, out, validation=runs or None, force=force)
-    tell(f"written: {page}", as_json=as_json, written=str(page))
+    print_outcome(f"written: {page}", as_json=as_json, written=str(page))
 
 
 @command
@@ -122,7 +131,7 @@ def plot(
     as_json: Json = False,
 ) -> None:
     """Plot a saved model: fit or residuals on runs, Bode plot, poles, step or impulse response."""
-    check_free(out, force=force, words=COMMAND)
+    check_free(out, force=force, words=COMMAND_MESSAGES)
     figure_kind(out)
     loaded, runs = _with_runs(model, reading, files, quiet=as_json)
     alone = {"bode": plots.bode, "poles": plots.poles, "step": plots.step, "impulse": plots.impulse}
@@ -137,7 +146,7 @@ def plot(
     else:
         figure = plots.residuals(loaded.resid(runs))
     write_figure(figure, out, force=force)
-    tell(f"written: {out}", as_json=as_json, written=out)
+    print_outcome(f"written: {out}", as_json=as_json, written=out)
 
 
 @command
@@ -155,14 +164,14 @@ def export(
     as_json: Json = False,
 ) -> None:
     """Export a saved model for another tool, to a file or to standard output."""
-    check_free(out, force=force, words=COMMAND)
+    check_free(out, force=force, words=COMMAND_MESSAGES)
     limits = None if band is None else _both_ends(band)
     text = export_text(load_model(model), to, band=limits, order=order)
     if out is None:
-        tell(text.rstrip("\n"), as_json=as_json, to=to, text=text)
+        print_outcome(text.rstrip("\n"), as_json=as_json, to=to, text=text)
     else:
         write_atomically(out, text.encode(), force=force)
-        tell(f"written: {out}", as_json=as_json, to=to, written=out)
+        print_outcome(f"written: {out}", as_json=as_json, to=to, written=out)
 
 
 def _both_ends(band: str) -> tuple[float, float]:

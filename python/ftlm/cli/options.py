@@ -11,7 +11,7 @@ from typing import Annotated, Any, Literal
 from typer import Argument, Option
 
 from ftlm.arm.flexible_link import Law, flexible_link
-from ftlm.cli.framework import expect_reading, interval, numbers, pairs, ranges
+from ftlm.cli.framework import announce_reading, interval, numbers, pairs, ranges
 from ftlm.data.run import Run
 from ftlm.errors import DataError, ModelError
 from ftlm.estimation.genetic import Genetic
@@ -19,10 +19,10 @@ from ftlm.io.dialect import Layout
 from ftlm.io.load import load
 from ftlm.io.preview import OpenedFile, open_file
 from ftlm.order_search.options import Criterion
-from ftlm.structure.order_grid import Lattice, lattice
+from ftlm.structure.order_grid import OrderGrid, order_grid
 from ftlm.structure.parser import equation
 from ftlm.structure.sensor_filter import SensorFilter
-from ftlm.structure.structure import START_WORDS, Structure, check_initial
+from ftlm.structure.structure import INITIAL_CHOICES, Structure, check_initial
 
 #: Types of optional options.
 Text = str | None
@@ -45,7 +45,7 @@ CandidateTexts = Annotated[
         help="One, whose inside is searched, or several to compare: as of identify; or auto, one output, any inputs.",
     ),
 ]
-LatticeStep = Annotated[float, Option("--step", help="Step of the order lattice.")]
+GridIncrement = Annotated[float, Option("--step", help="Step of the order lattice.")]
 BlockPulses = Annotated[int | None, Option("--m", help="Block pulses a run; default 2048, or what the runs carry.")]
 Threads = Annotated[int | None, Option("--threads", help="Threads; default FTLM_THREADS, or all cores.")]
 Out = Annotated[Text, Option("-o", "--out", metavar="FILE", help="Model to write, .json.")]
@@ -64,14 +64,14 @@ Thousands = Annotated[
     Literal["none", "point", "comma", "space", "apostrophe"] | None,
     Option(help="What groups thousands of numbers in text; default what is there."),
 ]
-Skipped = Annotated[int | None, Option(metavar="LINES", help="Lines above the table; default what is no table.")]
+SkippedLines = Annotated[int | None, Option(metavar="LINES", help="Lines above the table; default what is no table.")]
 HeaderLines = Annotated[
     int | None, Option(metavar="0|1|2", help="Lines of header: none, names, names and units; default what is there.")
 ]
 Sheet = Annotated[Text, Option(help="Sheet of a workbook that has several.")]
 
 
-def layout_of(record: object) -> dict[str, Any]:
+def layout_options(record: object) -> dict[str, Any]:
     """Layout options that a dataclass has and the user has set."""
     said = {f.name: getattr(record, f.name, None) for f in fields(Layout)}
     return {name: value for name, value in said.items() if value is not None}
@@ -111,7 +111,7 @@ class ReadingOptions:
     separator: Separator = None
     decimal: Decimal = None
     thousands: Thousands = None
-    skip: Skipped = None
+    skip: SkippedLines = None
     header: HeaderLines = None
     dates: Annotated[
         Literal["ymd", "dmy", "mdy"] | None, Option(help="Order of day and month where dates leave it open.")
@@ -140,11 +140,11 @@ class ReadingOptions:
             "intersample": pairs("--intersample", self.between),
             "resample": self.resample,
             "missing": self.missing,
-            "layout": layout_of(self),
+            "layout": layout_options(self),
         }
         if not files:
             return []
-        expect_reading(files)
+        announce_reading(files)
         options = {name: value for name, value in given.items() if value not in (None, {}, "")}
         if self.sliced is not None:
             options["slice"] = interval(self.sliced, "--slice", "1.1:19.5")
@@ -158,11 +158,11 @@ class ReadingOptions:
                 return [run]
         return [load(f, **options) for f in files]
 
-    def opened(self, file: str) -> OpenedFile:
+    def preview_file(self, file: str) -> OpenedFile:
         """Preview a file that is not loaded as a run."""
         if self.detrend is not None:
             raise ModelError("--detrend is not used with open; give it to the commands that open names")
-        expect_reading([file])
+        announce_reading([file])
         return open_file(
             file,
             time=self.time,
@@ -173,7 +173,7 @@ class ReadingOptions:
             columns=self.columns,
             time_unit=self.time_unit,
             intersample=pairs("--intersample", self.between),
-            layout=layout_of(self),
+            layout=layout_options(self),
             slice=None if self.sliced is None else interval(self.sliced, "--slice", "1.1:19.5"),
             resample=self.resample,
             missing=self.missing,
@@ -262,7 +262,7 @@ class StructureOptions:
         )
         return built.with_orders(numbers("--order", self.orders)).with_coefficients(numbers("--fixed", self.fixed))
 
-    def measured(self, text: str, runs: Sequence[Run]) -> Structure:
+    def structure_for_runs(self, text: str, runs: Sequence[Run]) -> Structure:
         """Return the structure of `text` for runs: one link alone if no run contains the other stage."""
         stage = re.fullmatch("arm:([12])", text)
         if stage is not None:
@@ -273,7 +273,7 @@ class StructureOptions:
                 return self.structure(text, alone=True)
         return self.structure(text)
 
-    def given(self) -> list[str]:
+    def given_options(self) -> list[str]:
         """Options with values other than their defaults."""
         names = {"orders": "--order", "fixed": "--fixed"}
         usual = StructureOptions()
@@ -282,7 +282,7 @@ class StructureOptions:
 
     def _check_equation(self, count: int) -> None:
         """Raise for options of the flexible link, given the number of equations."""
-        given = self._of_the_link() | {
+        given = self._link_options() | {
             "--coupling": self.coupling is not None and count == 1,
         }
         wrong = [option for option, is_given in given.items() if is_given]
@@ -294,7 +294,7 @@ class StructureOptions:
                 "out, or use --structure flexible-link:1, :2 or :both"
             )
 
-    def _of_the_link(self) -> dict[str, bool]:
+    def _link_options(self) -> dict[str, bool]:
         """Whether each option of the flexible link is given."""
         return {
             "--cross-stage": self.cross_stage,
@@ -328,7 +328,7 @@ class StructureOptions:
         nearly integer order has hardly any memory. So runs start from the link's angle and velocity unless a history is
         requested.
         """
-        given = self._of_the_link() | {"--coupling": self.coupling is not None}
+        given = self._link_options() | {"--coupling": self.coupling is not None}
         given |= {"--filtered": bool(self.filtered), "--low-pass": self.low_pass is not None}
         wrong = [option for option, is_given in given.items() if is_given]
         if wrong:
@@ -384,13 +384,13 @@ class StructureOptions:
         )
 
     def _initial(self) -> Any:
-        if self.initial in START_WORDS:
+        if self.initial in INITIAL_CHOICES:
             return self.initial
         try:
             return tuple(float(exponent) for exponent in self.initial.split(","))
         except ValueError:
             raise ModelError(
-                f"--initial {self.initial!r} is not {', '.join(START_WORDS)} or exponents such as 0,1"
+                f"--initial {self.initial!r} is not {', '.join(INITIAL_CHOICES)} or exponents such as 0,1"
             ) from None
 
 
@@ -416,13 +416,13 @@ class SearchOptions:
     m: BlockPulses = None
     keep: Annotated[int | None, Option(help="Rows of the ranked table; default 20.")] = None
 
-    def lattice(self) -> Lattice | None:
+    def lattice(self) -> OrderGrid | None:
         """Order grid of the search; None without options."""
         if self.step is None and not self.values:
             return None
         named: dict[str, Any] = dict(pairs("--lattice", self.values))
         alpha = named.pop("alpha", None)
-        made = lattice(**named) if self.step is None else lattice(step=self.step, **named)
+        made = order_grid(**named) if self.step is None else order_grid(step=self.step, **named)
         return made if alpha is None else replace(made, orders={**made.orders, "alpha": alpha})
 
     def settings(self) -> dict[str, Any]:

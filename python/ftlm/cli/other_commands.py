@@ -7,14 +7,14 @@ from typing import Annotated
 
 from typer import Argument, Option
 
-from ftlm.app.server import PORT, serve
-from ftlm.cli.framework import command, say, show_json
+from ftlm.app.server import DEFAULT_PORT, serve
+from ftlm.cli.framework import command, print_text, show_json
 from ftlm.cli.options import (
     Files,
     Force,
     GeneticOptions,
+    GridIncrement,
     Json,
-    LatticeStep,
     Page,
     ReadingOptions,
     Text,
@@ -30,8 +30,8 @@ from ftlm.reproduction.demo import run_demo
 from ftlm.reproduction.optimizer_comparison import CONTEST_STEP
 from ftlm.reproduction.report import demo_details, demo_page, demo_text, reproduction_text, unseen_page, unseen_text
 from ftlm.reproduction.reproduction import ALWAYS_SAVED
-from ftlm.utils.files import COMMAND, check_folder, check_free
-from ftlm.utils.resources import expected
+from ftlm.utils.files import COMMAND_MESSAGES, check_folder, check_free
+from ftlm.utils.resources import estimate_duration
 from ftlm.utils.validation import check_threads
 
 #: Processor time of `ftlm demo` and its pages on the reference machine of base/pace.py [s].
@@ -42,7 +42,7 @@ DEMO_SECONDS = 22.0
 def demo(
     *,
     out: Annotated[str, Option("-o", "--out", metavar="FOLDER", help="Where to write.")] = "ftlm-demo",
-    step: LatticeStep = 0.1,
+    step: GridIncrement = 0.1,
     noise: Annotated[float, Option(help="Noise on every angle [rad].")] = 1e-4,
     seed: Annotated[int, Option(min=0, help="Seed of the noise.")] = 1,
     threads: Threads = None,
@@ -55,7 +55,7 @@ def demo(
     The paper's order grid has the increment 0.05, which takes minutes.
     """
     with Progress("", quiet=as_json) as progress:
-        progress.expect("the demo", expected(DEMO_SECONDS * (0.1 / step) ** 2, check_threads(threads)))
+        progress.expect("the demo", estimate_duration(DEMO_SECONDS * (0.1 / step) ** 2, check_threads(threads)))
         result = run_demo(
             Path(out),
             step=step,
@@ -71,9 +71,9 @@ def demo(
         show_json(result.to_dict())
     else:
         if verbose:
-            say(f"{demo_details(result)}\n")
+            print_text(f"{demo_details(result)}\n")
         files = f"{Path(out) / 'demo.html'} (open it), and {len(result.files) - 1} runs and models"
-        say(f"{demo_text(result)}\nwritten: {files}")
+        print_text(f"{demo_text(result)}\nwritten: {files}")
 
 
 @command
@@ -84,7 +84,7 @@ def reproduce(
     square: Annotated[Text, Option(metavar="FILE", help="A measured run to identify from.")] = None,
     sine: Annotated[Text, Option(metavar="FILE", help="Another one, to validate on.")] = None,
     reading: ReadingOptions,
-    step: LatticeStep = 0.05,
+    step: GridIncrement = 0.05,
     noise: Annotated[float, Option(help="Noise on every angle of the virtual rig [rad].")] = 1e-4,
     seed: Annotated[int, Option("--noise-seed", min=0, help="Seed of that noise.")] = 1,
     arms: Annotated[
@@ -100,7 +100,7 @@ def reproduce(
     as_json: Json = False,
 ) -> None:
     """Recompute the tables and figures of the paper on simulated or measured runs, as one HTML page."""
-    check_free(out, force=force, words=COMMAND)
+    check_free(out, force=force, words=COMMAND_MESSAGES)
     if save is not None:
         check_folder(Path(save), ALWAYS_SAVED, force=force)
     if sine is not None and square is None:
@@ -125,7 +125,7 @@ def reproduce(
     if as_json:
         show_json({**result.to_dict(), "files": [str(f) for f in files]})
     else:
-        say(f"{reproduction_text(result)}\n\nwritten: {', '.join(str(f) for f in files)}")
+        print_text(f"{reproduction_text(result)}\n\nwritten: {', '.join(str(f) for f in files)}")
 
 
 @command
@@ -142,7 +142,7 @@ def orders(
     as_json: Json = False,
 ) -> None:
     """Compare integer and fractional orders of the arm's links by cross-validation over runs, as an HTML page."""
-    check_free(out, force=force, words=COMMAND)
+    check_free(out, force=force, words=COMMAND_MESSAGES)
     runs = reading.runs(files, apart=True)
     with Progress("", quiet=as_json) as progress:
         found = orders_on_unseen_runs(runs, filtered=filtered, threads=threads, say=progress.say, progress=progress)
@@ -151,7 +151,7 @@ def orders(
     if as_json:
         show_json({**found.to_dict(), "files": [str(page)]})
     else:
-        say(f"{unseen_text(found)}\n\nwritten: {page}")
+        print_text(f"{unseen_text(found)}\n\nwritten: {page}")
 
 
 @command
@@ -159,7 +159,8 @@ def app(
     *,
     files: Annotated[list[str] | None, Argument(metavar="[FILE...]", help="Measured files to open at once.")] = None,
     port: Annotated[
-        int | None, Option(metavar="PORT", help=f"Of 127.0.0.1; default {PORT}, or any other where that is taken.")
+        int | None,
+        Option(metavar="PORT", help=f"Of 127.0.0.1; default {DEFAULT_PORT}, or any other where that is taken."),
     ] = None,
     browser: Annotated[
         bool, Option("--browser/--no-browser", help="Open a browser, or print the address alone.")

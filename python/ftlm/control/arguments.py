@@ -8,25 +8,26 @@ from collections.abc import Sequence
 import numpy as np
 
 from ftlm.errors import ModelError
-from ftlm.utils.validation import Floats, check_seed, nearest, real_number, shown, whole_number
+from ftlm.utils.validation import Floats, check_seed, nearest, real_number, short_repr, whole_number
 
 #: Sampling rates [Hz] at which margins can be computed in floating point.
-RATES = (1e-9, 1e9)
+RATE_RANGE_HZ = (1e-9, 1e9)
 #: Range of standard deviations and times.
-SIZES = (1e-100, 1e100)
+POSITIVE_RANGE = (1e-100, 1e100)
 
 
 def checked_rate(rate: object) -> float:
     """Return a sampling rate [Hz]; raise outside the range."""
     value = real_number("rate", rate)
-    if not RATES[0] <= value <= RATES[1]:
+    if not RATE_RANGE_HZ[0] <= value <= RATE_RANGE_HZ[1]:
         raise ModelError(
-            f"rate = {shown(rate)} Hz is not a positive number of samples per second from {RATES[0]:g} to {RATES[1]:g}"
+            f"rate = {short_repr(rate)} Hz is not a positive number of samples per second from {RATE_RANGE_HZ[0]:g} "
+            f"to {RATE_RANGE_HZ[1]:g}"
         )
     return value
 
 
-def names_of(what: str, given: Sequence[str] | None, outputs: tuple[str, ...]) -> tuple[str, ...]:
+def select_outputs(what: str, given: Sequence[str] | None, outputs: tuple[str, ...]) -> tuple[str, ...]:
     """Return the given outputs, or all without a list."""
     if given is None:
         return outputs
@@ -34,12 +35,12 @@ def names_of(what: str, given: Sequence[str] | None, outputs: tuple[str, ...]) -
     absent = [n for n in names if not (isinstance(n, str) and n in outputs)]
     if not names or (not absent and len(set(names)) < len(names)):
         raise ModelError(
-            f"{what} = {shown(given)} is no list of outputs, each once; the input reaches {', '.join(outputs)}"
+            f"{what} = {short_repr(given)} is no list of outputs, each once; the input reaches {', '.join(outputs)}"
         )
     if absent:
         near = nearest(absent[0], outputs) if isinstance(absent[0], str) else ""
         raise ModelError(
-            f"{what} = {shown(absent[0])} is not one of the outputs that the input reaches{near}; they are "
+            f"{what} = {short_repr(absent[0])} is not one of the outputs that the input reaches{near}; they are "
             f"{', '.join(outputs)}"
         )
     return tuple(names)
@@ -49,29 +50,32 @@ def positive(name: str, value: object) -> float:
     """Return a finite number above 0."""
     number = real_number(name, value)
     if not (math.isfinite(number) and number > 0):
-        raise ModelError(f"{name} = {shown(value)} is not a finite number above 0")
-    if not SIZES[0] <= number <= SIZES[1]:
-        raise ModelError(f"{name} = {shown(value)} is outside [{SIZES[0]:g}, {SIZES[1]:g}], where squares are numbers")
+        raise ModelError(f"{name} = {short_repr(value)} is not a finite number above 0")
+    if not POSITIVE_RANGE[0] <= number <= POSITIVE_RANGE[1]:
+        raise ModelError(
+            f"{name} = {short_repr(value)} is outside [{POSITIVE_RANGE[0]:g}, {POSITIVE_RANGE[1]:g}], where squares "
+            "are numbers"
+        )
     return number
 
 
-def largest(limit: object) -> float:
+def check_limit(limit: object) -> float:
     """Return the largest command, which may be infinite."""
     most = real_number("limit", limit)
     if not most > 0:
-        raise ModelError(f"limit = {shown(limit)} is not a number above 0")
+        raise ModelError(f"limit = {short_repr(limit)} is not a number above 0")
     return most
 
 
-def drawn_from(samples: object, seed: object) -> tuple[int, int]:
+def check_samples(samples: object, seed: object) -> tuple[int, int]:
     """Return the number of parameter samples and their seed."""
     count = whole_number(samples)
     if count is None or not 0 <= count <= 10_000:
-        raise ModelError(f"samples = {shown(samples)} is no whole number from 0 to 10000")
+        raise ModelError(f"samples = {short_repr(samples)} is no whole number from 0 to 10000")
     return count, check_seed(seed)
 
 
-def sums(what: str, text: object, outputs: tuple[str, ...]) -> Floats:
+def sum_row(what: str, text: object, outputs: tuple[str, ...]) -> Floats:
     """Return the coefficients of a sum of outputs, such as "theta11 + theta12"."""
     row = np.zeros(len(outputs))
     for part in text.split("+") if isinstance(text, str) else [""]:
@@ -79,7 +83,7 @@ def sums(what: str, text: object, outputs: tuple[str, ...]) -> Floats:
         if name not in outputs:
             near = nearest(name, outputs)
             raise ModelError(
-                f"{what} = {shown(text)} is not a sum of outputs that the input reaches{near}; they are "
+                f"{what} = {short_repr(text)} is not a sum of outputs that the input reaches{near}; they are "
                 f"{', '.join(outputs)}"
             )
         row[outputs.index(name)] += 1.0

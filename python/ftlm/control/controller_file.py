@@ -10,16 +10,16 @@ import msgspec
 import numpy as np
 
 from ftlm._core import __version__
-from ftlm.control.fractional_pid import FractionalPid, Realised
+from ftlm.control.fractional_pid import DiscretePid, FractionalPid
 from ftlm.control.lqg import Lqg, Observer
-from ftlm.control.realization import MOST, Realisation
+from ftlm.control.realization import MAX_POLES, Realisation
 from ftlm.errors import DataError, FtlmError, ModelError
-from ftlm.utils.files import Saved, write_atomically
-from ftlm.utils.validation import Floats, words_of
+from ftlm.utils.files import JsonFormat, write_atomically
+from ftlm.utils.validation import Floats, error_text
 
-SCHEMA = 1
+CONTROLLER_SCHEMA = 1
 #: Algorithm of each kind of controller, as text for implementations without ftlm.
-MEANING = {
+ALGORITHM_TEXTS = {
     "pid": "each sample, with e = reference - measured: every lag becomes x = keep x + now e + before e_last, and the "
     "output is (kp + direct) e + the sum of weight x, cut at the limit; lags of the derivative begin with "
     "e (now + before)/(1 - keep), those of the integral with 0 and stand still where they would push further",
@@ -55,11 +55,11 @@ class PidFile(msgspec.Struct, forbid_unknown_fields=True, tag="pid"):
     direct: float
     lags: list[Lag]
 
-    def controller(self) -> Realised:
+    def controller(self) -> DiscretePid:
         """Return the controller."""
         pid = FractionalPid(self.kp, self.ki, self.kd, self.lam, self.mu)
         limit = math.inf if self.limit is None else self.limit
-        return Realised(pid, self.rate, limit=limit, band=self.band, order=self.order)
+        return DiscretePid(pid, self.rate, limit=limit, band=self.band, order=self.order)
 
 
 class LqgFile(msgspec.Struct, forbid_unknown_fields=True, tag="lqg"):
@@ -103,8 +103,8 @@ class LqgFile(msgspec.Struct, forbid_unknown_fields=True, tag="lqg"):
                 raise ModelError(f"{name} has shape {matrix.shape}, not {shape}")
             if not np.isfinite(matrix).all():
                 raise ModelError(f"{name} is not finite")
-        if not 0 < size <= MOST + 1:
-            raise ModelError(f"{size} states are not 1 to {MOST + 1}")
+        if not 0 < size <= MAX_POLES + 1:
+            raise ModelError(f"{size} states are not 1 to {MAX_POLES + 1}")
         if not 0 < len(self.poles) <= size:
             raise ModelError(f"{len(self.poles)} poles are not those of {size} states")
         absent = [n for n in (*self.measured, self.tracked) if n not in self.outputs]
@@ -145,11 +145,11 @@ class ControllerFile(msgspec.Struct, forbid_unknown_fields=True):
 
 
 #: A controller of thirty states has a few tens of kilobytes; the default size limit suffices.
-CONTROLLER = Saved("controller", "a file that ftlm control wrote", ControllerFile, SCHEMA)
+CONTROLLER_FORMAT = JsonFormat("controller", "a file that ftlm control wrote", ControllerFile, CONTROLLER_SCHEMA)
 
 
 def save_controller(
-    controller: Realised | Lqg, path: str | os.PathLike[str], *, model: str = "", force: bool = False
+    controller: DiscretePid | Lqg, path: str | os.PathLike[str], *, model: str = "", force: bool = False
 ) -> None:
     """Write a controller as JSON: design data and the coefficients of its discrete-time algorithm.
 
@@ -171,18 +171,20 @@ def save_controller(
     DataError
         The file exists and ``force`` is not set, or it cannot be written.
     """
-    if isinstance(controller, Realised):
+    if isinstance(controller, DiscretePid):
         written: PidFile | LqgFile = _pid(controller)
     elif isinstance(controller, Lqg):
         written = _lqg(controller)
     else:
         raise ModelError(f"controller is a {type(controller).__name__}; give a Realised or an Lqg")
     kind = "pid" if isinstance(written, PidFile) else "lqg"
-    file = ControllerFile("ftlm-controller", SCHEMA, f"ftlm {__version__}", str(model), MEANING[kind], written)
+    file = ControllerFile(
+        "ftlm-controller", CONTROLLER_SCHEMA, f"ftlm {__version__}", str(model), ALGORITHM_TEXTS[kind], written
+    )
     write_atomically(path, msgspec.json.format(msgspec.json.encode(file), indent=1) + b"\n", force=force)
 
 
-def load_controller(path: str | os.PathLike[str]) -> Realised | Lqg:
+def load_controller(path: str | os.PathLike[str]) -> DiscretePid | Lqg:
     """Read a controller written by :func:`save_controller` or ``ftlm control``.
 
     Raises
@@ -190,19 +192,19 @@ def load_controller(path: str | os.PathLike[str]) -> Realised | Lqg:
     DataError
         A file that cannot be read, or is no controller of this version.
     """
-    read = CONTROLLER.read(path)
-    CONTROLLER.check_schema(path, read, SCHEMA)
+    read = CONTROLLER_FORMAT.read(path)
+    CONTROLLER_FORMAT.check_schema(path, read, CONTROLLER_SCHEMA)
     try:
         return read.controller.controller()
     except (FtlmError, ValueError) as error:
-        raise DataError(f"{path} is damaged: {words_of(error)}; write it again") from error
+        raise DataError(f"{path} is damaged: {error_text(error)}; write it again") from error
 
 
 def _limit(value: float) -> float | None:
     return value if math.isfinite(value) else None
 
 
-def _pid(controller: Realised) -> PidFile:
+def _pid(controller: DiscretePid) -> PidFile:
     pid = controller.pid
     lags = [Lag(of, *values) for of, values in controller.lags()]
     return PidFile(
@@ -247,10 +249,10 @@ def _lqg(controller: Lqg) -> LqgFile:
 
 
 #: Angles that the rig measures, in the order of the rig.
-ANGLES = ("theta11", "theta12", "theta21", "theta22")
+ANGLE_NAMES = ("theta11", "theta12", "theta21", "theta22")
 
 
-class HubLoops:
+class JointControllers:
     """Controllers of both joints for :func:`ftlm.rig.control`: angles and references to motor currents.
 
     Parameters
@@ -265,17 +267,19 @@ class HubLoops:
         Another type of controller, or one that needs a signal that the arm does not measure.
     """
 
-    def __init__(self, first: Realised | Lqg | None, second: Realised | Lqg | None = None) -> None:
+    def __init__(self, first: DiscretePid | Lqg | None, second: DiscretePid | Lqg | None = None) -> None:
         self.loops = (first, second)
         self._reads: list[list[int]] = []
         for j, loop in enumerate(self.loops):
-            if not isinstance(loop, (Realised, Lqg, type(None))):
+            if not isinstance(loop, (DiscretePid, Lqg, type(None))):
                 raise ModelError("first and second are Realised or Lqg controllers, or None")
-            names = loop.observer.measured if isinstance(loop, Lqg) else (ANGLES[2 * j],)
-            unknown = [n for n in names if n not in ANGLES]
+            names = loop.observer.measured if isinstance(loop, Lqg) else (ANGLE_NAMES[2 * j],)
+            unknown = [n for n in names if n not in ANGLE_NAMES]
             if unknown:
-                raise ModelError(f"the controller reads {', '.join(unknown)}; the arm measures {', '.join(ANGLES)}")
-            self._reads.append([ANGLES.index(n) for n in names])
+                raise ModelError(
+                    f"the controller reads {', '.join(unknown)}; the arm measures {', '.join(ANGLE_NAMES)}"
+                )
+            self._reads.append([ANGLE_NAMES.index(n) for n in names])
 
     def reset(self) -> None:
         """Reset both controllers."""

@@ -8,21 +8,21 @@ from typing import Any, Literal
 
 import numpy as np
 
-from ftlm.analysis.frequency_response import check_unlimited, is_coupled, model_numbers, response_inputs
+from ftlm.analysis.frequency_response import check_no_input_nonlinearity, is_coupled, parameter_vector, response_inputs
 from ftlm.analysis.rational_approximation import LARGEST_ORDER, oustaloup
-from ftlm.control.arguments import checked_rate, drawn_from, largest
-from ftlm.control.stability_margins import JudgedLoop, Margins, Plant, grid, margins_of
+from ftlm.control.arguments import check_limit, check_samples, checked_rate
+from ftlm.control.stability_margins import LoopDesign, Margins, Plant, margins_of, nyquist_frequencies
 from ftlm.errors import ModelError
-from ftlm.model.model import Solved, check_solved
+from ftlm.model.model import ModelData, check_model
 from ftlm.simulation.discretization import check_linear
-from ftlm.utils.validation import Complex, Floats, nearest, real_number, shown, whole_number
+from ftlm.utils.validation import Complex, Floats, nearest, real_number, short_repr, whole_number
 
 #: Poles extend this factor beyond the band on both sides.
-REACH = 30.0
+POLE_RANGE_FACTOR = 30.0
 #: Largest ratio of the band's ends.
-WIDEST = 1e9
+MAX_BAND_RATIO = 1e9
 #: Number of frequencies at which the approximation error is measured.
-COMPARED_FRACTIONAL = 200
+ERROR_FREQUENCIES = 200
 
 
 @dataclass(frozen=True)
@@ -87,7 +87,7 @@ class _Bank:
         return np.asarray(self.direct + lags @ self.weights)
 
 
-class Realised:
+class DiscretePid:
     """Fractional PID at a sampling rate: Oustaloup's approximation as a bank of first-order lags.
 
     The controller starts without a derivative kick: the first error is taken as constant in the past. While the output
@@ -127,24 +127,26 @@ class Realised:
             if given > 1:
                 raise ModelError(f"{name} = {given:g} cannot be realised; give a controller whose orders are at most 1")
         value = checked_rate(rate)
-        most = largest(limit)
+        most = check_limit(limit)
         half = math.pi * value
         if band is None:
             band = (half / 1000.0, half / 8.0)
         try:
             low, high = (real_number("band", b) for b in band)
         except (TypeError, ValueError):
-            raise ModelError(f"band = {shown(band)} is no pair of frequencies; give (low, high) in rad/s") from None
-        if not (0 < low < high <= half and high <= WIDEST * low):
+            raise ModelError(
+                f"band = {short_repr(band)} is no pair of frequencies; give (low, high) in rad/s"
+            ) from None
+        if not (0 < low < high <= half and high <= MAX_BAND_RATIO * low):
             raise ModelError(
                 f"band = ({low:g}, {high:g}) rad/s is no interval up to half the rate, {half:g} rad/s, whose upper end "
-                f"is at most {WIDEST:g} times the lower"
+                f"is at most {MAX_BAND_RATIO:g} times the lower"
             )
         count = whole_number(order)
         if count is None or not 1 <= count <= LARGEST_ORDER:
-            raise ModelError(f"order = {shown(order)} is no whole number from 1 to {LARGEST_ORDER}")
+            raise ModelError(f"order = {short_repr(order)} is no whole number from 1 to {LARGEST_ORDER}")
         self.pid, self.rate, self.limit, self.band, self.order = pid, value, most, (low, high), count
-        reach = (low / REACH, high * REACH)
+        reach = (low / POLE_RANGE_FACTOR, high * POLE_RANGE_FACTOR)
         self._integral = _bank(pid.ki, *_integral(pid.lam, reach, count), 1.0 / value)
         self._derivative = _bank(pid.kd, *_power(pid.mu, reach, count), 1.0 / value)
         #: Largest errors over the band against the exact controller [dB], [degrees].
@@ -194,8 +196,8 @@ class Realised:
             self._lags = error * (bank.now + bank.before) / (1.0 - bank.keeps)
             self._error, sums = error, self._sums
         else:
-            self._lags = self._stepped(self._derivative, self._lags, error)
-            sums = self._stepped(self._integral, self._sums, error)
+            self._lags = self._next_states(self._derivative, self._lags, error)
+            sums = self._next_states(self._integral, self._sums, error)
         rest = self.pid.kp * error + self._derivative.direct * error + float(self._lags @ self._derivative.weights)
         output = rest + self._integral.direct * error + float(sums @ self._integral.weights)
         if abs(output) > self.limit and output * error > 0:
@@ -204,11 +206,11 @@ class Realised:
         self._sums, self._error = sums, error
         return min(max(output, -self.limit), self.limit)
 
-    def _stepped(self, bank: _Bank, states: Floats, error: float) -> Floats:
+    def _next_states(self, bank: _Bank, states: Floats, error: float) -> Floats:
         return bank.keeps * states + bank.now * error + bank.before * self._error
 
     def _errors(self) -> tuple[float, float]:
-        w = np.geomspace(*self.band, COMPARED_FRACTIONAL)
+        w = np.geomspace(*self.band, ERROR_FREQUENCIES)
         with np.errstate(all="ignore"):
             quotient = self.response(w) / self.pid.response(w)
             gain = float(np.max(np.abs(20.0 * np.log10(np.abs(quotient)))))
@@ -266,26 +268,26 @@ def _bank(factor: float, poles: Floats, residues: Floats, direct: float, step: f
 
 
 #: Range of the orders of integral and derivative, and values per order and round.
-LOWEST, HIGHEST, TRIED = 0.5, 1.0, 15
-ROUNDS = 3
+MIN_ORDER, MAX_ORDER, ORDERS_PER_ROUND = 0.5, 1.0, 15
+REFINEMENT_ROUNDS = 3
 #: Number of frequencies at which orders are compared.
-COMPARED = 300
+COMPARISON_FREQUENCIES = 300
 #: Target of the largest sensitivity over all samples; if it is not reached, the tolerance above the smallest one.
-CALM, ABOVE = 1.5, 1.05
+TARGET_SENSITIVITY, SENSITIVITY_TOLERANCE = 1.5, 1.05
 #: Frequency of the low-frequency gain, as a share of the crossover; that gain rejects friction and offsets.
-SLOW = 0.1
+LOW_FREQUENCY_SHARE = 0.1
 #: Largest share of parameter samples whose requirements the design may violate.
-BROKEN = 0.05
+MAX_BROKEN_SHARE = 0.05
 #: Smallest phase margin of a sample as a share of the requested one.
-KEPT = 0.5
+MIN_PHASE_MARGIN_SHARE = 0.5
 #: Lowest crossover as a share of the rate; below, margins are not computable in floating point.
-SLOWEST = 1e-6
+MIN_CROSSOVER_SHARE = 1e-6
 #: Relative plant gains at which the phase margin is evaluated.
-FLAT = (0.7, 1.4)
+GAIN_VARIATIONS = (0.7, 1.4)
 
 
 @dataclass(frozen=True)
-class PidDesign(JudgedLoop):
+class PidDesign(LoopDesign):
     """Fractional PID with the margins of its loop.
 
     Parameters
@@ -311,9 +313,9 @@ class PidDesign(JudgedLoop):
     flat: tuple[float, float, float]
     plants: tuple[Plant, ...] = field(default=(), compare=False, repr=False)
 
-    def acting(self, w: Floats | Complex) -> tuple[tuple[str, ...], Complex, Complex]:
+    def controller_response(self, w: Floats | Complex) -> tuple[tuple[str, ...], Complex, Complex]:
         """Return the measured output, and responses to it and to the reference at frequencies [rad/s]."""
-        response = Realised(self.pid, self.rate).response(w)
+        response = DiscretePid(self.pid, self.rate).response(w)
         return (self.plants[0].output,), response[None], response
 
     def to_dict(self) -> dict[str, Any]:
@@ -327,9 +329,9 @@ class PidDesign(JudgedLoop):
         }
 
     def __str__(self) -> str:
-        lines = [f"fractional PID: {self.pid}", *self._judged()]
+        lines = [f"fractional PID: {self.pid}", *self._margin_lines()]
         lines.append(
-            "phase margin with {:g}, 1, {:g} of the plant's gain: ".format(*FLAT)
+            "phase margin with {:g}, 1, {:g} of the plant's gain: ".format(*GAIN_VARIATIONS)
             + ", ".join(f"{p:.3g}" for p in self.flat)
             + " degrees"
         )
@@ -337,7 +339,7 @@ class PidDesign(JudgedLoop):
 
 
 def fractional_pid(
-    model: Solved,
+    model: ModelData,
     *,
     output: str | None = None,
     input: str | None = None,
@@ -390,67 +392,69 @@ def fractional_pid(
     """
     plant = plant_of(model, output, input, rate, coupling, sensor=sensor)
     wc = real_number("crossover", crossover)
-    if not SLOWEST * plant.rate <= wc < math.pi * plant.rate / 4:
+    if not MIN_CROSSOVER_SHARE * plant.rate <= wc < math.pi * plant.rate / 4:
         raise ModelError(
-            f"crossover = {shown(crossover)} rad/s is outside [{SLOWEST * plant.rate:.4g}, "
+            f"crossover = {short_repr(crossover)} rad/s is outside [{MIN_CROSSOVER_SHARE * plant.rate:.4g}, "
             f"{math.pi * plant.rate / 4:.4g}), from a millionth to an eighth of the rate of {plant.rate:g} Hz"
         )
     asked = real_number("phase_margin", phase_margin)
     if not 10 <= asked <= 80:
-        raise ModelError(f"phase_margin = {shown(phase_margin)} degrees is outside [10, 80]")
-    count, start = drawn_from(samples, seed)
+        raise ModelError(f"phase_margin = {short_repr(phase_margin)} degrees is outside [10, 80]")
+    count, start = check_samples(samples, seed)
     plant.check_stable()
     drawn = plant.samples(count, start)
     target = np.exp(1j * (math.radians(asked) - math.pi)) / plant.response(np.array([wc]))[0]
     near = np.array([wc * (1 - 1e-5), wc * (1 + 1e-5)])
     slope = float(np.diff(np.unwrap(np.angle(plant.response(near))))[0] / (near[1] - near[0]))
-    w = np.geomspace(wc / 100, min(30 * wc, 0.999 * math.pi * plant.rate), COMPARED)
+    w = np.geomspace(wc / 100, min(30 * wc, 0.999 * math.pi * plant.rate), COMPARISON_FREQUENCIES)
     curves = np.array([one.response(w) for one in [plant, *drawn[:50]]])
     best = _best(target, slope, wc, w, curves)
     if best is None:
         raise ModelError(
-            f"no fractional PID with gains from 0 and orders from {LOWEST:g} to {HIGHEST:g} has a flat phase margin of "
+            f"no fractional PID with gains from 0 and orders from {MIN_ORDER:g} to {MAX_ORDER:g} has a flat phase "
+            "margin of "
             f"{asked:g} degrees at {wc:g} rad/s on this model, whose phase there is "
             f"{np.degrees(np.angle(plant.response(np.array([wc]))[0])):.4g} degrees; move the crossover, or ask for "
             "another phase margin"
         )
-    fine = grid(wc, plant.rate)
+    fine = nyquist_frequencies(wc, plant.rate)
     acting = best.response(fine)
 
-    def judged(one: Plant, factor: float = 1.0) -> Margins:
-        order = one.integrates() + (best.lam if best.ki > 0 else 0.0)
-        return margins_of(factor * acting * one.response(fine), fine, order, one.grows())
+    def loop_margins(one: Plant, factor: float = 1.0) -> Margins:
+        order = one.integral_order() + (best.lam if best.ki > 0 else 0.0)
+        return margins_of(factor * acting * one.response(fine), fine, order, one.count_unstable_poles())
 
-    nominal = judged(plant)
+    nominal = loop_margins(plant)
     if not nominal.stable:
         raise ModelError(
             f"the loop with a phase margin of {asked:g} degrees at {wc:g} rad/s is not stable on this model: its gain "
             "is 1 elsewhere too, at a resonance; move the crossover away from it"
         )
-    margins = tuple(map(judged, drawn))
-    broken = [m for m in margins if not (m.stable and m.phase >= KEPT * asked)]
-    if len(broken) > BROKEN * len(margins):
+    margins = tuple(map(loop_margins, drawn))
+    broken = [m for m in margins if not (m.stable and m.phase >= MIN_PHASE_MARGIN_SHARE * asked)]
+    if len(broken) > MAX_BROKEN_SHARE * len(margins):
         raise ModelError(
             f"the intervals are too wide to design on: in {len(broken)} of {len(margins)} samples of the model's "
-            f"numbers the loop is not stable or has less than {KEPT * asked:g} degrees of the phase margin; "
-            f"{known_least(model)}; "
+            f"numbers the loop is not stable or has less than {MIN_PHASE_MARGIN_SHARE * asked:g} degrees of the "
+            "phase margin; "
+            f"{least_certain_parameter(model)}; "
             "identify from a longer or richer run, or lower the crossover"
         )
-    flat = tuple(judged(plant, factor).phase for factor in (FLAT[0], 1.0, FLAT[1]))
+    flat = tuple(loop_margins(plant, factor).phase for factor in (GAIN_VARIATIONS[0], 1.0, GAIN_VARIATIONS[1]))
     others = [replace(plant, output=o) for o in model.outputs if o != plant.output]
-    moved = (plant, *(p for p in others if p.reached()))
+    moved = (plant, *(p for p in others if p.has_response()))
     return PidDesign(best, plant.rate, nominal, margins, (flat[0], flat[1], flat[2]), moved)
 
 
 def plant_of(
-    model: Solved, output: str | None, driver: str | None, rate: float, coupling: str, *, sensor: bool
+    model: ModelData, output: str | None, driver: str | None, rate: float, coupling: str, *, sensor: bool
 ) -> Plant:
     """Return the plant of an output and an input; raise if they are unknown or ambiguous."""
-    check_solved(model)
+    check_model(model)
     if not isinstance(sensor, bool):
-        raise ModelError(f"sensor = {shown(sensor)} is neither True nor False")
+        raise ModelError(f"sensor = {short_repr(sensor)} is neither True nor False")
     check_linear(model.equations, "a loop's margin")
-    check_unlimited(model, "a loop's margin")
+    check_no_input_nonlinearity(model, "a loop's margin")
     inputs = response_inputs(model, coupled=is_coupled(coupling))
     names = []
     for what, name, known in (("output", output, model.outputs), ("input", driver, inputs)):
@@ -461,7 +465,7 @@ def plant_of(
         elif not isinstance(name, str) or name not in known:
             near = nearest(name, known) if isinstance(name, str) else ""
             raise ModelError(
-                f"{what} = {shown(name)} is not one of the model's{near}; it has {', '.join(known) or 'none'}"
+                f"{what} = {short_repr(name)} is not one of the model's{near}; it has {', '.join(known) or 'none'}"
             )
         else:
             names.append(name)
@@ -471,25 +475,25 @@ def plant_of(
 def _best(target: complex, slope: float, wc: float, w: Floats, curves: Complex) -> FractionalPid | None:
     """Controller with the largest low-frequency gain among those that meet all conditions with low sensitivity."""
     found: list[tuple[float, float, FractionalPid]] = []
-    centre, reach = ((LOWEST + HIGHEST) / 2,) * 2, (HIGHEST - LOWEST) / 2
-    for _ in range(ROUNDS):
-        around = [np.clip(c + reach * np.linspace(-1, 1, TRIED), LOWEST, HIGHEST) for c in centre]
+    centre, reach = ((MIN_ORDER + MAX_ORDER) / 2,) * 2, (MAX_ORDER - MIN_ORDER) / 2
+    for _ in range(REFINEMENT_ROUNDS):
+        around = [np.clip(c + reach * np.linspace(-1, 1, ORDERS_PER_ROUND), MIN_ORDER, MAX_ORDER) for c in centre]
         for lam in np.unique(around[0]).tolist():
             for mu in np.unique(around[1]).tolist():
-                pid = _solved(target, slope, wc, lam, mu)
+                pid = _solve_gains(target, slope, wc, lam, mu)
                 if pid is None:
                     continue
                 worst = float(np.max(1.0 / np.abs(1.0 + pid.response(w) * curves)))
-                found.append((worst, float(abs(pid.response(np.array([SLOW * wc]))[0])), pid))
+                found.append((worst, float(abs(pid.response(np.array([LOW_FREQUENCY_SHARE * wc]))[0])), pid))
         if not found:
             return None
-        calm = max(CALM, ABOVE * min(worst for worst, _, _ in found))
+        calm = max(TARGET_SENSITIVITY, SENSITIVITY_TOLERANCE * min(worst for worst, _, _ in found))
         best = max((f for f in found if f[0] <= calm), key=lambda f: f[1])[2]
-        centre, reach = (best.lam, best.mu), reach / TRIED * 2
+        centre, reach = (best.lam, best.mu), reach / ORDERS_PER_ROUND * 2
     return best
 
 
-def _solved(target: complex, slope: float, wc: float, lam: float, mu: float) -> FractionalPid | None:
+def _solve_gains(target: complex, slope: float, wc: float, lam: float, mu: float) -> FractionalPid | None:
     """Gains at given orders: C(j wc) = target and d arg C/dw = -slope; None where one is negative."""
     powers = np.array([0.0, -lam, mu])
     parts = (1j * wc) ** powers
@@ -506,7 +510,7 @@ def _solved(target: complex, slope: float, wc: float, lam: float, mu: float) -> 
     return FractionalPid(kp, ki, kd, lam, mu)
 
 
-def known_least(model: Solved) -> str:
+def least_certain_parameter(model: ModelData) -> str:
     """Name of the coefficient or order with the largest relative uncertainty."""
     covariance = None if model.estimate is None else model.estimate.covariance
     if covariance is None:
@@ -519,6 +523,6 @@ def known_least(model: Solved) -> str:
             for t in item.terms
             for n in (f"the order of {t.signal} in {item.output}", f"the coefficient of {t.signal} in {item.output}")
         ]
-    share = np.sqrt(np.abs(np.diag(covariance))) / np.maximum(np.abs(model_numbers(model)), 1e-12)
+    share = np.sqrt(np.abs(np.diag(covariance))) / np.maximum(np.abs(parameter_vector(model)), 1e-12)
     at = int(np.argmax(np.nan_to_num(share, nan=0.0, posinf=1e300)))
     return f"known least is {names[at]}, to {100 * share[at]:.2g} % (one standard error)"

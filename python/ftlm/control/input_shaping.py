@@ -12,20 +12,20 @@ from numpy.typing import ArrayLike
 from ftlm.analysis.poles import Mode, modes
 from ftlm.control.arguments import checked_rate
 from ftlm.errors import DataError, ModelError
-from ftlm.model.model import Solved
+from ftlm.model.model import ModelData
 from ftlm.utils.formatting import with_error
 from ftlm.utils.statistics import NORMAL_95
-from ftlm.utils.validation import Floats, check_choice, shown, whole_number
+from ftlm.utils.validation import Floats, check_choice, short_repr, whole_number
 
 #: Convolution power of the zero-vibration shaper: the multiplicity of its zero at the pole.
-KINDS = {"zv": 1, "zvd": 2}
+SHAPER_REPETITIONS = {"zv": 1, "zvd": 2}
 #: Largest residual vibration over the confidence intervals of the poles.
-WIDEST = 0.2
+MAX_RESIDUAL_VIBRATION = 0.2
 #: Longest shaper [samples], and range of its poles [rad/s].
-LONGEST = 1 << 22
-POLES = (1e-12, 1e12)
+MAX_SHAPER_SAMPLES = 1 << 22
+POLE_RANGE_RAD_S = (1e-12, 1e12)
 #: Grid points per interval of frequency and of damping.
-GRID = 9
+INTERVAL_GRID_POINTS = 9
 
 
 @dataclass(frozen=True)
@@ -65,7 +65,7 @@ class Shaper:
         damping
             Damping ratio.
         """
-        return left_over(np.array(self.times), np.array(self.amplitudes), frequency, damping)
+        return residual_vibration(np.array(self.times), np.array(self.amplitudes), frequency, damping)
 
     def impulses(self, rate: float) -> Floats:
         """Impulses at the samples of a rate [Hz], shape (N,), with exact zeros at the poles and sum 1.
@@ -80,10 +80,10 @@ class Shaper:
             millions of samples.
         """
         rate = checked_rate(rate)
-        if self.delay * rate > LONGEST:
+        if self.delay * rate > MAX_SHAPER_SAMPLES:
             raise ModelError(
                 f"rate = {rate:g} Hz makes the shaper {self.delay * rate:.3g} samples long; use at most "
-                f"{LONGEST / self.delay:.3g} Hz"
+                f"{MAX_SHAPER_SAMPLES / self.delay:.3g} Hz"
             )
         taps = np.ones(1)
         for mode in self.modes:
@@ -92,9 +92,9 @@ class Shaper:
                     f"rate = {rate:g} Hz has fewer than four samples in a period of the mode at "
                     f"{mode.frequency:.4g} rad/s; use at least {2.0 * mode.pole.imag / math.pi:.3g} Hz"
                 )
-            part = _sampled(mode, 1.0 / rate)
-            for _ in range(KINDS[self.kind]):
-                taps = _through(np.append(taps, np.zeros(len(part) - 1)), part)
+            part = _zv_samples(mode, 1.0 / rate)
+            for _ in range(SHAPER_REPETITIONS[self.kind]):
+                taps = _convolve(np.append(taps, np.zeros(len(part) - 1)), part)
         return taps
 
     def filter(self, reference: ArrayLike, rate: float) -> Floats:
@@ -129,7 +129,7 @@ class Shaper:
             raise DataError(f"reference is not finite at row {bad[0]} ({bad.size} such rows in all)")
         taps = self.impulses(rate)
         rest = x[0]
-        shaped = np.column_stack([_through(column, taps) for column in (x - rest).T]) + rest
+        shaped = np.column_stack([_convolve(column, taps) for column in (x - rest).T]) + rest
         return np.asarray(shaped.reshape(given.shape), dtype=np.float64)
 
     def to_dict(self) -> dict[str, Any]:
@@ -150,7 +150,7 @@ class Shaper:
 
 
 def input_shaper(
-    model: Solved | complex,
+    model: ModelData | complex,
     kind: Literal["zv", "zvd"] = "zv",
     *,
     modes_shaped: int = 1,
@@ -184,49 +184,49 @@ def input_shaper(
     Notes ----- Singer and Seering (1990), doi:10.1115/1.2894142. Besides its oscillation a fractional model has a
     component that decays as a power of time, which no shaper cancels; it is no vibration.
     """
-    check_choice("kind", kind, KINDS)
+    check_choice("kind", kind, SHAPER_REPETITIONS)
     count = whole_number(modes_shaped)
     if count is None or count < 1:
-        raise ModelError(f"modes_shaped = {shown(modes_shaped)} is no number of modes; give a whole number from 1")
+        raise ModelError(f"modes_shaped = {short_repr(modes_shaped)} is no number of modes; give a whole number from 1")
     if isinstance(model, (complex, float, int, np.number)):
         every: tuple[Mode, ...] = (_mode_of(model),)
     else:
         every = modes(model, coupling=coupling)
-    growing = [m for m in every if m.grows or m.damping <= 0.0]
+    growing = [m for m in every if m.unstable or m.damping <= 0.0]
     if growing:
         raise ModelError(
             f"the model is not stable ({growing[0]}): what no loop holds cannot be shaped; close a loop around it, and "
             "shape the poles of the loop"
         )
-    swings = sorted((m for m in every if m.swings), key=lambda m: m.damping)
+    swings = sorted((m for m in every if m.oscillatory), key=lambda m: m.damping)
     if len(swings) < count:
         raise ModelError(
-            f"the model has {len(swings)} modes that swing, and {shown(count)} are to be shaped; what relaxes "
+            f"the model has {len(swings)} modes that swing, and {short_repr(count)} are to be shaped; what relaxes "
             "needs no shaper"
         )
     chosen = tuple(swings[:count])
     times, amplitudes = np.zeros(1), np.ones(1)
     for mode in chosen:
         half, kept = _half(mode)
-        for _ in range(KINDS[kind]):
+        for _ in range(SHAPER_REPETITIONS[kind]):
             times = np.concatenate([times, times + half])
             amplitudes = np.concatenate([amplitudes, amplitudes * kept]) / (1.0 + kept)
     instants, place = np.unique(np.round(times, 15), return_inverse=True)
     summed = np.bincount(place, weights=amplitudes)
-    worst = _worst(np.asarray(instants, dtype=np.float64), np.asarray(summed, dtype=np.float64), chosen)
-    if worst is not None and not worst <= WIDEST:
+    worst = _worst_residual(np.asarray(instants, dtype=np.float64), np.asarray(summed, dtype=np.float64), chosen)
+    if worst is not None and not worst <= MAX_RESIDUAL_VIBRATION:
         widest = max(chosen, key=lambda m: (m.frequency_error or 0.0) / m.frequency + (m.damping_error or 0.0))
         raise ModelError(
             f"the intervals are too wide to design on: within those of the mode at "
             f"{with_error(widest.frequency, widest.frequency_error)} rad/s, damping "
             f"{with_error(widest.damping, widest.damping_error)}, a {kind} shaper may leave {100 * worst:.0f} % of the "
-            f"vibration, more than {100 * WIDEST:.0f} %; identify from a longer run, or from one that excites this mode"
-            + (", or use kind='zvd'" if kind == "zv" else "")
+            f"vibration, more than {100 * MAX_RESIDUAL_VIBRATION:.0f} %; identify from a longer run, or from one "
+            "that excites this mode" + (", or use kind='zvd'" if kind == "zv" else "")
         )
     return Shaper(kind, chosen, tuple(instants.tolist()), tuple(summed.tolist()), worst)
 
 
-def left_over(times: Floats, amplitudes: Floats, frequency: ArrayLike, damping: ArrayLike) -> Floats:
+def residual_vibration(times: Floats, amplitudes: Floats, frequency: ArrayLike, damping: ArrayLike) -> Floats:
     """Amplitude of the vibration after the last impulse, relative to a single impulse of sum 1 at that time."""
     w, z = np.broadcast_arrays(np.asarray(frequency, dtype=np.float64), np.asarray(damping, dtype=np.float64))
     pole = w * (-z + 1j * np.sqrt(np.maximum(1.0 - z * z, 0.0)))
@@ -234,7 +234,7 @@ def left_over(times: Floats, amplitudes: Floats, frequency: ArrayLike, damping: 
     return np.asarray(np.abs(left), dtype=np.float64)
 
 
-def _through(x: Floats, taps: Floats) -> Floats:
+def _convolve(x: Floats, taps: Floats) -> Floats:
     """Causal convolution with a few impulses, truncated to the length of the signal."""
     out = np.zeros(len(x))
     for at in np.flatnonzero(taps[: len(x)]):
@@ -248,9 +248,9 @@ def _mode_of(given: complex | np.number[Any]) -> Mode:
         size = abs(pole)
     except (TypeError, ValueError, OverflowError):
         pole, size = complex("nan"), math.nan
-    low, high = POLES
+    low, high = POLE_RANGE_RAD_S
     if not (low <= abs(pole.imag) and size <= high):
-        raise ModelError(f"pole = {shown(given)} does not swing; give one such as -2 + 17j [rad/s]")
+        raise ModelError(f"pole = {short_repr(given)} does not swing; give one such as -2 + 17j [rad/s]")
     slow = abs(pole.real)
     return Mode(complex(pole.real, abs(pole.imag)), size, -pole.real / size, 1 / slow if slow else math.inf, True)
 
@@ -261,7 +261,7 @@ def _half(mode: Mode) -> tuple[float, float]:
     return half, math.exp(mode.pole.real * half)
 
 
-def _sampled(mode: Mode, step: float) -> Floats:
+def _zv_samples(mode: Mode, step: float) -> Floats:
     """Discrete zero-vibration shaper of a mode: 1 + K e^(-s half) = 0 exactly at its pole."""
     half, kept = _half(mode)
     whole = math.floor(half / step)
@@ -277,15 +277,15 @@ def _sampled(mode: Mode, step: float) -> Floats:
     return np.asarray(taps / taps.sum())
 
 
-def _worst(times: Floats, amplitudes: Floats, chosen: tuple[Mode, ...]) -> float | None:
+def _worst_residual(times: Floats, amplitudes: Floats, chosen: tuple[Mode, ...]) -> float | None:
     """Largest residual vibration over the confidence intervals of frequency and damping."""
     worst: float | None = None
     for mode in chosen:
         if mode.frequency_error is None or mode.damping_error is None:
             continue
-        across = NORMAL_95 * np.linspace(-1.0, 1.0, GRID)
+        across = NORMAL_95 * np.linspace(-1.0, 1.0, INTERVAL_GRID_POINTS)
         w = np.maximum(mode.frequency + mode.frequency_error * across, 1e-6 * mode.frequency)
         z = np.clip(mode.damping + mode.damping_error * across, -0.99, 0.99)
-        left = left_over(times, amplitudes, w[:, None], z)
+        left = residual_vibration(times, amplitudes, w[:, None], z)
         worst = max(worst or 0.0, float(np.max(np.where(np.isfinite(left), left, np.inf))))
     return worst

@@ -9,24 +9,24 @@ from typing import Any, Protocol
 import numpy as np
 from numpy.typing import ArrayLike
 
-from ftlm.control.arguments import SIZES, drawn_from, largest, positive, sums
-from ftlm.control.fractional_pid import known_least
-from ftlm.control.stability_margins import JudgedLoop, Plant
+from ftlm.control.arguments import POSITIVE_RANGE, check_limit, check_samples, positive, sum_row
+from ftlm.control.fractional_pid import least_certain_parameter
+from ftlm.control.stability_margins import LoopDesign, Plant
 from ftlm.errors import DataError, ModelError
-from ftlm.model.model import Solved
-from ftlm.utils.validation import Complex, Floats, real_number, shown
+from ftlm.model.model import ModelData
+from ftlm.utils.validation import Complex, Floats, real_number, short_repr
 
 #: Length of the transform relative to the path, and exponent of its weight exp(-t): the weight suppresses the periodic
 #: continuation, which the fading memory of a fractional model would never forget.
-LONGER, FALLS = 8, 28.0
+TRANSFORM_LENGTH_FACTOR, WEIGHT_DECAY = 8, 28.0
 #: Largest reference relative to the move; larger ones are unstable.
-GROWN = 20.0
+MAX_REFERENCE_RATIO = 20.0
 #: Longest path [samples].
-MOST = 100_000
+MAX_PATH_ROWS = 100_000
 #: Largest initial offset of a reference relative to the move; above, the path needs a longer dwell before the move.
-UNREST = 1e-3
+MAX_INITIAL_OFFSET_SHARE = 1e-3
 #: Largest residual vibration relative to that of the path as reference; above, the uncertainty is too large.
-SHARE_LEFT = 0.5
+MAX_RESIDUAL_SHARE = 0.5
 
 
 class Loop(Protocol):
@@ -40,12 +40,12 @@ class Loop(Protocol):
     def plants(self) -> tuple[Plant, ...]:
         """Plants of the loop, one per output."""
 
-    def acting(self, w: Floats | Complex) -> tuple[tuple[str, ...], Complex, Complex]:
+    def controller_response(self, w: Floats | Complex) -> tuple[tuple[str, ...], Complex, Complex]:
         """Return measured outputs, responses to each, shape (outputs, W), and to the reference, (W,)."""
 
 
 @dataclass(frozen=True)
-class PlannedMove:
+class Trajectory:
     """Reference signal for a move along a path.
 
     Parameters
@@ -69,7 +69,7 @@ class PlannedMove:
     path: Floats
     command: Floats
     outputs: dict[str, Floats]
-    left: float | None
+    residual_vibration: float | None
     plain: float
 
     def to_dict(self) -> dict[str, Any]:
@@ -77,20 +77,24 @@ class PlannedMove:
         return {
             "rows": len(self.path),
             "largest_command": float(np.max(np.abs(self.command))),
-            "left": self.left,
+            "left": self.residual_vibration,
             "plain": self.plain,
         }
 
     def __str__(self) -> str:
         most = f"largest command {np.max(np.abs(self.command)):.3g}"
-        within = "" if self.left is None else f", at most {self.left:.2g} off it afterwards within the intervals"
+        within = (
+            ""
+            if self.residual_vibration is None
+            else f", at most {self.residual_vibration:.2g} off it afterwards within the intervals"
+        )
         return (
             f"a path of {np.ptp(self.path):.4g} in {len(self.path)} samples: {most}{within}; the path itself as the "
             f"reference would leave {self.plain:.2g}"
         )
 
 
-def smooth_move(
+def point_to_point(
     size: float, duration: float, rate: float = 500.0, *, before: float = 0.3, after: float = 1.2
 ) -> Floats:
     """Point-to-point path with zero velocity, acceleration and jerk at both ends: a polynomial of degree 7.
@@ -113,25 +117,25 @@ def smooth_move(
     """
     reach = real_number("size", size)
     if not math.isfinite(reach):
-        raise ModelError(f"size = {shown(size)} is not a finite number")
+        raise ModelError(f"size = {short_repr(size)} is not a finite number")
     times = positive("duration", duration), positive("rate", rate)
     rests = [real_number(n, v) for n, v in (("before", before), ("after", after))]
     if not all(0 <= r < math.inf for r in rests):
         raise ModelError(f"before = {before!r} and after = {after!r} are not seconds from 0")
     if times[0] * times[1] < 10:
         raise ModelError(
-            f"duration = {shown(duration)} s has fewer than ten samples at {times[1]:g} Hz; give it more time"
+            f"duration = {short_repr(duration)} s has fewer than ten samples at {times[1]:g} Hz; give it more time"
         )
     rows = (sum(rests) + times[0]) * times[1] + 1
-    if rows > MOST:
-        raise ModelError(f"a move of {rows:.4g} samples is longer than {MOST}; give it less time")
+    if rows > MAX_PATH_ROWS:
+        raise ModelError(f"a move of {rows:.4g} samples is longer than {MAX_PATH_ROWS}; give it less time")
     s = np.clip((np.arange(round(rows)) / times[1] - rests[0]) / times[0], 0.0, 1.0)
     return np.asarray(reach * s**4 * (35.0 - 84.0 * s + 70.0 * s**2 - 20.0 * s**3))
 
 
-def inverse(
+def inverse_dynamics(
     design: Loop, path: ArrayLike, *, of: str | None = None, limit: float = math.inf, samples: int = 40, seed: int = 0
-) -> PlannedMove:
+) -> Trajectory:
     """Compute the reference with which a loop moves a sum of outputs, such as a tip, along a path.
 
     Parameters
@@ -164,48 +168,48 @@ def inverse(
     Notes ----- In the frequency domain a nonminimum-phase response has a bounded inverse, which starts before the path:
     Bayo (1987), doi:10.1002/rob.4620040406.
     """
-    if not isinstance(design, JudgedLoop):
+    if not isinstance(design, LoopDesign):
         raise ModelError(f"design is a {type(design).__name__}, no PidDesign or LqgDesign; design a loop first")
     rows = _path(path)
-    count, start = drawn_from(samples, seed)
-    most = largest(limit)
+    count, start = check_samples(samples, seed)
+    most = check_limit(limit)
     names = tuple(p.output for p in design.plants)
-    row = sums("of", names[0] if of is None and len(names) == 1 else of, names)
-    size = 1 << math.ceil(math.log2(LONGER * len(rows)))
+    row = sum_row("of", names[0] if of is None and len(names) == 1 else of, names)
+    size = 1 << math.ceil(math.log2(TRANSFORM_LENGTH_FACTOR * len(rows)))
     # On a line right of all poles and left of the zeros that a tip has there: s = jw, its real part above 0.
-    fall = FALLS * design.rate / size
+    fall = WEIGHT_DECAY * design.rate / size
     w: Complex = np.asarray(2.0 * math.pi * np.fft.rfftfreq(size, 1.0 / design.rate) - 1j * fall, dtype=np.complex128)
     inside = w.real < 0.999 * math.pi * design.rate
     weight = np.exp(-fall * np.arange(size) / design.rate)
-    heard, acts, asks = design.acting(w[inside])
+    heard, acts, asks = design.controller_response(w[inside])
 
-    def moved(model: Solved) -> tuple[Complex, Complex]:
+    def closed_loop_response(model: ModelData) -> tuple[Complex, Complex]:
         """Command and outputs of the closed loop per reference."""
         held = np.array([replace(p, model=model).response(w[inside]) for p in design.plants])
         loop = np.sum([a * held[names.index(o)] for o, a in zip(heard, acts, strict=True)], axis=0)
         command = asks / (1.0 + loop)
         return command, held * command
 
-    command, outputs = moved(design.plants[0].model)
+    command, outputs = closed_loop_response(design.plants[0].model)
     held = np.concatenate([rows, np.full(size - len(rows), rows[-1])]) - rows[0]
     spectrum = np.fft.rfft(held * weight)[inside]
     needed = spectrum / (row @ outputs)
 
-    def back(part: Complex) -> Floats:
+    def inverse_transform(part: Complex) -> Floats:
         every = np.zeros(len(w), dtype=complex)
         every[inside] = part
         return np.asarray((np.fft.irfft(every, size) / weight)[: len(rows)])
 
-    reference = back(needed) + rows[0]
+    reference = inverse_transform(needed) + rows[0]
     move = float(np.ptp(rows))
     off = float(np.max(np.abs(reference[:1] - rows[0])))
-    if off > UNREST * move:
+    if off > MAX_INITIAL_OFFSET_SHARE * move:
         raise ModelError(
             f"the reference has to begin before the path does: at its first row it is {off:.3g} away from rest, more "
-            f"than {UNREST:g} of the move; let the path rest longer before its move"
+            f"than {MAX_INITIAL_OFFSET_SHARE:g} of the move; let the path rest longer before its move"
         )
-    asked = back(needed * command)
-    if not np.max(np.abs(reference - rows[0])) < GROWN * move:
+    asked = inverse_transform(needed * command)
+    if not np.max(np.abs(reference - rows[0])) < MAX_REFERENCE_RATIO * move:
         raise ModelError(
             "the reference grows beyond all bounds: what is asked for begins with a move the other way that is slower "
             "than the path; give it more time, or ask for another output"
@@ -216,47 +220,50 @@ def inverse(
             f"the path needs a command of {np.max(np.abs(asked)):.3g} at {at / design.rate:.4g} s, over the limit of "
             f"{most:g}; give it more time, or a smaller move"
         )
-    ends = int(np.flatnonzero(np.abs(rows - rows[-1]) > UNREST * move)[-1]) + 1
-    plain = _off(back(spectrum * (row @ outputs)) + rows[0], rows, ends)
+    ends = int(np.flatnonzero(np.abs(rows - rows[-1]) > MAX_INITIAL_OFFSET_SHARE * move)[-1]) + 1
+    plain = _residual_rms(inverse_transform(spectrum * (row @ outputs)) + rows[0], rows, ends)
     left = [
-        _off(back(needed * (row @ moved(one.model)[1])) + rows[0], rows, ends)
+        _residual_rms(inverse_transform(needed * (row @ closed_loop_response(one.model)[1])) + rows[0], rows, ends)
         for one in design.plants[0].samples(count, start)
     ]
     worst = float(np.quantile(left, 0.975)) if left else None
-    if worst is not None and not worst <= SHARE_LEFT * plain:
+    if worst is not None and not worst <= MAX_RESIDUAL_SHARE * plain:
         raise ModelError(
             f"the intervals are too wide to design on: within them {worst:.2g} may be off the path after its end, and "
-            f"the path itself as the reference leaves {plain:.2g}; {known_least(design.plants[0].model)}; identify "
+            f"the path itself as the reference leaves {plain:.2g}; "
+            f"{least_certain_parameter(design.plants[0].model)}; identify "
             "from a longer or richer run (ftlm design-input lays it out)"
         )
-    ways = {n: back(needed * line) for n, line in zip(names, outputs, strict=True)}
-    return PlannedMove(reference, rows, asked, ways, worst, plain)
+    ways = {n: inverse_transform(needed * line) for n, line in zip(names, outputs, strict=True)}
+    return Trajectory(reference, rows, asked, ways, worst, plain)
 
 
 def _path(path: ArrayLike) -> Floats:
     """Return a path as an array of shape (rows,)."""
     try:
         raw = np.asarray(path)
-        good = raw.dtype.kind in "fiu" and raw.ndim == 1 and 16 <= raw.size <= MOST
+        good = raw.dtype.kind in "fiu" and raw.ndim == 1 and 16 <= raw.size <= MAX_PATH_ROWS
     except (TypeError, ValueError):
         good = False
     if not good:
-        raise DataError(f"path is no array of 16 to {MOST} numbers, one a sample")
+        raise DataError(f"path is no array of 16 to {MAX_PATH_ROWS} numbers, one a sample")
     rows = np.array(raw, dtype=np.float64)
     bad = np.flatnonzero(~np.isfinite(rows))
     if bad.size:
         raise DataError(f"path is not finite at row {bad[0]} ({bad.size} such rows in all)")
-    large = np.flatnonzero(np.abs(rows) > SIZES[1])
+    large = np.flatnonzero(np.abs(rows) > POSITIVE_RANGE[1])
     if large.size:
-        raise DataError(f"path is beyond {SIZES[1]:g} at row {large[0]} ({large.size} such rows in all); scale it")
-    if np.ptp(rows) < SIZES[0]:
+        raise DataError(
+            f"path is beyond {POSITIVE_RANGE[1]:g} at row {large[0]} ({large.size} such rows in all); scale it"
+        )
+    if np.ptp(rows) < POSITIVE_RANGE[0]:
         raise DataError("path stands still: there is nothing to follow")
     for where, pair in (("begin", rows[:2]), ("end", rows[-2:])):
-        if abs(pair[1] - pair[0]) > UNREST * np.ptp(rows):
+        if abs(pair[1] - pair[0]) > MAX_INITIAL_OFFSET_SHARE * np.ptp(rows):
             raise DataError(f"path does not {where} at rest; repeat its {'first' if where == 'begin' else 'last'} row")
     return rows
 
 
-def _off(found: Floats, rows: Floats, ends: int) -> float:
+def _residual_rms(found: Floats, rows: Floats, ends: int) -> float:
     """RMS deviation from a path after its end."""
     return float(np.sqrt(np.mean(np.square((found - rows)[min(ends, len(rows) - 1) :]))))

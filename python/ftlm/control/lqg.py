@@ -11,17 +11,17 @@ import msgspec
 import numpy as np
 from numpy.typing import ArrayLike
 
-from ftlm.control.arguments import drawn_from, largest, names_of, positive, sums
-from ftlm.control.fractional_pid import BROKEN, known_least, plant_of
-from ftlm.control.realization import Realisation, python_control, realised, solving
-from ftlm.control.stability_margins import JudgedLoop, Margins, Plant, margins_of
+from ftlm.control.arguments import check_limit, check_samples, positive, select_outputs, sum_row
+from ftlm.control.fractional_pid import MAX_BROKEN_SHARE, least_certain_parameter, plant_of
+from ftlm.control.realization import Realisation, catch_numerical_errors, fit_realization, python_control
+from ftlm.control.stability_margins import LoopDesign, Margins, Plant, margins_of
 from ftlm.data.run import Run
 from ftlm.errors import DataError, ModelError
-from ftlm.model.model import Solved, check_solved
-from ftlm.utils.validation import Complex, Floats, nearest, shown
+from ftlm.model.model import ModelData, check_model
+from ftlm.utils.validation import Complex, Floats, nearest, short_repr
 
 #: Name of the input disturbance in the estimates.
-UNKNOWN = "unknown input"
+UNKNOWN_INPUT = "unknown input"
 
 
 @dataclass(frozen=True)
@@ -101,7 +101,7 @@ class Observer:
         inputs = np.vstack([run[self.realisation.input], np.column_stack([y[:, 1:], y[:, -1:]])])
         states = library.forced_response(system, time, inputs, start).states
         shown = self.realisation.c @ states[:-1]
-        return dict(zip(self.realisation.outputs, shown, strict=True)) | {UNKNOWN: states[-1]}
+        return dict(zip(self.realisation.outputs, shown, strict=True)) | {UNKNOWN_INPUT: states[-1]}
 
     def rest(self, measured: Floats) -> Floats:
         """Equilibrium states for a measured value of an integrating output; 0 for any other output."""
@@ -118,7 +118,7 @@ class Observer:
 
 
 def observer(
-    model: Solved,
+    model: ModelData,
     *,
     input: str | None = None,
     measured: Sequence[str] | None = None,
@@ -162,22 +162,26 @@ def observer(
         or python-control is not installed.
     """
     plants = plants_of(model, input, rate, coupling, sensor=sensor)
-    names = names_of("measured", measured, tuple(p.output for p in plants))
-    return filtered(realised(plants, band, poles), names, noises(model, names, noise), positive("drift", drift))
+    names = select_outputs("measured", measured, tuple(p.output for p in plants))
+    return kalman_filter(
+        fit_realization(plants, band, poles), names, noise_deviations(model, names, noise), positive("drift", drift)
+    )
 
 
-def plants_of(model: Solved, driver: str | None, rate: float, coupling: str, *, sensor: bool) -> list[Plant]:
+def plants_of(model: ModelData, driver: str | None, rate: float, coupling: str, *, sensor: bool) -> list[Plant]:
     """Return all outputs of a stable model from one input; raise for an unstable model."""
-    check_solved(model)
+    check_model(model)
     plants = [plant_of(model, o, driver, rate, coupling, sensor=sensor) for o in model.outputs]
     plants[0].check_stable()
-    reached = [p for p in plants if p.reached()]
+    reached = [p for p in plants if p.has_response()]
     if not reached:
         raise ModelError(f"{plants[0].input} reaches no output of this model")
     return reached
 
 
-def filtered(realisation: Realisation, measured: tuple[str, ...], noise: tuple[float, ...], drift: float) -> Observer:
+def kalman_filter(
+    realisation: Realisation, measured: tuple[str, ...], noise: tuple[float, ...], drift: float
+) -> Observer:
     """Return the Kalman filter of a realization."""
     bare = Observer(realisation, measured, noise, drift, np.zeros((0, 0)), {})
     a, b, c = bare.matrices
@@ -187,7 +191,7 @@ def filtered(realisation: Realisation, measured: tuple[str, ...], noise: tuple[f
     inside[:-1, :-1] = b[:-1] @ b[:-1].T * drift**2
     inside[-1, -1] = drift**2 * step
     outside = np.diag(np.square(noise))
-    with solving(f"no observer from {', '.join(measured)}", "measure more, or narrow the band"):
+    with catch_numerical_errors(f"no observer from {', '.join(measured)}", "measure more, or narrow the band"):
         _, spread, _ = python_control().dlqe(a, np.eye(len(a)), c, inside, outside)
         gain = np.linalg.solve(c @ spread @ c.T + outside, c @ spread).T
         left = spread - gain @ c @ spread
@@ -201,14 +205,16 @@ def filtered(realisation: Realisation, measured: tuple[str, ...], noise: tuple[f
     return Observer(realisation, measured, noise, drift, gain, dict(zip(realisation.outputs, deviations, strict=True)))
 
 
-def noises(model: Solved, measured: tuple[str, ...], given: Mapping[str, float] | None) -> tuple[float, ...]:
+def noise_deviations(
+    model: ModelData, measured: tuple[str, ...], given: Mapping[str, float] | None
+) -> tuple[float, ...]:
     """Standard deviation of the noise of each measured output."""
     if given is not None and not isinstance(given, Mapping):
-        raise ModelError(f"noise = {shown(given)} is no mapping from outputs to standard deviations")
+        raise ModelError(f"noise = {short_repr(given)} is no mapping from outputs to standard deviations")
     for name in given or {}:
         if name not in measured:
             near = nearest(name, measured) if isinstance(name, str) else ""
-            raise ModelError(f"noise of {shown(name)} is of nothing that is measured{near}")
+            raise ModelError(f"noise of {short_repr(name)} is of nothing that is measured{near}")
     free = msgspec.UNSET if model.estimate is None else model.estimate.free
     left = {} if free is msgspec.UNSET else dict(free.noise)
     out = []
@@ -224,11 +230,11 @@ def noises(model: Solved, measured: tuple[str, ...], given: Mapping[str, float] 
 
 
 #: Largest sensitivity of an acceptable design: phase margin of at least 19 degrees, gain margins of at least 1.5.
-SHARP = 3.0
+MAX_SENSITIVITY = 3.0
 #: Number of frequencies of a Nyquist curve, and its start relative to the band.
-POINTS, BELOW = 2500, 1e-2
+CURVE_POINTS, BAND_EXTENSION = 2500, 1e-2
 #: Distance from 1 below which a pole of the controller is its integrator.
-AT_ONE = 1e-7
+INTEGRATOR_TOLERANCE = 1e-7
 
 
 class Lqg:
@@ -256,7 +262,7 @@ class Lqg:
     """
 
     def __init__(self, observer: Observer, feedback: ArrayLike, tracked: str, *, limit: float = math.inf) -> None:
-        self.observer, self.tracked, self.limit = observer, tracked, largest(limit)
+        self.observer, self.tracked, self.limit = observer, tracked, check_limit(limit)
         realisation = observer.realisation
         self.rate = realisation.rate
         gains = np.array(feedback, dtype=np.float64).reshape(1, -1)
@@ -280,7 +286,7 @@ class Lqg:
         """Prediction of all outputs at the next sample, and estimate of the input disturbance."""
         states = np.zeros(len(self._a)) if self._states is None else self._states
         shown = (self.observer.realisation.c @ states[:-1]).tolist()
-        return dict(zip(self.observer.realisation.outputs, shown, strict=True)) | {UNKNOWN: float(states[-1])}
+        return dict(zip(self.observer.realisation.outputs, shown, strict=True)) | {UNKNOWN_INPUT: float(states[-1])}
 
     def reset(self) -> None:
         """Reset all states."""
@@ -306,7 +312,7 @@ class Lqg:
     def response(self, w: Floats | Complex) -> tuple[Complex, Complex]:
         """Frequency responses of the command to the measured outputs, (measured, W), and to the reference, (W,)."""
         z = np.exp(1j * np.asarray(w) / self.rate)
-        a, into = self._closed()
+        a, into = self._transition_matrices()
         system = z[:, None, None] * np.eye(len(a)) - a
         right = np.broadcast_to(np.column_stack([into, self._b]), (z.size, len(a), into.shape[1] + 1))
         answer = (self._gains @ np.linalg.solve(system, right))[:, 0, :]
@@ -314,9 +320,9 @@ class Lqg:
 
     def poles(self) -> Complex:
         """Poles of the controller in the z-plane."""
-        return np.asarray(np.linalg.eigvals(self._closed()[0]))
+        return np.asarray(np.linalg.eigvals(self._transition_matrices()[0]))
 
-    def _closed(self) -> tuple[Floats, Floats]:
+    def _transition_matrices(self) -> tuple[Floats, Floats]:
         """State and input matrices of the controller."""
         into = self._a @ self.observer.gain
         return self._a - self._b @ self._gains - into @ self._c, into
@@ -349,7 +355,7 @@ class Lqg:
 
 
 @dataclass(frozen=True)
-class LqgDesign(JudgedLoop):
+class LqgDesign(LoopDesign):
     """Linear-quadratic controller with the margins of its loop on the exact model.
 
     Parameters
@@ -377,12 +383,12 @@ class LqgDesign(JudgedLoop):
         """Sampling rate [Hz]."""
         return self.realisation.rate
 
-    def acting(self, w: Floats | Complex) -> tuple[tuple[str, ...], Complex, Complex]:
+    def controller_response(self, w: Floats | Complex) -> tuple[tuple[str, ...], Complex, Complex]:
         """Return the measured outputs, and responses to each of them and to the reference at frequencies [rad/s]."""
         heard, asked = self.controller.response(w)
         return self.controller.observer.measured, -heard, asked
 
-    def controlled(self, limit: float) -> Lqg:
+    def with_limit(self, limit: float) -> Lqg:
         """Return the controller with a limit of its command."""
         return Lqg(self.controller.observer, self.controller.feedback, self.controller.tracked, limit=limit)
 
@@ -403,12 +409,12 @@ class LqgDesign(JudgedLoop):
         }
 
     def __str__(self) -> str:
-        lines = [str(self.controller), f"realised by {self.realisation}", *self._judged()]
+        lines = [str(self.controller), f"realised by {self.realisation}", *self._margin_lines()]
         return "\n".join(lines)
 
 
 def lqg(
-    model: Solved,
+    model: ModelData,
     *,
     allowed: Mapping[str, float],
     effort: float,
@@ -465,76 +471,80 @@ def lqg(
     delay. LQG loops have no guaranteed margins: Doyle (1978), doi:10.1109/TAC.1978.1101812. Therefore the argument
     principle on the exact response decides.
     """
-    count, start = drawn_from(samples, seed)
+    count, start = check_samples(samples, seed)
     dear = positive("effort", effort)
     walks = 0.2 * dear if drift is None else positive("drift", drift)
     plants = plants_of(model, input, rate, coupling, sensor=sensor)
     names = tuple(p.output for p in plants)
-    read = names_of("measured", measured, names)
+    read = select_outputs("measured", measured, names)
     weights = _weights(allowed, names)
-    tracked = _tracked(output, plants)
-    realisation = realised(plants, band, poles)
-    seen = filtered(realisation, read, noises(model, read, noise), walks)
+    tracked = _tracked_output(output, plants)
+    realisation = fit_realization(plants, band, poles)
+    seen = kalman_filter(realisation, read, noise_deviations(model, read, noise), walks)
     c = realisation.c
     cost = sum(np.outer(row @ c, row @ c) / size**2 for row, size in weights)
     no = "no state feedback brings the model to rest; allow for deviations of every output that integrates"
-    with solving(*no.split("; ")):
+    with catch_numerical_errors(*no.split("; ")):
         gains, _, own = python_control().dlqr(realisation.a, realisation.b, cost, np.eye(1) / dear**2)
-    if np.max(np.abs(own)) >= 1.0 - AT_ONE:
+    if np.max(np.abs(own)) >= 1.0 - INTEGRATOR_TOLERANCE:
         raise ModelError(no)
     controller = Lqg(seen, gains, tracked, limit=limit)
-    w = np.geomspace(BELOW * realisation.band[0], 0.999 * math.pi * plants[0].rate, POINTS)
+    w = np.geomspace(BAND_EXTENSION * realisation.band[0], 0.999 * math.pi * plants[0].rate, CURVE_POINTS)
     acting = -controller.response(w)[0]
     poles_of_it = controller.poles()
-    at_one = np.abs(poles_of_it - 1.0) < AT_ONE
+    at_one = np.abs(poles_of_it - 1.0) < INTEGRATOR_TOLERANCE
     integral, grows = int(np.sum(at_one)), int(np.sum((np.abs(poles_of_it) > 1.0) & ~at_one))
     heard = [plants[names.index(o)] for o in seen.measured]
 
-    def judged(which: Solved) -> Margins:
+    def loop_margins(which: ModelData) -> Margins:
         parts = [replace(p, model=which) for p in heard]
         loop = np.sum(acting * np.array([p.response(w) for p in parts]), axis=0)
-        order = max(p.integrates() for p in parts)
-        return margins_of(loop, w, max(order, 0.0) + integral, parts[0].grows() + grows)
+        order = max(p.integral_order() for p in parts)
+        return margins_of(loop, w, max(order, 0.0) + integral, parts[0].count_unstable_poles() + grows)
 
-    nominal = judged(model)
-    if not (nominal.stable and nominal.sensitivity <= SHARP):
+    nominal = loop_margins(model)
+    if not (nominal.stable and nominal.sensitivity <= MAX_SENSITIVITY):
         raise ModelError(
             f"the loop is no design on the exact response of the model ({nominal}): such loops have no guaranteed "
             "margins; make effort smaller, drift larger or the noise smaller, or allow for larger deviations"
         )
-    margins = tuple(judged(one.model) for one in plants[0].samples(count, start))
-    broken = [m for m in margins if not (m.stable and m.sensitivity <= SHARP)]
-    if len(broken) > BROKEN * len(margins):
+    margins = tuple(loop_margins(one.model) for one in plants[0].samples(count, start))
+    broken = [m for m in margins if not (m.stable and m.sensitivity <= MAX_SENSITIVITY)]
+    if len(broken) > MAX_BROKEN_SHARE * len(margins):
         raise ModelError(
             f"the intervals are too wide to design on: in {len(broken)} of {len(margins)} samples of the model's "
-            f"numbers the loop is not stable or has a largest sensitivity above {SHARP:g}; {known_least(model)}; "
+            f"numbers the loop is not stable or has a largest sensitivity above {MAX_SENSITIVITY:g}; "
+            f"{least_certain_parameter(model)}; "
             "identify from a longer or richer run (ftlm design-input lays it out), or make effort smaller"
         )
     return LqgDesign(controller, realisation, nominal, margins, tuple(plants))
 
 
-def _tracked(output: str | None, plants: Sequence[Plant]) -> str:
+def _tracked_output(output: str | None, plants: Sequence[Plant]) -> str:
     """Return the output that follows the reference."""
     names = [p.output for p in plants]
     if output is not None:
-        return names_of("output", [output], tuple(names))[0]
-    return next((p.output for p in plants if p.integrates() > 0.5), names[0])
+        return select_outputs("output", [output], tuple(names))[0]
+    return next((p.output for p in plants if p.integral_order() > 0.5), names[0])
 
 
 def _weights(allowed: Mapping[str, float], names: tuple[str, ...]) -> list[tuple[Floats, float]]:
     """Return coefficients of sums of outputs, with their maximum acceptable deviations."""
     if not isinstance(allowed, Mapping) or not allowed:
         raise ModelError(
-            f"allowed = {shown(allowed)} is no mapping from outputs, or sums of them, to deviations; give such as "
+            f"allowed = {short_repr(allowed)} is no mapping from outputs, or sums of them, to deviations; give such as "
             f"{{{names[0]!r}: 0.01}}"
         )
-    return [(sums("allowed", text, names), positive(f"allowed[{shown(text)}]", size)) for text, size in allowed.items()]
+    return [
+        (sum_row("allowed", text, names), positive(f"allowed[{short_repr(text)}]", size))
+        for text, size in allowed.items()
+    ]
 
 
 def _equilibrium(realisation: Realisation, tracked: str) -> Floats:
     """States and input at rest with the tracked output at 1."""
     if tracked not in realisation.outputs:
-        raise ModelError(f"tracked = {shown(tracked)} is not one of the outputs {', '.join(realisation.outputs)}")
+        raise ModelError(f"tracked = {short_repr(tracked)} is not one of the outputs {', '.join(realisation.outputs)}")
     size = realisation.states
     matrix = np.zeros((size + 1, size + 1))
     matrix[:size, :size] = realisation.a - np.eye(size)

@@ -15,19 +15,19 @@ import numpy as np
 from ftlm.analysis.poles import modes
 from ftlm.control.stability_margins import Plant
 from ftlm.errors import ModelError
-from ftlm.utils.validation import Complex, Floats, real_number, shown, whole_number, words_of
+from ftlm.utils.validation import Complex, Floats, error_text, real_number, short_repr, whole_number
 
 #: Number of fitted frequencies; the error is also evaluated between them.
-FITTED = 120
+FIT_FREQUENCIES = 120
 #: Most iterations of pole relocation, and relative change of converged poles.
-ROUNDS, STILL = 30, 1e-6
+MAX_POLE_ITERATIONS, POLE_TOLERANCE = 30, 1e-6
 #: Smallest contribution of a pole, relative to every output at every frequency; smaller ones are dropped.
-NOTHING = 1e-6
+MIN_POLE_CONTRIBUTION = 1e-6
 #: Poles closer to 0 than this share of the band's lower end are integrators.
-AT_ORIGIN = 1e-3
+INTEGRATOR_BAND_SHARE = 1e-3
 #: Target errors of gain [dB] and phase [degrees], and range of the number of poles.
 GAIN_DB, PHASE_DEGREES = 0.1, 1.0
-FEWEST, MOST = 2, 30
+MIN_POLES, MAX_POLES = 2, 30
 #: Largest errors of a realization that a design may use.
 COARSE_DB, COARSE_DEGREES = 1.0, 6.0
 
@@ -83,7 +83,7 @@ class Realisation:
         )
 
 
-def realised(plants: Sequence[Plant], band: tuple[float, float] | None, poles: int | None) -> Realisation:
+def fit_realization(plants: Sequence[Plant], band: tuple[float, float] | None, poles: int | None) -> Realisation:
     """Fit an integer-order system to the exact response of outputs to one input, and discretize it.
 
     Parameters
@@ -107,26 +107,32 @@ def realised(plants: Sequence[Plant], band: tuple[float, float] | None, poles: i
     """
     low, high = _band(band, plants[0].rate)
     if poles is None:
-        counts = list(range(2, MOST + 1, 2))
+        counts = list(range(2, MAX_POLES + 1, 2))
     else:
         count = whole_number(poles)
-        if count is None or not FEWEST <= count <= MOST:
-            raise ModelError(f"poles = {shown(poles)} is no whole number from {FEWEST} to {MOST}")
+        if count is None or not MIN_POLES <= count <= MAX_POLES:
+            raise ModelError(f"poles = {short_repr(poles)} is no whole number from {MIN_POLES} to {MAX_POLES}")
         counts = [count]
     library = python_control()
-    w = np.geomspace(low, high, FITTED)
-    with solving(f"no response from {low:.3g} to {high:.3g} rad/s", "use a narrower band"):
+    w = np.geomspace(low, high, FIT_FREQUENCIES)
+    with catch_numerical_errors(f"no response from {low:.3g} to {high:.3g} rad/s", "use a narrower band"):
         exact = np.array([p.exact(w) for p in plants])
-    own = [m.pole for m in modes(plants[0].model, coupling=plants[0].coupling) if m.swings and low < m.frequency < high]
-    integrates = [p.integrates() > 0.5 for p in plants]
+    own = [
+        m.pole
+        for m in modes(plants[0].model, coupling=plants[0].coupling)
+        if m.oscillatory and low < m.frequency < high
+    ]
+    integrates = [p.integral_order() > 0.5 for p in plants]
     best: Realisation | None = None
     for count in counts:
-        with solving(f"no {count} poles from {low:.3g} to {high:.3g} rad/s", "use a narrower band"):
-            found = _fit(np.asarray(1j * w, dtype=np.complex128), exact, integrates, _begun(own, low, high, count))
-            made = _sampled(library, plants, (low, high), *found)
-        if best is None or _worst(made) < _worst(best):
+        with catch_numerical_errors(f"no {count} poles from {low:.3g} to {high:.3g} rad/s", "use a narrower band"):
+            found = _fit(
+                np.asarray(1j * w, dtype=np.complex128), exact, integrates, _initial_poles(own, low, high, count)
+            )
+            made = _discretize(library, plants, (low, high), *found)
+        if best is None or _scaled_error(made) < _scaled_error(best):
             best = made
-        if _worst(best) <= 1.0:
+        if _scaled_error(best) <= 1.0:
             break
     assert best is not None
     gain, phase = max(best.gain_error.values()), max(best.phase_error.values())
@@ -140,7 +146,7 @@ def realised(plants: Sequence[Plant], band: tuple[float, float] | None, poles: i
 
 
 @contextmanager
-def solving(what: str, way_out: str) -> Iterator[None]:
+def catch_numerical_errors(what: str, way_out: str) -> Iterator[None]:
     """Raise ModelError for overflow and for numerically singular matrices."""
     with np.errstate(over="raise", divide="raise", invalid="raise"), warnings.catch_warnings():
         # SciPy warns of a matrix whose solution has no digits.
@@ -150,7 +156,7 @@ def solving(what: str, way_out: str) -> Iterator[None]:
         except ModelError:
             raise
         except (np.linalg.LinAlgError, ArithmeticError, ValueError, RuntimeWarning) as error:
-            raise ModelError(f"{what} ({words_of(error, 200)}); {way_out}") from None
+            raise ModelError(f"{what} ({error_text(error, 200)}); {way_out}") from None
 
 
 def python_control() -> Any:
@@ -168,7 +174,7 @@ def _band(band: tuple[float, float] | None, rate: float) -> tuple[float, float]:
     try:
         low, high = (real_number("band", b) for b in band)
     except (TypeError, ValueError):
-        raise ModelError(f"band = {shown(band)} is no pair of frequencies; give (low, high) in rad/s") from None
+        raise ModelError(f"band = {short_repr(band)} is no pair of frequencies; give (low, high) in rad/s") from None
     if not (math.isfinite(low) and 0 < low < high <= half / 2):
         raise ModelError(
             f"band = ({low:g}, {high:g}) rad/s is no interval up to a quarter of the rate, {half / 2:g} rad/s"
@@ -176,7 +182,7 @@ def _band(band: tuple[float, float] | None, rate: float) -> tuple[float, float]:
     return low, high
 
 
-def _begun(own: Sequence[complex], low: float, high: float, count: int) -> Complex:
+def _initial_poles(own: Sequence[complex], low: float, high: float, count: int) -> Complex:
     """Initial poles, one of each pair: the oscillatory modes of the model, and real poles over the band."""
     pairs = list(own)[: count // 2]
     real = -np.geomspace(low, high, count - 2 * len(pairs))
@@ -215,7 +221,7 @@ def _system(poles: Complex) -> tuple[Floats, Floats]:
 def _fit(s: Complex, exact: Complex, integrates: Sequence[bool], poles: Complex) -> tuple[Complex, Floats, bool]:
     """Return the poles and, by output, their residues, the integrator's first."""
     weight = 1.0 / np.abs(exact)
-    for _ in range(ROUNDS):
+    for _ in range(MAX_POLE_ITERATIONS):
         basis = _basis(s, poles)
         blocks, right = [], []
         width = basis.shape[1]
@@ -235,17 +241,17 @@ def _fit(s: Complex, exact: Complex, integrates: Sequence[bool], poles: Complex)
         # A stable model has no poles on the right; where noise of the fit puts one, it is mirrored.
         moved = -np.abs(moved.real) + 1j * moved.imag
         before, poles = poles, np.array(sorted(moved[moved.imag >= 0], key=lambda p: (p.imag == 0, abs(p))))
-        if len(before) == len(poles) and np.max(np.abs(before - poles) / np.abs(poles)) < STILL:
+        if len(before) == len(poles) and np.max(np.abs(before - poles) / np.abs(poles)) < POLE_TOLERANCE:
             break
     residues = _residues(s, exact, integrates, poles)
     # Of a model with fewer poles than were asked for the others do nothing, and no observer would find their states.
     # Nor those of a second integral beside the one that is there.
     at, kept = 1, []
-    slow = AT_ORIGIN * float(np.min(s.imag)) if any(integrates) else 0.0
+    slow = INTEGRATOR_BAND_SHARE * float(np.min(s.imag)) if any(integrates) else 0.0
     for p in poles:
         wide = 1 if p.imag == 0 else 2
         part = residues[:, at : at + wide] @ _basis(s, np.array([p])).T
-        kept.append(bool(np.max(np.abs(part) * weight) > NOTHING and abs(p) > slow))
+        kept.append(bool(np.max(np.abs(part) * weight) > MIN_POLE_CONTRIBUTION and abs(p) > slow))
         at += wide
     if not all(kept) and any(kept):
         poles = poles[kept]
@@ -273,7 +279,7 @@ def _residues(s: Complex, exact: Complex, integrates: Sequence[bool], poles: Com
     return residues
 
 
-def _sampled(
+def _discretize(
     library: Any, plants: Sequence[Plant], band: tuple[float, float], poles: Complex, residues: Floats, integral: bool
 ) -> Realisation:
     """Return the discretized realization with its approximation errors."""
@@ -300,15 +306,15 @@ def _sampled(
         {},
         {},
     )
-    w = np.geomspace(*band, 2 * FITTED - 1)
-    quotient = made.response(w) / np.array([p.held(w) for p in plants])
+    w = np.geomspace(*band, 2 * FIT_FREQUENCIES - 1)
+    quotient = made.response(w) / np.array([p.held_response(w) for p in plants])
     for name, line in zip(made.outputs, quotient, strict=True):
         made.gain_error[name] = float(np.max(np.abs(20.0 * np.log10(np.abs(line)))))
         made.phase_error[name] = float(np.degrees(np.max(np.abs(np.angle(line)))))
     return made
 
 
-def _worst(made: Realisation) -> float:
+def _scaled_error(made: Realisation) -> float:
     """Largest approximation error relative to its target."""
     worst = max(max(made.gain_error.values()) / GAIN_DB, max(made.phase_error.values()) / PHASE_DEGREES)
     return worst if math.isfinite(worst) else math.inf

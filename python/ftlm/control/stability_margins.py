@@ -10,20 +10,20 @@ import numpy as np
 
 from ftlm.analysis.frequency_response import (
     frequency_response,
-    model_numbers,
+    parameter_vector,
     response_inputs,
     transfer_functions,
     value_at,
-    with_numbers,
+    with_parameter_vector,
 )
 from ftlm.analysis.poles import stability
 from ftlm.errors import ModelError
-from ftlm.model.model import Solved
+from ftlm.model.model import ModelData
 from ftlm.utils.validation import Complex, Floats
 
 #: Number of frequencies of a Nyquist curve, from a thousandth of the crossover to the Nyquist frequency.
-POINTS = 1500
-BELOW = 1e-3
+NYQUIST_POINTS = 1500
+LOWEST_FREQUENCY_SHARE = 1e-3
 
 
 @dataclass(frozen=True)
@@ -59,18 +59,18 @@ class Margins:
         )
 
 
-class JudgedLoop:
+class LoopDesign:
     """Loop design with margins at the nominal parameters and at samples of their distribution."""
 
     nominal: Margins
     samples: tuple[Margins, ...]
 
     @property
-    def kept(self) -> float:
+    def stable_share(self) -> float:
         """Share of the samples with a stable loop; 1 without samples."""
         return sum(m.stable for m in self.samples) / len(self.samples) if self.samples else 1.0
 
-    def within(self, what: Literal["crossover", "phase", "gain", "sensitivity"]) -> tuple[float, float]:
+    def margin_interval(self, what: Literal["crossover", "phase", "gain", "sensitivity"]) -> tuple[float, float]:
         """Central 95 % interval of a margin over the samples."""
         if not self.samples:
             value = getattr(self.nominal, what)
@@ -85,13 +85,14 @@ class JudgedLoop:
             one |= {n: v if math.isfinite(v) else None for n, v in one.items()}
         return {"nominal": told[0], "samples": told[1:]}
 
-    def _judged(self) -> list[str]:
+    def _margin_lines(self) -> list[str]:
         """Margins as lines of text."""
         lines = [f"at the values: {self.nominal}"]
         if self.samples:
-            phase, gain, peak = (self.within(n) for n in ("phase", "gain", "sensitivity"))
+            phase, gain, peak = (self.margin_interval(n) for n in ("phase", "gain", "sensitivity"))
             lines.append(
-                f"over the intervals ({len(self.samples)} samples, {100 * self.kept:.0f} % stable), 95 % between: "
+                f"over the intervals ({len(self.samples)} samples, {100 * self.stable_share:.0f} % stable), 95 % "
+                "between: "
                 f"phase margin {phase[0]:.3g} and {phase[1]:.3g} degrees, gain margin {gain[0]:.3g} and {gain[1]:.3g}, "
                 f"largest sensitivity {peak[0]:.3g} and {peak[1]:.3g}"
             )
@@ -114,7 +115,7 @@ class Plant:
         See :func:`ftlm.analysis.frequency_response`.
     """
 
-    model: Solved
+    model: ModelData
     output: str
     input: str
     rate: float
@@ -130,12 +131,12 @@ class Plant:
                 value_at({p: c for c, p in pairs}, s)
                 for pairs in (transfer.numerators[self.output, self.input], transfer.denominator[self.output])
             )
-            return np.asarray(above / below * np.exp(-s * transfer.delay[self.input]) * self._seen(s))
+            return np.asarray(above / below * np.exp(-s * transfer.delay[self.input]) * self._filter_response(s))
         inputs = response_inputs(self.model, coupled=self.coupling == "simulated")
         every = frequency_response(self.model, w, coupling=self.coupling, sensor=self.sensor)
         return np.asarray(every[self.model.outputs.index(self.output), inputs.index(self.input)])
 
-    def _seen(self, s: Complex) -> Complex:
+    def _filter_response(self, s: Complex) -> Complex:
         """Response of the sensor filter."""
         passed = self.model.structure.sensor_filter if self.sensor else None
         if passed is None:
@@ -144,16 +145,16 @@ class Plant:
         power = (self.output in passed.signals) - (self.input in passed.signals)
         return np.asarray((above / below) ** power)
 
-    def held(self, w: Floats | Complex) -> Complex:
+    def held_response(self, w: Floats | Complex) -> Complex:
         """Response with a zero-order hold of the input, below half the rate."""
         turn = 1j * w / self.rate
         return np.asarray(self.exact(w) * -np.expm1(-turn) / turn)
 
     def response(self, w: Floats | Complex) -> Complex:
         """Response with zero-order hold and one sample of delay."""
-        return np.asarray(self.held(w) * np.exp(-1j * w / self.rate))
+        return np.asarray(self.held_response(w) * np.exp(-1j * w / self.rate))
 
-    def integrates(self) -> float:
+    def integral_order(self) -> float:
         """Order of the plant's integration at zero frequency."""
         transfer = transfer_functions(self.model, coupling=self.coupling)
         above = transfer.numerators[self.output, self.input]
@@ -161,18 +162,18 @@ class Plant:
             raise ModelError(f"{self.input} does not reach {self.output} in this model")
         return transfer.denominator[self.output][-1][1] - above[-1][1]
 
-    def grows(self) -> float:
+    def count_unstable_poles(self) -> float:
         """Number of unstable poles; NaN with a pole on the imaginary axis."""
         found = stability(self.model, coupling=self.coupling)
         return math.nan if found.on_axis else found.unstable_poles
 
-    def reached(self) -> bool:
+    def has_response(self) -> bool:
         """Whether the output depends on the input."""
         return bool(transfer_functions(self.model, coupling=self.coupling).numerators[self.output, self.input])
 
     def check_stable(self) -> None:
         """Raise for an unstable model; an integrator is allowed."""
-        grows = self.grows()
+        grows = self.count_unstable_poles()
         if grows != 0:
             why = "a pole is on the imaginary axis" if math.isnan(grows) else f"{grows:g} of its poles are on the right"
             raise ModelError(
@@ -191,13 +192,13 @@ class Plant:
         values, vectors = np.linalg.eigh((matrix + matrix.T) / 2)
         spread = vectors * np.sqrt(np.maximum(values, 0.0))
         drawn = np.random.default_rng(seed).standard_normal((count, len(values))) @ spread.T
-        centre = model_numbers(self.model)
-        return [replace(self, model=with_numbers(self.model, centre + d)) for d in drawn]
+        centre = parameter_vector(self.model)
+        return [replace(self, model=with_parameter_vector(self.model, centre + d)) for d in drawn]
 
 
-def grid(crossover: float, rate: float) -> Floats:
+def nyquist_frequencies(crossover: float, rate: float) -> Floats:
     """Frequencies of a Nyquist curve [rad/s]."""
-    return np.geomspace(BELOW * crossover, 0.999 * math.pi * rate, POINTS)
+    return np.geomspace(LOWEST_FREQUENCY_SHARE * crossover, 0.999 * math.pi * rate, NYQUIST_POINTS)
 
 
 def margins_of(loop: Complex, w: Floats, integrates: float, grows: float = 0.0) -> Margins:

@@ -1,1 +1,1 @@
-"""Records: orders, equations, structures, runs."""
+"""Run and frequency-response data: sampling, units, validation and file export."""

@@ -1,4 +1,4 @@
-"""What a person asks a run to be, and the checks that make it one."""
+"""Construction of runs: validation of arguments, data window, resampling, missing samples and units."""
 
 from __future__ import annotations
 
@@ -9,56 +9,56 @@ from typing import TYPE_CHECKING, Any
 import numpy as np
 
 from ftlm.data.sampling import (
-    FEWEST_ROWS,
-    HELD,
+    MIN_RUN_SAMPLES,
+    ZERO_ORDER_HOLD,
     Intersample,
-    Missing,
-    Readings,
+    MissingPolicy,
+    NonuniformSamples,
     as_seconds,
     as_vector,
     check_increasing,
+    check_intersample,
     check_lengths,
+    check_missing_policy,
     check_rows,
+    check_step,
     check_values,
-    checked_intersample,
-    checked_missing,
-    checked_step,
-    few_read,
-    grid_of,
-    held,
-    how_interpolated,
-    interpolated,
+    describe_interpolation,
+    describe_missing,
+    fill_input_gaps,
+    grid_positions,
+    has_too_few_values,
     is_regular,
-    places_on_grid,
+    missing_mask,
     regular_step,
-    said_missing,
-    unread,
+    resample_uniform,
+    uniform_times,
     window_rows,
 )
-from ftlm.data.units import TIME_UNITS, checked_units
+from ftlm.data.units import TIME_UNITS, check_units
 from ftlm.errors import DataError
-from ftlm.utils.validation import Floats, bad_rows, check_run_name, check_signal_name, listed
+from ftlm.utils.validation import Floats, bad_rows, check_run_name, check_signal_name, join_names
 
 if TYPE_CHECKING:
-    from ftlm.data.run import Measured
+    from ftlm.data.run import RunData
 
 
 @dataclass(frozen=True)
-class Asked:
-    """Everything that a run is made of, as a person or a file gave it; see :meth:`ftlm.Run.from_arrays`.
+class RunArguments:
+    """Arguments of a run before validation; see :meth:`ftlm.Run.from_arrays`.
 
     Parameters
     ----------
     inputs, outputs, step, time, units, intersample, name, resample, time_unit, missing
-        As there.
+        As in :meth:`ftlm.Run.from_arrays`.
     window
-        Its ``slice``.
+        Data window: the argument ``window`` of :meth:`ftlm.Run.from_arrays`.
     labels, time_label
-        What errors call each signal and the time.
+        Names of the signals and of the time in error messages.
     known_step
-        The step that the file states.
-    facts, about
-        What was done to the data before, and how they were made.
+        Step that the file header states [s].
+    notes, metadata
+        Notes on earlier processing, and metadata on the origin of the data.
     """
 
     inputs: Mapping[str, object]
@@ -74,43 +74,43 @@ class Asked:
     labels: Mapping[str, str] = field(default_factory=dict)
     time_label: str = "time"
     known_step: float | None = None
-    facts: tuple[str, ...] = ()
-    about: Mapping[str, Any] = field(default_factory=dict)
+    notes: tuple[str, ...] = ()
+    metadata: Mapping[str, Any] = field(default_factory=dict)
     missing: str = "refuse"
 
-    def thing(self, signal: str) -> str:
-        """Return what errors call a signal."""
+    def label_of(self, signal: str) -> str:
+        """Return the name of a signal in error messages."""
         return self.labels.get(signal, f"signal {signal!r}")
 
-    def measured(self) -> Measured:
-        """Check everything once, in the order in which the data come: names, numbers, clock, window, values, spacing.
+    def build_run_data(self) -> RunData:
+        """Validate the arguments and build the run: names, numbers, time, window, values, spacing, in this order.
 
         Raises
         ------
         DataError
-            Whatever cannot be used as it is.
+            An argument or a sample that cannot be used as given.
         """
-        from ftlm.data.run import Measured  # noqa: PLC0415 — the class that it makes
+        from ftlm.data.run import RunData  # noqa: PLC0415 — the class that it makes
 
         self._check_names()
-        units = checked_units(self.units, (*self.inputs, *self.outputs))
+        units = check_units(self.units, (*self.inputs, *self.outputs))
         behaviour: dict[str, Intersample] = {
-            **dict.fromkeys(self.inputs, HELD),
-            **checked_intersample(self.intersample, tuple(self.inputs)),
+            **dict.fromkeys(self.inputs, ZERO_ORDER_HOLD),
+            **check_intersample(self.intersample, tuple(self.inputs)),
         }
-        new_step = None if self.resample is None else checked_step(self.resample, "resample")
-        missing = checked_missing(self.missing)
+        new_step = None if self.resample is None else check_step(self.resample, "resample")
+        missing = check_missing_policy(self.missing)
         vectors = {
-            s: as_vector(v, self.thing(s), gaps=missing != "refuse" and (missing == "hold" or s in self.outputs))[0]
+            s: as_vector(v, self.label_of(s), gaps=missing != "refuse" and (missing == "hold" or s in self.outputs))[0]
             for s, v in {**self.inputs, **self.outputs}.items()
         }
-        clock = self._clock(vectors)
+        clock = self._time_axis(vectors)
         first, last = self._rows(clock.times)
         if last - first < clock.times.size:
             # Copies: a view would keep the rest in memory, and could be written to.
             vectors = {s: vector[first:last].copy() for s, vector in vectors.items()}
         data = self._values(vectors, units, first, missing)
-        times, facts = clock.times[first:last], self.facts + clock.facts
+        times, facts = clock.times[first:last], self.notes + clock.notes
         if clock.step is not None:
             step, start = clock.step, float(f"{first * clock.step:.12g}")
         else:
@@ -119,24 +119,24 @@ class Asked:
             start = float(times[0])
             if new_step is None:
                 if missing != "refuse":
-                    times, data = self._with_lost_rows(times, data, missing, first)
+                    times, data = self._insert_missing_samples(times, data, missing, first)
                 step, jitter = regular_step(times, self.time_label, first, clock.resolution, self.known_step)
                 facts += jitter
-        data, said = self._known(data, behaviour, missing)
+        data, said = self._fill_input_gaps(data, behaviour, missing)
         facts += said
         readings = None
         if new_step is not None:
             step, since = new_step, times - times[0]
             whole = not any(np.isnan(data[s]).any() for s in self.outputs)
             if whole and is_regular(since):
-                data = interpolated(since, data, behaviour, new_step)
-                facts += (resampled(since, new_step, first, how_interpolated(behaviour)),)
+                data = resample_uniform(since, data, behaviour, new_step)
+                facts += (describe_resampling(since, new_step, first, describe_interpolation(behaviour)),)
             else:
                 check_rows(since, new_step)
-                readings = Readings(since, data)
-                data = readings.on(behaviour, new_step)
-                facts += (resampled(since, new_step, first, how_read(behaviour)),)
-        return Measured(
+                readings = NonuniformSamples(since, data)
+                data = readings.resample(behaviour, new_step)
+                facts += (describe_resampling(since, new_step, first, describe_nonuniform_resampling(behaviour)),)
+        return RunData(
             name=self.name,
             step=step,
             start=start,
@@ -145,16 +145,16 @@ class Asked:
             _data=data,
             _units={s: unit for s, (unit, _) in units.items()},
             _intersample=behaviour,
-            facts=tuple(dict.fromkeys(facts)),
-            _about=dict(self.about),
-            readings=readings,
+            notes=tuple(dict.fromkeys(facts)),
+            _metadata=dict(self.metadata),
+            sample_times=readings,
         )
 
-    def _with_lost_rows(
-        self, times: Floats, data: dict[str, Floats], missing: Missing, first: int
+    def _insert_missing_samples(
+        self, times: Floats, data: dict[str, Floats], missing: MissingPolicy, first: int
     ) -> tuple[Floats, dict[str, Floats]]:
-        """Rows for the places of a regular grid that have none, where the others lie on one."""
-        found = places_on_grid(times)
+        """Insert rows at the missing positions of a regular time grid, if all existing rows lie on one."""
+        found = grid_positions(times)
         if found is None or found[0].size == found[0][-1] + 1:
             return times, data
         places, step = found
@@ -166,7 +166,7 @@ class Asked:
                 f"{row}, and the inputs are not known there; give these rows with NaN for the outputs alone, or hold "
                 "the inputs over them with missing='hold'"
             )
-        whole = times[0] + grid_of(int(places[-1]) + 1, step)
+        whole = times[0] + uniform_times(int(places[-1]) + 1, step)
         whole[places] = times
         out = {}
         for name, values in data.items():
@@ -174,37 +174,39 @@ class Asked:
             out[name][places] = values
         return whole, out
 
-    def _known(
-        self, data: dict[str, Floats], behaviour: Mapping[str, Intersample], missing: Missing
+    def _fill_input_gaps(
+        self, data: dict[str, Floats], behaviour: Mapping[str, Intersample], missing: MissingPolicy
     ) -> tuple[dict[str, Floats], tuple[str, ...]]:
-        """Inputs that are known throughout, and what there is to say of what was not read."""
+        """Fill missing input samples, and describe the missing samples of all signals."""
         said, out = [], dict(data)
         for name, values in data.items():
-            gone = unread(values)
+            gone = missing_mask(values)
             if not gone.any():
                 continue
             if name in self.outputs:
-                if few_read(values):
+                if has_too_few_values(values):
                     raise bad_rows(
-                        self.thing(name),
-                        f"{gone.size - int(gone.sum())} values, {FEWEST_ROWS} are needed",
+                        self.label_of(name),
+                        f"{gone.size - int(gone.sum())} values, {MIN_RUN_SAMPLES} are needed",
                         0,
                         int(gone.sum()),
                         "use a longer record",
                     )
-                said.append(said_missing(f"output {name}", gone, "they weigh nothing in output-error fits and figures"))
+                said.append(
+                    describe_missing(f"output {name}", gone, "they weigh nothing in output-error fits and figures")
+                )
                 continue
             if gone[0]:
                 raise bad_rows(
-                    self.thing(name),
+                    self.label_of(name),
                     "no value before which there is none to hold",
                     0,
                     int(gone.sum()),
                     "begin where the input is known, with slice=",
                 )
-            out[name] = held(values, behaviour[name])
-            how = "its last value was held" if behaviour[name] == HELD else "a straight line was drawn"
-            said.append(said_missing(f"input {name}", gone, f"{how}, which is a guess"))
+            out[name] = fill_input_gaps(values, behaviour[name])
+            how = "its last value was held" if behaviour[name] == ZERO_ORDER_HOLD else "a straight line was drawn"
+            said.append(describe_missing(f"input {name}", gone, f"{how}, which is a guess"))
         return out, tuple(said)
 
     def _check_names(self) -> None:
@@ -220,17 +222,17 @@ class Asked:
             given = "neither is given" if self.step is None else "both are given"
             raise DataError(f"step= and time=: {given}; pass exactly one of them")
 
-    def _clock(self, vectors: Mapping[str, Floats]) -> _Clock:
-        """Return the time of every row, which all signals must have."""
-        lengths = {self.thing(s): vector.size for s, vector in vectors.items()}
+    def _time_axis(self, vectors: Mapping[str, Floats]) -> _TimeAxis:
+        """Return the time axis; raise if the signals differ in length."""
+        lengths = {self.label_of(s): vector.size for s, vector in vectors.items()}
         if self.time is None:
             if self.time_unit != "s":
                 raise DataError(f"time_unit={self.time_unit!r} is the unit of time=, which is not given; step= is in s")
-            step = checked_step(self.step, "step")
-            clock = _Clock(grid_of(min(lengths.values()), step), step, 0.0)
+            step = check_step(self.step, "step")
+            clock = _TimeAxis(uniform_times(min(lengths.values()), step), step, 0.0)
         else:
             if not isinstance(self.time_unit, str) or self.time_unit not in TIME_UNITS:
-                raise DataError(f"time_unit={self.time_unit!r} is unknown; the known ones are {listed(TIME_UNITS)}")
+                raise DataError(f"time_unit={self.time_unit!r} is unknown; the known ones are {join_names(TIME_UNITS)}")
             dated = as_seconds(self.time, self.time_label)
             if dated is not None and self.time_unit != "s":
                 raise DataError(
@@ -242,27 +244,27 @@ class Asked:
             single = dtype.kind == "f" and dtype.itemsize < 8
             precision = float(np.finfo(dtype if single else np.float64).eps)
             said = (dated[1],) if dated is not None and dated[1] else ()
-            clock = _Clock(times, None, precision * float(np.abs(times).max()), said)
+            clock = _TimeAxis(times, None, precision * float(np.abs(times).max()), said)
         check_lengths(lengths)
         return clock
 
     def _rows(self, times: Floats) -> tuple[int, int]:
-        """Return the first row asked for and the one after the last."""
+        """Return the half-open range of rows inside the data window."""
         first, last = 0, times.size
         if self.window is not None:
             first, last = window_rows(times, self.window, "slice", self.time_label)
-        if last - first < FEWEST_ROWS:
-            thing = self.thing((*self.inputs, *self.outputs)[0]) if self.time is None else self.time_label
+        if last - first < MIN_RUN_SAMPLES:
+            thing = self.label_of((*self.inputs, *self.outputs)[0]) if self.time is None else self.time_label
             raise DataError(
                 f"{thing}: {last - first} rows{' in the slice' if self.window is not None else ''}, "
-                f"{FEWEST_ROWS} are needed; use a longer record"
+                f"{MIN_RUN_SAMPLES} are needed; use a longer record"
             )
         return first, last
 
     def _values(
-        self, vectors: Mapping[str, Floats], units: Mapping[str, tuple[str, float]], first: int, missing: Missing
+        self, vectors: Mapping[str, Floats], units: Mapping[str, tuple[str, float]], first: int, missing: MissingPolicy
     ) -> dict[str, Floats]:
-        """Return finite numbers in SI units, NaN where they may be missing."""
+        """Return finite values in SI units; NaN where samples may be missing."""
         data: dict[str, Floats] = {}
         for signal, vector in vectors.items():
             unit, scale = units[signal]
@@ -270,25 +272,27 @@ class Asked:
             instead = "give them no weight with missing='weight'"
             if signal in self.inputs:
                 instead = "hold the last value before them with missing='hold'"
-            check_values(vector, self.thing(signal), first, gaps=gaps, instead=f"{instead}, or avoid them with slice=")
+            check_values(
+                vector, self.label_of(signal), first, gaps=gaps, instead=f"{instead}, or avoid them with slice="
+            )
             with np.errstate(over="ignore"):
                 data[signal] = vector * scale if scale != 1.0 else vector
-            check_values(data[signal], f"{self.thing(signal)} in {unit}", first, gaps=gaps)
+            check_values(data[signal], f"{self.label_of(signal)} in {unit}", first, gaps=gaps)
         return data
 
 
 @dataclass(frozen=True)
-class _Clock:
-    """Times of the rows [s], their step where it was given, what their numbers resolve, what is to be said of them."""
+class _TimeAxis:
+    """Sample times [s], the step if it was given, the resolution of the times [s], and notes."""
 
     times: Floats
     step: float | None
     resolution: float
-    facts: tuple[str, ...] = ()
+    notes: tuple[str, ...] = ()
 
 
-def resampled(since: Floats, step: float, first: int, how: str) -> str:
-    """Say what was put on which step, and how."""
+def describe_resampling(since: Floats, step: float, first: int, how: str) -> str:
+    """Describe a resampling: new step, old intervals, method."""
     intervals = np.diff(since)
     return (
         f"resampled to {step:.12g} s from intervals of {intervals.min():.6g} to {intervals.max():.6g} s, the widest "
@@ -296,8 +300,8 @@ def resampled(since: Floats, step: float, first: int, how: str) -> str:
     )
 
 
-def how_read(behaviour: Mapping[str, Intersample]) -> str:
-    """Say what becomes of each signal that has times of its own."""
-    kept = [signal for signal, kind in behaviour.items() if kind == HELD]
+def describe_nonuniform_resampling(behaviour: Mapping[str, Intersample]) -> str:
+    """Describe how nonuniformly sampled signals are used after resampling."""
+    kept = [signal for signal, kind in behaviour.items() if kind == ZERO_ORDER_HOLD]
     means = f"held: {', '.join(kept)}, by means over the new intervals; " if kept else ""
     return f"{means}outputs keep their own times in output-error fits and figures, elsewhere straight lines"

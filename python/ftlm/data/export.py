@@ -1,4 +1,4 @@
-"""Frames of pandas and polars and datasets of xarray, into runs and out of them."""
+"""Export and import of runs: pandas and polars frames, xarray datasets, csv and parquet files."""
 
 from __future__ import annotations
 
@@ -16,16 +16,16 @@ from typing import Any, cast
 
 import numpy as np
 
-from ftlm.data.construction import Asked
-from ftlm.data.run import Measured
-from ftlm.data.sampling import as_seconds, grid_of, unread
+from ftlm.data.construction import RunArguments
+from ftlm.data.run import RunData
+from ftlm.data.sampling import as_seconds, missing_mask, uniform_times
 from ftlm.data.units import is_time_name, time_unit_of
 from ftlm.errors import DataError, ModelError
-from ftlm.utils.files import RUN, check_new, write_atomically
-from ftlm.utils.validation import CSV_TIME, Floats, is_run_name, listed, names_to_columns, nearest
+from ftlm.utils.files import RUN_MESSAGES, check_new, write_atomically
+from ftlm.utils.validation import CSV_TIME, Floats, is_run_name, join_names, names_to_columns, nearest
 
 
-def asked_of_frame(
+def arguments_from_frame(
     frame: object,
     *,
     time: Hashable | None,
@@ -35,8 +35,8 @@ def asked_of_frame(
     time_unit: str | None,
     window: Sequence[float | None] | None,
     **more: Any,
-) -> Asked:
-    """Take columns of a frame; see :meth:`ftlm.Run.from_frame`."""
+) -> RunArguments:
+    """Arguments of a run from the columns of a frame; see :meth:`ftlm.Run.from_frame`."""
     columns, index = _columns_of(frame), _index_of(frame)
 
     def pick(column: Hashable, thing: str) -> object:
@@ -46,7 +46,7 @@ def asked_of_frame(
         if count == 0:
             raise DataError(
                 f"column {column!r} ({thing}) is not in the frame{nearest(column, columns)}; "
-                f"the columns are {listed(columns)}; for the index of a pandas frame use frame.reset_index()"
+                f"the columns are {join_names(columns)}; for the index of a pandas frame use frame.reset_index()"
             )
         if count > 1:
             raise DataError(f"column {column!r} ({thing}) is there {count} times; rename all but one")
@@ -55,7 +55,7 @@ def asked_of_frame(
     label, clock = "time" if time is None else f"time (column {time!r})", None
     if time is not None:
         clock = pick(time, "time")
-    elif step is None and index is not None and _is_clock(*index):
+    elif step is None and index is not None and _is_time_index(*index):
         time, clock = index
         label = "time (the index)" if time is None else f"time (the index {time!r})"
     wanted = [names_to_columns(argument, given) for argument, given in (("inputs", inputs), ("outputs", outputs))]
@@ -65,7 +65,7 @@ def asked_of_frame(
         unit, said = time_unit_of(time, label, time_unit)
     else:
         unit, said = time_unit or "s", ()
-    return Asked(
+    return RunArguments(
         given_inputs,
         given_outputs,
         step=step,
@@ -73,7 +73,7 @@ def asked_of_frame(
         time_unit=unit,
         window=window,
         labels=labels,
-        facts=said,
+        notes=said,
         time_label=label,
         **more,
     )
@@ -81,9 +81,9 @@ def asked_of_frame(
 
 def _columns_of(frame: object) -> list[Hashable]:
     if isinstance(frame, Mapping):
-        # Of a dataset of xarray, too, whose coordinates are columns like the others.
+        # An xarray dataset is a mapping, too; its coordinates count as columns.
         return list(getattr(frame, "variables", frame))
-    # A lazy polars frame is told by its collect(); asking it for its columns would already start work.
+    # A lazy polars frame has collect(); reading its columns would already start the computation.
     columns = None if hasattr(frame, "collect") else getattr(frame, "columns", None)
     if columns is None:
         columns = getattr(getattr(frame, "dtype", None), "names", None)
@@ -96,7 +96,7 @@ def _columns_of(frame: object) -> list[Hashable]:
 
 
 def _index_of(frame: object) -> tuple[Hashable, object] | None:
-    """Name and values of what the rows of a frame are known by; None where there is no such thing, or several."""
+    """Name and values of the row index of a frame; None if there is none or several."""
     sizes = getattr(frame, "sizes", None)
     if isinstance(frame, Mapping) and isinstance(sizes, Mapping):
         only = next(iter(sizes), None)
@@ -107,32 +107,32 @@ def _index_of(frame: object) -> tuple[Hashable, object] | None:
     return getattr(index, "name", None), index
 
 
-def _is_clock(name: Hashable, values: object) -> bool:
-    """Whether an index is the time: it holds dates, or is called so."""
+def _is_time_index(name: Hashable, values: object) -> bool:
+    """Whether an index is a time axis, by its name or because it holds dates."""
     return (isinstance(name, str) and is_time_name(name)) or as_seconds(values, "time (the index)") is not None
 
 
-def frame_of(run: Measured) -> Any:
-    """Return a run as a pandas frame over its time."""
+def frame_of(run: RunData) -> Any:
+    """Return a run as a pandas frame indexed by time."""
     pandas = _library("pandas")
     index = pandas.Index(run.start + run.time, name=CSV_TIME)
     frame = pandas.DataFrame({name: run[name].copy() for name in run.signals}, index=index)
-    frame.attrs = {**_told(run), "units": run.units, "intersample": dict(run.intersample)}
+    frame.attrs = {**_frame_attributes(run), "units": run.units, "intersample": dict(run.intersample)}
     return frame
 
 
-def dataset_of(run: Measured) -> Any:
-    """Return a run as an xarray dataset over its time."""
+def dataset_of(run: RunData) -> Any:
+    """Return a run as an xarray dataset indexed by time."""
     xarray = _library("xarray")
     signals = {}
     for name in run.signals:
         role = {"role": "input", "intersample": run.intersample[name]} if name in run.inputs else {"role": "output"}
         signals[name] = (CSV_TIME, run[name].copy(), {"units": run.units[name], **role})
     clock = (CSV_TIME, run.start + run.time, {"units": "s"})
-    return xarray.Dataset(signals, coords={CSV_TIME: clock}, attrs=_told(run))
+    return xarray.Dataset(signals, coords={CSV_TIME: clock}, attrs=_frame_attributes(run))
 
 
-def _told(run: Measured) -> dict[str, Any]:
+def _frame_attributes(run: RunData) -> dict[str, Any]:
     told = {"name": run.name, "inputs": list(run.inputs), "outputs": list(run.outputs), "step": run.step}
     return {**told, "warnings": list(run.warnings)}
 
@@ -146,13 +146,13 @@ def _library(name: str) -> Any:
 
 CSV_MARK = "# ftlm-run "
 CSV_VERSION = 1
-BOM = b"\xef\xbb\xbf"
-#: Most bytes of the line; a reader that knew none would take a file without a line's end into memory.
-LONGEST_HEADER = 1 << 20
-#: What a file says of rows at times of their own, which it does not hold.
-LEFT_BEHIND = "written on its grid: the times at which outputs were read stayed behind"
-#: What must be told, as JSON gives it; the rows themselves say when they start.
-_KINDS: dict[str, type] = {
+UTF8_BOM = b"\xef\xbb\xbf"
+#: Bound on the first line: a file without line breaks would otherwise be read into memory whole.
+MAX_HEADER_BYTES = 1 << 20
+#: Note in files of runs with nonuniform samples, which only hold the resampled grid.
+OWN_TIMES_OMITTED_NOTE = "written on its grid: the times at which outputs were read stayed behind"
+#: JSON type of every header field; the start time follows from the samples.
+_FIELD_TYPES: dict[str, type] = {
     "name": str,
     "step": float,
     "inputs": list,
@@ -163,13 +163,13 @@ _KINDS: dict[str, type] = {
     "about": dict,
     "missing": list,
 }
-#: ... and what may be left out.
-_OPTIONAL: dict[str, Any] = {"about": {}, "missing": []}
+#: Optional header fields and their defaults.
+_OPTIONAL_DEFAULTS: dict[str, Any] = {"about": {}, "missing": []}
 
 
 @dataclass(frozen=True)
 class Header:
-    """What the first line of a csv file or the metadata of a parquet file says: ``VERSION JSON``, keys as here."""
+    """Header of a run: first line of a csv file or parquet metadata, ``VERSION JSON`` with these fields as keys."""
 
     name: str
     step: float
@@ -183,7 +183,7 @@ class Header:
     missing: tuple[str, ...] = ()
 
     @classmethod
-    def of(cls, run: Measured) -> Header:
+    def of(cls, run: RunData) -> Header:
         """Return the header of a run."""
         return cls(
             run.name,
@@ -193,32 +193,36 @@ class Header:
             run.outputs,
             run.units,
             dict(run.intersample),
-            run.facts if run.readings is None else (*run.facts, LEFT_BEHIND),
-            run.about,
-            tuple(n for n in run.outputs if unread(run[n]).any()),
+            run.notes if run.sample_times is None else (*run.notes, OWN_TIMES_OMITTED_NOTE),
+            run.metadata,
+            tuple(n for n in run.outputs if missing_mask(run[n]).any()),
         )
 
     def text(self) -> str:
-        """Write it."""
-        told = {f.name: getattr(self, f.name) for f in fields(self) if f.name not in _OPTIONAL or getattr(self, f.name)}
+        """Return the header as text, ``VERSION JSON``."""
+        told = {
+            f.name: getattr(self, f.name)
+            for f in fields(self)
+            if f.name not in _OPTIONAL_DEFAULTS or getattr(self, f.name)
+        }
         words = json.dumps(told, ensure_ascii=False, allow_nan=False)
-        # Half of a pair, which no file can hold, is written as JSON escapes it.
+        # A lone surrogate cannot be encoded in UTF-8 and is written as a JSON escape.
         return f"{CSV_VERSION} {words.encode('utf-8', 'backslashreplace').decode()}"
 
     def line(self) -> str:
-        """Write it as the first line of a text file, or refuse what no reader would take for one."""
+        """Return the header as the first line of a text file; raise if it is too long."""
         line = f"{CSV_MARK}{self.text()}\n"
         size = len(line.encode())
-        if size > LONGEST_HEADER:
+        if size > MAX_HEADER_BYTES:
             raise DataError(
                 f"run {self.name!r}: names, warnings and what it is about take {size} bytes, more than the "
-                f"{LONGEST_HEADER} of the first line of a csv file; write it as .parquet"
+                f"{MAX_HEADER_BYTES} of the first line of a csv file; write it as .parquet"
             )
         return line
 
     @classmethod
     def read(cls, path: Path, where: str, text: str) -> Header:
-        """Read what a file says in one place, and refuse a damaged header or one of a later version."""
+        """Parse a header; raise if it is corrupt or of a later version."""
         version, _, body = text.partition(" ")
         if version.strip() != str(CSV_VERSION):
             raise DataError(
@@ -226,7 +230,7 @@ class Header:
                 "ftlm, or remove the line and name the columns"
             )
         try:
-            return _checked(json.loads(body))
+            return _parse_fields(json.loads(body))
         except (ValueError, KeyError, TypeError, RecursionError) as error:
             raise DataError(
                 f"{path.name}: {where} is a damaged ftlm header ({str(error)[:100]}); restore it, or remove the line "
@@ -234,10 +238,10 @@ class Header:
             ) from None
 
 
-def _checked(told: Any) -> Header:
+def _parse_fields(told: Any) -> Header:
     values: dict[str, Any] = {}
-    for key, kind in _KINDS.items():
-        value = told.get(key, _OPTIONAL[key]) if key in _OPTIONAL else told[key]
+    for key, kind in _FIELD_TYPES.items():
+        value = told.get(key, _OPTIONAL_DEFAULTS[key]) if key in _OPTIONAL_DEFAULTS else told[key]
         if not isinstance(value, kind):
             raise ValueError(f"{key!r} is {str(value)[:40]!r}")
         values[key] = tuple(value) if isinstance(value, list) else value
@@ -251,23 +255,23 @@ def _checked(told: Any) -> Header:
 
 
 def header_of_line(path: Path, line: bytes) -> Header | None:
-    """Return what the first line of a text file says, if ftlm wrote it."""
-    text = line.removeprefix(BOM).decode("utf-8", errors="replace")
+    """Return the header in the first line of a text file; None if ftlm did not write it."""
+    text = line.removeprefix(UTF8_BOM).decode("utf-8", errors="replace")
     return Header.read(path, "line 1", text.removeprefix(CSV_MARK)) if text.startswith(CSV_MARK) else None
 
 
-def write_csv(run: Measured, path: str | os.PathLike[str], *, force: bool) -> None:
+def write_csv(run: RunData, path: str | os.PathLike[str], *, force: bool) -> None:
     """Write a run as text; see :meth:`ftlm.Run.to_csv`."""
-    check_new(path, force=force, words=RUN)
+    check_new(path, force=force, words=RUN_MESSAGES)
     columns = _columns(run)
     rows = map(",".join, zip(*(map(repr, column.tolist()) for column in columns.values()), strict=True))
     text = Header.of(run).line() + "\n".join([",".join(columns), *rows, ""])
-    write_atomically(path, text.encode(), force=force, words=RUN)
+    write_atomically(path, text.encode(), force=force, words=RUN_MESSAGES)
 
 
-def write_parquet(run: Measured, path: str | os.PathLike[str], *, force: bool) -> None:
+def write_parquet(run: RunData, path: str | os.PathLike[str], *, force: bool) -> None:
     """Write a run as a parquet file; see :meth:`ftlm.Run.to_parquet`."""
-    target = check_new(path, force=force, words=RUN)
+    target = check_new(path, force=force, words=RUN_MESSAGES)
     try:
         pyarrow = importlib.import_module("pyarrow")
         parquet = importlib.import_module("pyarrow.parquet")
@@ -277,13 +281,13 @@ def write_parquet(run: Measured, path: str | os.PathLike[str], *, force: bool) -
     check = f"{run.length} {digest(columns, header)}"
     table = pyarrow.table(columns).replace_schema_metadata({"ftlm-run": header, "ftlm-check": check})
     content = io.BytesIO()
-    # Checksums of pages, and one of all rows: the footer, which says how many there are, has none of its own.
+    # Page checksums do not cover the footer with the row count; a digest of all rows does.
     parquet.write_table(table, content, write_page_checksum=True)
-    write_atomically(target, content.getvalue(), force=force, words=RUN)
+    write_atomically(target, content.getvalue(), force=force, words=RUN_MESSAGES)
 
 
 def digest(columns: Mapping[str, Floats], header: str) -> str:
-    """Checksum of a run's columns in their order and of its header; `files/reader.py` computes it as well."""
+    """SHA-256 of the columns of a run and of its header; the isolated reader computes the same digest."""
     made = hashlib.sha256(header.encode())
     for name, values in columns.items():
         made.update(f"\0{name}\0{len(values)}\0".encode())
@@ -291,14 +295,14 @@ def digest(columns: Mapping[str, Floats], header: str) -> str:
     return made.hexdigest()
 
 
-def _columns(run: Measured) -> dict[str, Floats]:
+def _columns(run: RunData) -> dict[str, Floats]:
     return {CSV_TIME: _source_time(run)} | {name: run[name] for name in run.signals}
 
 
-def _source_time(run: Measured) -> Floats:
-    """Source time of every row, in digits that read well."""
-    exact = run.start + grid_of(run.length, run.step)
-    # Nine digits below the step read well, and the exact step stands in the header.
+def _source_time(run: RunData) -> Floats:
+    """Source time of every sample [s], rounded to short decimals."""
+    exact = run.start + uniform_times(run.length, run.step)
+    # Nine digits below the step suffice; the header holds the exact step.
     digits = 9 - math.floor(math.log10(run.step))
     if not 0 <= digits <= 15 or np.abs(exact).max() * 10.0**digits >= 2.0**53:
         return exact

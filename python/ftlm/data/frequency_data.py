@@ -1,4 +1,4 @@
-"""Measured frequency responses: gain and phase of one output from one input, or an impedance."""
+"""Frequency response data: measured gain and phase of one output from one input, or an impedance."""
 
 from __future__ import annotations
 
@@ -12,7 +12,7 @@ from numpy.typing import ArrayLike
 from ftlm.errors import DataError
 from ftlm.utils.validation import Complex, Floats, as_floats, real_number
 
-#: Units in which a person writes frequencies, and their angular frequency [rad/s]. A lower-case m is a thousandth.
+#: Accepted frequency units and their angular frequency [rad/s]; lower-case m means milli.
 FREQUENCY_UNITS: dict[str, float] = {
     "rad/s": 1.0,
     "Hz": 2 * math.pi,
@@ -24,7 +24,7 @@ FREQUENCY_UNITS: dict[str, float] = {
 
 @dataclass(frozen=True, eq=False)
 class FrequencyData:
-    """A measured frequency response of one output from one input; :meth:`from_arrays` makes one of arrays.
+    """Frequency response measured from one input to one output; built by :meth:`from_arrays`.
 
     Parameters
     ----------
@@ -33,16 +33,16 @@ class FrequencyData:
     response
         Complex response, shape (N,), finite: output over input.
     deviation
-        Standard deviation of the real part and of the imaginary part at each frequency, shape (N,), above 0; None where
-        nobody states it.
+        Standard deviation of the real part and of the imaginary part at each frequency, shape (N,), above 0; None if
+        unknown.
     output, input
-        What the response is of and from; "" for those of the only equation.
+        Names of the output and the input; "" for those of the only equation.
     unit
-        Of the response, such as "Ω".
+        Unit of the response, such as "Ω".
     name
-        What reports call it.
+        Name of the data in reports.
     warnings
-        What was assumed of the file.
+        Assumptions made on reading the file.
 
     Raises
     ------
@@ -73,8 +73,8 @@ class FrequencyData:
                 f"{self.name}: response has shape {response.shape}, frequency {frequency.shape}; give one value each"
             )
         _refuse(~np.isfinite(response), response, f"{self.name}: response", "is not finite; leave such rows out")
-        object.__setattr__(self, "frequency", _fixed(frequency))
-        object.__setattr__(self, "response", _fixed(response))
+        object.__setattr__(self, "frequency", _read_only_copy(frequency))
+        object.__setattr__(self, "response", _read_only_copy(response))
         if self.deviation is not None:
             deviation = _column(f"{self.name}: deviation", self.deviation)
             if deviation.ndim == 1 and deviation.size != frequency.size:
@@ -83,7 +83,7 @@ class FrequencyData:
                 )
             words = "is not above 0; leave such rows out, or weight without deviations"
             _refuse(~(deviation > 0), deviation, f"{self.name}: deviation", words)
-            object.__setattr__(self, "deviation", _fixed(deviation))
+            object.__setattr__(self, "deviation", _read_only_copy(deviation))
 
     @classmethod
     def from_arrays(
@@ -98,7 +98,7 @@ class FrequencyData:
         unit: str = "",
         name: str = "data",
     ) -> FrequencyData:
-        """Frequency data of arrays.
+        """Build frequency data from arrays.
 
         Parameters
         ----------
@@ -123,30 +123,30 @@ class FrequencyData:
 
     @property
     def gain(self) -> Floats:
-        """Size of the response [dB]."""
+        """Gain of the response [dB]."""
         with np.errstate(divide="ignore"):
             return np.asarray(20.0 * np.log10(np.abs(self.response)))
 
     @property
     def phase(self) -> Floats:
-        """Phase [degrees], without jumps from one frequency to the next higher one."""
+        """Phase [degrees], unwrapped in the order of the frequencies."""
         order = np.argsort(self.frequency, kind="stable")
         out = np.empty(order.size)
         out[order] = np.degrees(np.unwrap(np.angle(self.response[order])))
         return out
 
     def slice(self, low: float | None = None, high: float | None = None) -> FrequencyData:
-        """Only what was measured from one angular frequency to another, both included.
+        """Return the data between two angular frequencies, both included.
 
         Parameters
         ----------
         low, high
-            Ends [rad/s]; by default the first and the last.
+            Limits [rad/s]; default the whole range.
 
         Raises
         ------
         DataError
-            An end that is no number, or nothing between them.
+            A limit that is not a number, or no data between the limits.
         """
         ends = [
             default if end is None else real_number(name, end)
@@ -172,7 +172,7 @@ class FrequencyData:
 
     @property
     def pair(self) -> str:
-        """What it is of and from, in words."""
+        """Output and input of the response as text, such as ``y from u``; else the name of the data."""
         return f"{self.output} from {self.input}" if self.output and self.input else self.name
 
     def __str__(self) -> str:
@@ -192,7 +192,7 @@ class FrequencyData:
 
 
 def as_frequency_data(data: object) -> tuple[FrequencyData, ...]:
-    """One record or several as a tuple; refuses everything else."""
+    """Return one or several frequency responses as a tuple; raise for other types."""
     items = (data,) if isinstance(data, FrequencyData) else data
     if not isinstance(items, Sequence) or isinstance(items, str):
         raise DataError(
@@ -228,7 +228,7 @@ def _refuse(bad: np.ndarray, values: np.ndarray, name: str, way_out: str) -> Non
         raise DataError(f"{name} {what}: {values[at]} at row {at}, {int(np.sum(bad))} in all;{rest}")
 
 
-def _fixed(values: np.ndarray) -> np.ndarray:
+def _read_only_copy(values: np.ndarray) -> np.ndarray:
     kept = values.copy()
     kept.setflags(write=False)
     return kept

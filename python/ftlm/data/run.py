@@ -1,4 +1,4 @@
-"""The record of one measured experiment: what verbs read of a run."""
+"""Runs: measured experiments with named inputs and outputs in SI units, immutable after validation."""
 
 from __future__ import annotations
 
@@ -12,55 +12,55 @@ from typing import TYPE_CHECKING, Any, NoReturn
 import numpy as np
 from numpy.typing import NDArray
 
-from ftlm.data.construction import Asked, how_read
+from ftlm.data.construction import RunArguments, describe_nonuniform_resampling
 from ftlm.data.sampling import (
-    FEWEST_ROWS,
+    MIN_RUN_SAMPLES,
     Intersample,
-    Readings,
+    NonuniformSamples,
     as_vector,
-    bridged,
+    check_intersample,
     check_lengths,
     check_rows,
+    check_step,
     check_values,
-    checked_intersample,
-    checked_step,
-    grid_of,
-    how_interpolated,
-    interpolated,
+    describe_interpolation,
+    drop_missing,
+    fit_trend,
+    interpolate_gaps,
     is_constant,
-    locked,
-    read,
-    trend_of,
-    unread,
+    make_read_only,
+    missing_mask,
+    resample_uniform,
+    uniform_times,
     window_rows,
 )
 from ftlm.errors import DataError
-from ftlm.structure.input_nonlinearity import Limit
+from ftlm.structure.input_nonlinearity import InputNonlinearity
 from ftlm.structure.structure import Structure
 from ftlm.svg.figure import Figures
-from ftlm.utils.validation import Floats, as_mapping, bad_rows, check_signal_name, listed, names_to_columns, nearest
+from ftlm.utils.validation import Floats, as_mapping, bad_rows, check_signal_name, join_names, names_to_columns, nearest
 
 if TYPE_CHECKING:
     from ftlm.validation.data_advice import Advice
 
 
 @dataclass(frozen=True, eq=False, repr=False)
-class Measured:
-    """Regular samples of named inputs and outputs in SI units; :class:`ftlm.Run` is what people hold.
+class RunData:
+    """Regular samples of named inputs and outputs in SI units; base class of :class:`ftlm.Run`.
 
     Parameters
     ----------
     name
-        What reports call it.
+        Name of the run in reports.
     step, start
-        Time between rows, and source time of the first row [s].
+        Sampling interval and source time of the first sample [s].
     inputs, outputs
-        Names.
-    facts
-        What was done to the data, and what a rig said of them, in words.
-    readings
-        Rows at times of their own, where these are not those of the grid; on the grid stand means of the hold and
-        straight lines.
+        Names of the signals.
+    notes
+        Notes on processing and, for a rig, on the recording.
+    sample_times
+        Nonuniform samples at their own times; None if the samples lie on the grid. The grid then holds interval means
+        of held inputs and linear interpolation of all other signals.
     """
 
     name: str
@@ -71,21 +71,24 @@ class Measured:
     _data: dict[str, Floats]
     _units: dict[str, str]
     _intersample: dict[str, Intersample]
-    facts: tuple[str, ...] = ()
-    _about: dict[str, Any] = field(default_factory=dict)
-    readings: Readings | None = None
+    notes: tuple[str, ...] = ()
+    _metadata: dict[str, Any] = field(default_factory=dict)
+    sample_times: NonuniformSamples | None = None
 
     def __post_init__(self) -> None:
         for name, value in (
-            ("_data", {s: locked(self._data[s]) for s in self.signals}),
+            ("_data", {s: make_read_only(self._data[s]) for s in self.signals}),
             ("_units", {s: self._units[s] for s in self.signals}),
             ("_intersample", {s: self._intersample[s] for s in self.inputs}),
-            ("_about", copy.deepcopy(self._about)),
+            ("_metadata", copy.deepcopy(self._metadata)),
         ):
             object.__setattr__(self, name, value)
-        if self.readings is not None:
-            own = Readings(locked(self.readings.times), {s: locked(self.readings.data[s]) for s in self.signals})
-            object.__setattr__(self, "readings", own)
+        if self.sample_times is not None:
+            own = NonuniformSamples(
+                make_read_only(self.sample_times.times),
+                {s: make_read_only(self.sample_times.data[s]) for s in self.signals},
+            )
+            object.__setattr__(self, "sample_times", own)
 
     @property
     def signals(self) -> tuple[str, ...]:
@@ -99,82 +102,82 @@ class Measured:
 
     @property
     def intersample(self) -> dict[str, Intersample]:
-        """Behaviour of every input between rows, "zoh" or "foh". A copy."""
+        """Intersample behavior of every input, "zoh" or "foh". A copy."""
         return dict(self._intersample)
 
     @property
     def length(self) -> int:
-        """Number of rows N."""
+        """Number of samples N."""
         return int(self._data[self.outputs[0]].size)
 
     @property
     def duration(self) -> float:
-        """Time from the first row to the last, (N − 1)·step [s]."""
+        """Time from the first sample to the last, (N − 1)·step [s]."""
         return (self.length - 1) * self.step
 
     @property
     def time(self) -> Floats:
-        """Time of every row [s], from 0, shape (N,), read-only."""
-        return locked(grid_of(self.length, self.step))
+        """Sample times [s] from 0, shape (N,), read-only."""
+        return make_read_only(uniform_times(self.length, self.step))
 
     @property
     def warnings(self) -> tuple[str, ...]:
-        """What was done to the data and what is odd about them, in words."""
-        there = {name: read(self._data[name]) for name in self.outputs}
+        """Notes on processing and warnings about the data, as sentences."""
+        there = {name: drop_missing(self._data[name]) for name in self.outputs}
         constant = tuple(
             f"output {name!r} is constant ({float(values[0])!r} in all {values.size} rows): nothing can be identified "
             "from it"
             for name, values in there.items()
             if values.size and is_constant(values)
         )
-        return self.facts + constant
+        return self.notes + constant
 
     @property
-    def missing(self) -> dict[str, NDArray[np.bool_]]:
-        """Outputs that were not read throughout, with the rows of the run (or of its `readings`) that hold no value."""
-        data = self._data if self.readings is None else self.readings.data
-        gone = {name: unread(data[name]) for name in self.outputs}
+    def missing_samples(self) -> dict[str, NDArray[np.bool_]]:
+        """Mask of missing samples (of the run or of its `sample_times`) for every output with gaps."""
+        data = self._data if self.sample_times is None else self.sample_times.data
+        gone = {name: missing_mask(data[name]) for name in self.outputs}
         return {name: rows for name, rows in gone.items() if rows.any()}
 
-    def bridged(self) -> Measured:
-        """The same with straight lines over what was not read, for a first look; nothing is fitted to these."""
-        if not any(unread(self._data[name]).any() for name in self.outputs):
+    def with_interpolated_gaps(self) -> RunData:
+        """Return a copy with linearly interpolated gaps, for plots and data checks; never used for estimation."""
+        if not any(missing_mask(self._data[name]).any() for name in self.outputs):
             return self
-        told = {f.name: getattr(self, f.name) for f in fields(Measured)}
-        return Measured(**{**told, "_data": {name: bridged(values) for name, values in self._data.items()}})
+        told = {f.name: getattr(self, f.name) for f in fields(RunData)}
+        return RunData(**{**told, "_data": {name: interpolate_gaps(values) for name, values in self._data.items()}})
 
     @property
-    def about(self) -> dict[str, Any]:
-        """How the run was made, for JSON: a rig says its name, seed, input, parameters and faults. A copy."""
-        return copy.deepcopy(self._about)
+    def metadata(self) -> dict[str, Any]:
+        """Metadata for JSON, such as name, seed, input, parameters and faults of a rig. A copy."""
+        return copy.deepcopy(self._metadata)
 
     def __getitem__(self, name: str) -> Floats:
         """Return a signal in SI units, shape (N,), read-only; `DataError` for an unknown name."""
         try:
             return self._data[name]
         except (KeyError, TypeError):
-            raise self._unknown(name) from None
+            raise self._unknown_signal_error(name) from None
 
     def __contains__(self, name: object) -> bool:
         return name in self.signals
 
-    def _unknown(self, name: object) -> DataError:
+    def _unknown_signal_error(self, name: object) -> DataError:
         return DataError(
             f"signal {name!r} is not in run {self.name!r}{nearest(name, self.signals)}; "
-            f"its signals are {listed(self.signals)}"
+            f"its signals are {join_names(self.signals)}"
         )
 
 
-class Run(Measured):
+class Run(RunData):
     """One measured experiment: regular samples of named inputs and outputs in SI units.
 
-    A run never changes. It is made by `Run.from_arrays`, `Run.from_frame` or `ftlm.load`, which check the data once:
-    whatever cannot be used as given is refused with a `DataError` that names the signal, the first bad row (counted
-    from 0), the number of bad rows and what to do. Nothing is repaired, resampled or clipped unless asked for, and
-    what was asked for is stated in `warnings`.
+    A run is immutable. `Run.from_arrays`, `Run.from_frame` and `ftlm.load` create it and check the data once. Data
+    that cannot be used raise a `DataError` that names the signal, the first bad row (counted from 0), the number of
+    bad rows and the remedy. Data are repaired, resampled or clipped only on request, and `warnings` lists every such
+    change.
 
-    Row j holds the outputs read at t = j·step and the inputs of that moment; between rows an input behaves as
-    `intersample` says: ``"zoh"`` (a command, held until the next row) or ``"foh"`` (a measured signal, linear).
+    Sample j holds the outputs and inputs at t = j·step. Between samples `intersample` defines an input: ``"zoh"`` (a
+    command, held until the next sample) or ``"foh"`` (a measured signal, linear).
     """
 
     def __init__(self) -> None:
@@ -187,7 +190,7 @@ class Run(Measured):
         raise AttributeError(f"a Run never changes; {name!r} cannot be deleted")
 
     def __reduce__(self) -> tuple[object, ...]:
-        return run_of, (Measured(**self._fields()),)
+        return run_of, (RunData(**self._fields()),)
 
     @classmethod
     def from_arrays(
@@ -223,23 +226,23 @@ class Run(Measured):
         units : mapping of str to str, optional
             Unit of a signal's numbers, converted to SI here. A signal without a unit is taken as it is.
         intersample : mapping of str to {"zoh", "foh"}, optional
-            Behaviour of an input between rows; ``"zoh"`` where not given.
+            Intersample behavior of an input; default ``"zoh"``.
         name : str, default "run"
-            What reports call this run.
+            Name of the run in reports.
         resample : float, optional
-            Put the run on this step [s]: held inputs by the mean of the hold over each new interval, everything
-            else linearly. Recorded in `warnings`. Where the rows were not regular, or outputs were not read
-            throughout, they stay in `readings`: output error simulates under the inputs as they were, and compares
-            with each output when it was read. Methods of the equation error see the straight lines.
+            Resample to this step [s]: interval means of held inputs, linear interpolation of all other signals.
+            Recorded in `warnings`. Nonuniform or missing samples are kept in `sample_times`: the output error is
+            simulated with the original inputs and evaluated at the original output times. Equation-error methods use
+            the resampled signals.
         slice : pair of float or None, optional
             Use the rows with a ≤ t < b only, [s] since the first row; applied before any other check of the rows.
         time_unit : {"s", "ms", "us", "min", "h"}, default "s"
             Unit of `time`.
         missing : {"refuse", "weight", "hold"}, default "refuse"
-            What to do about values that are not there: NaN, None in a list, masked values, rows that a regular `time`
-            lacks. ``"weight"``: of outputs; they stay NaN and weigh nothing wherever output error is fitted or judged,
-            every other method refuses the run. ``"hold"``: of inputs as well, which hold their last value (a straight
-            line where they are ``"foh"``). What was missing is said in `warnings`.
+            Treatment of missing values: NaN, None in a list, masked values, rows that a regular `time`
+            lacks. ``"weight"``: missing outputs stay NaN and get no weight in output-error estimation and validation;
+            other methods raise. ``"hold"``: in addition, missing inputs hold their last value (linear interpolation
+            for ``"foh"``). `warnings` lists the missing samples.
 
         Returns
         -------
@@ -252,7 +255,7 @@ class Run(Measured):
             large; if lengths differ; if a name, unit or behaviour is unknown or used twice; if time is not finite,
             repeated, decreasing, jittered or has a gap; if `step` is not positive.
         """
-        asked = Asked(
+        asked = RunArguments(
             as_mapping("inputs", {} if inputs is None else inputs),
             as_mapping("outputs", outputs),
             step=step,
@@ -265,7 +268,7 @@ class Run(Measured):
             time_unit=time_unit,
             missing=missing,
         )
-        return built(asked)
+        return build_run(asked)
 
     @classmethod
     def from_frame(
@@ -291,8 +294,8 @@ class Run(Measured):
         frame : frame
             Columns are taken as ``frame[column]``.
         time : hashable, optional
-            Column that holds the time, or the name of the frame's index. Without `time` and `step` that index is the
-            time where it holds dates or is called t, time or seconds; of a dataset its only dimension.
+            Time column, or the name of the frame's index. Default without `step`: the index if it holds dates or is
+            called t, time or seconds; for a dataset its only dimension.
         step : float, optional
             Time between rows [s], > 0.
         inputs, outputs : mapping of str to column, or list of str
@@ -300,8 +303,8 @@ class Run(Measured):
         units, intersample, name, resample, slice, missing
             As in `Run.from_arrays`.
         time_unit : {"s", "ms", "us", "min", "h"}, optional
-            Unit of the time column; where not given, the one that its name states, as in ``time [ms]`` (said in the
-            run's `warnings`), or else s. A name that states another one is refused.
+            Unit of the time column; default the unit in its name, as in ``time [ms]`` (with a warning), else s. A
+            contradicting name raises an error.
 
         Returns
         -------
@@ -312,9 +315,9 @@ class Run(Measured):
         DataError
             If a column is unknown or there more than once, and for everything `Run.from_arrays` refuses.
         """
-        from ftlm.data.export import asked_of_frame
+        from ftlm.data.export import arguments_from_frame
 
-        asked = asked_of_frame(
+        asked = arguments_from_frame(
             frame,
             time=time,
             step=step,
@@ -328,13 +331,13 @@ class Run(Measured):
             time_unit=time_unit,
             missing=missing,
         )
-        return built(asked)
+        return build_run(asked)
 
     def __repr__(self) -> str:
         lines = [self._headline()]
         if self.inputs:
-            lines.append("  inputs:  " + ", ".join(self._described(name) for name in self.inputs))
-        lines.append("  outputs: " + ", ".join(self._described(name) for name in self.outputs))
+            lines.append("  inputs:  " + ", ".join(self._describe_signal(name) for name in self.inputs))
+        lines.append("  outputs: " + ", ".join(self._describe_signal(name) for name in self.outputs))
         lines.extend(f"  warning: {text}" for text in self.warnings)
         return "\n".join(lines)
 
@@ -353,7 +356,7 @@ class Run(Measured):
             f"<tbody>{rows}</tbody></table>" + (f"<ul>{warnings}</ul>" if warnings else "")
         )
 
-    def slice(self, start: float | None, stop: float | None) -> Run:
+    def window(self, start: float | None, stop: float | None) -> Run:
         """Return the rows with start ≤ t < stop.
 
         Parameters
@@ -372,23 +375,22 @@ class Run(Measured):
         DataError
             If a limit lies outside the run, the limits do not increase, or fewer than three rows remain.
         """
-        first, last = window_rows(grid_of(self.length, self.step), (start, stop), "slice")
-        if last - first < FEWEST_ROWS:
-            raise DataError(f"slice: {last - first} rows remain, {FEWEST_ROWS} are needed; widen the limits")
+        first, last = window_rows(uniform_times(self.length, self.step), (start, stop), "slice")
+        if last - first < MIN_RUN_SAMPLES:
+            raise DataError(f"slice: {last - first} rows remain, {MIN_RUN_SAMPLES} are needed; widen the limits")
         data = {name: values[first:last] for name, values in self._data.items()}
-        # The digits beyond the twelfth come from the sum and not from the source.
+        # Digits beyond the twelfth are rounding errors of the sum.
         begin = self.start if first == 0 else float(f"{self.start + first * self.step:.12g}")
-        readings = self.readings
+        readings = self.sample_times
         if readings is not None:
-            readings = readings.part(self._intersample, first * self.step, (last - 1) * self.step, self.step)
-        return self._with(_data=data, start=begin, readings=readings)
+            readings = readings.cut_window(self._intersample, first * self.step, (last - 1) * self.step, self.step)
+        return self._with(_data=data, start=begin, sample_times=readings)
 
     def resample(self, step: float) -> Run:
-        """Return this run interpolated onto another step.
+        """Return this run resampled to another step.
 
-        Held inputs ("zoh") take their mean over each new interval, the exact integral of the hold; inputs that are
-        "foh" and all outputs are interpolated linearly. There is no anti-alias filter. The result says so in
-        `warnings`.
+        Held inputs ("zoh") take their mean over each new interval, the exact integral of the hold. Inputs with "foh"
+        and all outputs are interpolated linearly. No anti-alias filter is applied. `warnings` records the resampling.
 
         Parameters
         ----------
@@ -404,31 +406,37 @@ class Run(Measured):
         DataError
             If `step` is not positive, or leaves fewer than three rows or more than 50 million.
         """
-        new_step = checked_step(step, "resample")
-        since, readings, how = grid_of(self.length, self.step), self.readings, how_interpolated(self._intersample)
-        if readings is None and self.missing:
-            readings = Readings(since, self._data)
+        new_step = check_step(step, "resample")
+        since, readings, how = (
+            uniform_times(self.length, self.step),
+            self.sample_times,
+            describe_interpolation(self._intersample),
+        )
+        if readings is None and self.missing_samples:
+            readings = NonuniformSamples(since, self._data)
         if readings is None:
-            data = interpolated(since, self._data, self._intersample, new_step)
+            data = resample_uniform(since, self._data, self._intersample, new_step)
         else:
             check_rows(readings.times, new_step)
-            data, how = readings.on(self._intersample, new_step), how_read(self._intersample)
+            data, how = (
+                readings.resample(self._intersample, new_step),
+                describe_nonuniform_resampling(self._intersample),
+            )
         fact = f"resampled from {self.step:.12g} s to {new_step:.12g} s ({how})"
-        return self._with(_data=data, step=new_step, facts=(*self.facts, fact), readings=readings)
+        return self._with(_data=data, step=new_step, notes=(*self.notes, fact), sample_times=readings)
 
     def detrend(self, kind: str = "constant", signals: Iterable[str] | None = None) -> Run:
-        """Return this run less the mean, or the straight line of least squares, of some signals.
+        """Return this run with the mean or least-squares line of some signals subtracted.
 
-        A mean belongs to the record, not to the system: the mean of a record that does not end where it began holds
-        part of the response. An offset in the structure (``+ c``) estimates it instead. The result says in `warnings`
-        what was subtracted.
+        The mean of a run that does not end where it began contains part of the response. An offset in the structure
+        (``+ c``) estimates a constant offset without this bias. `warnings` records what was subtracted.
 
         Parameters
         ----------
         kind : {"constant", "linear"}, default "constant"
-            What is subtracted.
+            Trend to subtract: mean or least-squares line.
         signals : iterable of str, optional
-            Which signals; default all inputs and outputs.
+            Signals to detrend; default all inputs and outputs.
 
         Returns
         -------
@@ -444,37 +452,37 @@ class Run(Measured):
         wanted = self.signals if signals is None else tuple(names_to_columns("signals", signals))
         unknown = next((name for name in wanted if name not in self), None)
         if unknown is not None:
-            raise self._unknown(unknown)
-        data, facts, readings = dict(self._data), list(self.facts), self.readings
+            raise self._unknown_signal_error(unknown)
+        data, facts, readings = dict(self._data), list(self.notes), self.sample_times
         for name in wanted:
-            trend, words = trend_of(self._data[name], self.step, linear=kind == "linear")
+            trend, words = fit_trend(self._data[name], self.step, linear=kind == "linear")
             data[name] = self._data[name] - trend(self.time)
             if readings is not None:
-                readings = readings.changed(**{name: readings.data[name] - trend(readings.times)})
+                readings = readings.replace_signals(**{name: readings.data[name] - trend(readings.times)})
             facts.append(f"detrended: {words} subtracted from {name}")
-        return self._with(_data=data, facts=tuple(facts), readings=readings)
+        return self._with(_data=data, notes=tuple(facts), sample_times=readings)
 
-    def bent(self, limits: Sequence[Limit]) -> Run:
-        """Return this run with inputs as known saturations and dead zones let them act, sample by sample."""
-        data, readings = dict(self._data), self.readings
+    def with_input_nonlinearities(self, limits: Sequence[InputNonlinearity]) -> Run:
+        """Return this run with its inputs passed through known saturations and dead zones, sample by sample."""
+        data, readings = dict(self._data), self.sample_times
         for limit in limits:
-            data[limit.signal] = limit.of(data[limit.signal])
+            data[limit.signal] = limit.apply(data[limit.signal])
             if readings is not None:
-                readings = readings.changed(**{limit.signal: limit.of(readings.data[limit.signal])})
-        return self._with(_data=data, readings=readings)
+                readings = readings.replace_signals(**{limit.signal: limit.apply(readings.data[limit.signal])})
+        return self._with(_data=data, sample_times=readings)
 
     def with_samples(self, samples: Mapping[str, Floats], read: Mapping[str, Floats] | None = None) -> Run:
-        """Return this run with other samples of some of its signals.
+        """Return this run with new samples of some of its signals.
 
         Parameters
         ----------
         samples : mapping of str to array
             New samples by name, shape (N,).
         read : mapping of str to array, optional
-            The same at the rows' own times, if it has some.
+            New samples at the original times, for a run with `sample_times`.
         """
-        readings = self.readings and self.readings.changed(**(read or {}))
-        return self._with(_data={**self._data, **samples}, readings=readings)
+        readings = self.sample_times and self.sample_times.replace_signals(**(read or {}))
+        return self._with(_data={**self._data, **samples}, sample_times=readings)
 
     def rename(self, mapping: Mapping[str, str]) -> Run:
         """Return this run with other signal names.
@@ -495,7 +503,7 @@ class Run(Measured):
         """
         for old, new in mapping.items():
             if old not in self:
-                raise self._unknown(old)
+                raise self._unknown_signal_error(old)
             check_signal_name(new)
         renamed = {name: mapping.get(name, name) for name in self.signals}
         names = list(renamed.values())
@@ -508,18 +516,20 @@ class Run(Measured):
             _data={renamed[name]: values for name, values in self._data.items()},
             _units={renamed[name]: unit for name, unit in self._units.items()},
             _intersample={renamed[name]: kind for name, kind in self._intersample.items()},
-            readings=None
-            if self.readings is None
-            else Readings(self.readings.times, {renamed[name]: v for name, v in self.readings.data.items()}),
+            sample_times=None
+            if self.sample_times is None
+            else NonuniformSamples(
+                self.sample_times.times, {renamed[name]: v for name, v in self.sample_times.data.items()}
+            ),
         )
 
     def with_intersample(self, mapping: Mapping[str, str]) -> Run:
-        """Return this run with another behaviour of some inputs between rows.
+        """Return this run with another intersample behavior of some inputs.
 
         Parameters
         ----------
         mapping : mapping of str to {"zoh", "foh"}
-            Behaviour by input; other inputs keep theirs.
+            Intersample behavior by input; other inputs keep theirs.
 
         Returns
         -------
@@ -530,12 +540,12 @@ class Run(Measured):
         DataError
             If a name is not an input or a behaviour is neither "zoh" nor "foh".
         """
-        behaviour = {**self._intersample, **checked_intersample(mapping, self.inputs)}
-        data = self._data if self.readings is None else self.readings.on(behaviour, self.step)
+        behaviour = {**self._intersample, **check_intersample(mapping, self.inputs)}
+        data = self._data if self.sample_times is None else self.sample_times.resample(behaviour, self.step)
         return self._with(_intersample=behaviour, _data={n: v[: self.length] for n, v in data.items()})
 
     def with_outputs(self, values: Mapping[str, Floats]) -> Run:
-        """Return this run with further outputs, or other values of its own; on its grid, known throughout.
+        """Return this run with additional or replaced outputs, given on its grid without missing samples.
 
         Parameters
         ----------
@@ -558,14 +568,16 @@ class Run(Measured):
                 raise DataError(f"with_outputs: {name!r} is an input of run {self.name!r}; give it another name")
             check_lengths({f"run {self.name!r}": self.length, f"output {name!r}": numbers.size})
             check_values(numbers, f"output {name!r}", 0)
-        readings = self.readings
+        readings = self.sample_times
         if readings is not None:
-            readings = readings.changed(**{n: np.interp(readings.times, self.time, v) for n, v in given.items()})
+            readings = readings.replace_signals(
+                **{n: np.interp(readings.times, self.time, v) for n, v in given.items()}
+            )
         return self._with(
             outputs=tuple(dict.fromkeys([*self.outputs, *given])),
             _data={**self._data, **given},
             _units={**dict.fromkeys(given, ""), **self._units},
-            readings=readings,
+            sample_times=readings,
         )
 
     def select(self, names: Iterable[str]) -> Run:
@@ -588,12 +600,12 @@ class Run(Measured):
         kept = list(names_to_columns("names", names))
         for name in kept:
             if name not in self:
-                raise self._unknown(name)
+                raise self._unknown_signal_error(name)
         outputs = tuple(name for name in kept if name in self.outputs)
         if not outputs:
-            raise DataError(f"select: no output is left; keep at least one of {listed(self.outputs)}")
+            raise DataError(f"select: no output is left; keep at least one of {join_names(self.outputs)}")
         inputs = tuple(name for name in kept if name in self.inputs)
-        # The record keeps what is told of its own signals alone.
+        # RunData keeps units and intersample behavior of its own signals only.
         return self._with(inputs=inputs, outputs=outputs)
 
     def require_outputs(self, names: Iterable[str]) -> None:
@@ -613,10 +625,10 @@ class Run(Measured):
             if name not in self.outputs:
                 raise DataError(
                     f"output {name!r} is not in run {self.name!r}{nearest(name, self.outputs)}; "
-                    f"its outputs are {listed(self.outputs)}"
+                    f"its outputs are {join_names(self.outputs)}"
                 )
             values = self._data[name]
-            there = read(values)
+            there = drop_missing(values)
             if there.size == 0:
                 raise DataError(
                     f"output {name!r} of run {self.name!r}: none of its {values.size} rows holds a value; use a part "
@@ -628,7 +640,7 @@ class Run(Measured):
                 raise bad_rows(thing, what, 0, values.size, way_out)
 
     def plot(self, *signals: str) -> Figures:
-        """Charts of signals over time, outputs first: a notebook shows them; for matplotlib see ``ftlm.plot.run``.
+        """Plot signals over time, outputs first, for notebooks; for matplotlib see ``ftlm.plot.run``.
 
         Raises
         ------
@@ -640,21 +652,21 @@ class Run(Measured):
         return picture(self, *signals)
 
     def advice(self, structure: Structure | None = None) -> Advice:
-        """What to know about this run before a model is identified from it, in sentences with numbers.
+        """Check this run for faults and poor excitation before estimation.
 
-        Looks for dead, constant and zeroed channels, saturation, spikes, encoders that wrap, outputs that do not start
-        at rest, drift that no input explains, feedback from outputs to inputs, runs that are too short, and inputs that
-        excite too little. Nothing is repaired.
+        The checks cover dead, constant and zeroed channels, saturation, spikes, encoder wraps, outputs that do not
+        start at rest, unexplained drift, feedback from outputs to inputs, short runs and poor excitation. The data are
+        not changed.
 
         Parameters
         ----------
         structure : Structure, optional
-            What is to be identified: its free numbers are counted against the inputs' spectral lines.
+            Structure to identify: its free parameters are compared with the spectral lines of the inputs.
 
         Returns
         -------
         Advice
-            Prints as sentences; empty where nothing stands out.
+            Findings as sentences; empty if the checks find nothing.
         """
         from ftlm.validation.data_advice import advise
 
@@ -663,10 +675,10 @@ class Run(Measured):
     def to_csv(self, path: str | os.PathLike[str], *, force: bool = False) -> None:
         """Write this run to a csv file that `ftlm.load` reads back bit for bit, without being told the columns.
 
-        The first line is a comment, ``# ftlm-run 1`` and a JSON object that holds name, step, start, inputs, outputs,
-        units, intersample and warnings, and `about` where a rig made the run; then come a header ``t_s,…`` and the
-        rows, ``nan`` where an output was not read. `readings` stay behind: what is written is the grid. The file is
-        written beside its place and renamed, so a reader never sees half of it.
+        The first line is a comment, ``# ftlm-run 1`` and a JSON object with name, step, start, inputs, outputs, units,
+        intersample and warnings, and ``about`` for a run of a rig. A header ``t_s,…`` and the samples follow, with
+        ``nan`` for missing outputs. Only the samples on the grid are written, not `sample_times`. The file is written
+        under a temporary name and renamed, so that readers never see an incomplete file.
 
         Parameters
         ----------
@@ -687,7 +699,7 @@ class Run(Measured):
     def to_parquet(self, path: str | os.PathLike[str], *, force: bool = False) -> None:
         """Write this run to a parquet file that `ftlm.load` reads back bit for bit; needs pyarrow.
 
-        A column ``t_s`` and one a signal, float64; the header of `to_csv` is the metadata ``ftlm-run``.
+        The table has float64 columns ``t_s`` and one per signal; the metadata ``ftlm-run`` are the `to_csv` header.
 
         Parameters
         ----------
@@ -706,10 +718,9 @@ class Run(Measured):
         write_parquet(self, path, force=force)
 
     def to_frame(self) -> Any:
-        """Return the run as a pandas frame: a column a signal in SI units, the source time ``t_s`` [s] as its index.
+        """Return the run as a pandas frame: one column per signal in SI units, indexed by the source time ``t_s`` [s].
 
-        `Run.from_frame` takes it back. What is told of the signals stands in its ``attrs``: units, inputs, outputs,
-        intersample, name.
+        `Run.from_frame` reads it back. Its ``attrs`` hold units, inputs, outputs, intersample and name.
 
         Returns
         -------
@@ -741,10 +752,10 @@ class Run(Measured):
         return dataset_of(self)
 
     def _fields(self) -> dict[str, Any]:
-        return {f.name: getattr(self, f.name) for f in fields(Measured)}
+        return {f.name: getattr(self, f.name) for f in fields(RunData)}
 
     def _with(self, **changes: Any) -> Run:
-        return run_of(Measured(**{**self._fields(), **changes}))
+        return run_of(RunData(**{**self._fields(), **changes}))
 
     def _headline(self) -> str:
         return (
@@ -752,29 +763,29 @@ class Run(Measured):
             f"source time {self.start:.12g} s"
         )
 
-    def _described(self, name: str) -> str:
+    def _describe_signal(self, name: str) -> str:
         unit = f" [{self._units[name]}]" if self._units[name] else ""
         return name + unit + (f" {self._intersample[name]}" if name in self._intersample else "")
 
 
-def built(asked: Asked) -> Run:
-    """Check all that is asked of a run, and make it."""
-    return run_of(asked.measured())
+def build_run(asked: RunArguments) -> Run:
+    """Validate the arguments of a run and build it."""
+    return run_of(asked.build_run_data())
 
 
-def run_of(record: Measured) -> Run:
-    """Return a record of checked samples as what people hold."""
+def run_of(record: RunData) -> Run:
+    """Return validated run data as a :class:`Run`."""
     run = object.__new__(Run)
-    Measured.__init__(run, **{f.name: getattr(record, f.name) for f in fields(Measured)})
+    RunData.__init__(run, **{f.name: getattr(record, f.name) for f in fields(RunData)})
     return run
 
 
-#: Results that are kept with runs: those of the equations one by one and of the whole.
-MOST_KEPT = 8
+#: Cached results per set of runs: those of the single equations and of the whole structure.
+MAX_CACHED_RESULTS = 8
 
 
 def check_compatible(runs: Iterable[Run]) -> None:
-    """Refuse runs whose inputs, outputs or units differ; steps, lengths, holds and the order of signals may."""
+    """Raise if runs differ in inputs, outputs or units; steps, lengths, holds and signal order may differ."""
     every = list(runs)
     if not every:
         raise DataError("runs: there is none; pass at least one run")
@@ -784,7 +795,7 @@ def check_compatible(runs: Iterable[Run]) -> None:
         for role, mine, other in (("inputs", first.inputs, run.inputs), ("outputs", first.outputs, run.outputs)):
             if set(mine) != set(other):
                 raise DataError(
-                    f"{who} have different {role}: {listed(other)} and {listed(mine)}; "
+                    f"{who} have different {role}: {join_names(other)} and {join_names(mine)}; "
                     "use rename() and select() so that the names agree"
                 )
         units, first_units = run.units, first.units
@@ -798,15 +809,12 @@ def check_compatible(runs: Iterable[Run]) -> None:
 
 
 class Runs(tuple[Run, ...]):
-    """Runs that fit together, checked once; see :func:`as_runs`.
+    """Compatible runs with a cache of derived results; see :func:`as_runs`."""
 
-    What is computed from them time and again stays with them, read-only, and goes when they go.
-    """
-
-    _kept: dict[str, tuple[Any, ...]]
+    _cache: dict[str, tuple[Any, ...]]
 
     def __new__(cls, runs: Run | Iterable[Run]) -> Runs:
-        """Check them."""
+        """Validate the runs."""
         try:
             every = [runs] if isinstance(runs, Run) else list(runs)
         except TypeError:
@@ -818,28 +826,28 @@ class Runs(tuple[Run, ...]):
                 raise DataError(f"runs[{i}] is {type(run).__name__}, not a Run; use ftlm.load or Run.from_arrays")
         check_compatible(every)
         checked = super().__new__(cls, every)
-        checked._kept = {}
+        checked._cache = {}
         return checked
 
     def __reduce__(self) -> tuple[object, ...]:
         return Runs, (tuple(self),)
 
-    def keep(self, key: str, make: Callable[[], Iterable[Any]]) -> tuple[Any, ...]:
-        """Return what was made under this key, or make it; the oldest goes where there are too many."""
-        made = self._kept.get(key)
+    def get_or_compute(self, key: str, make: Callable[[], Iterable[Any]]) -> tuple[Any, ...]:
+        """Return the cached result of a key, or compute it; the oldest entry is evicted when the cache is full."""
+        made = self._cache.get(key)
         if made is None:
-            made = self._kept[key] = tuple(make())
-            for old in list(self._kept)[:-MOST_KEPT]:
-                self._kept.pop(old, None)
+            made = self._cache[key] = tuple(make())
+            for old in list(self._cache)[:-MAX_CACHED_RESULTS]:
+                self._cache.pop(old, None)
         return made
 
 
 def as_runs(runs: Run | Iterable[Run]) -> Runs:
-    """One run or several that fit together; what is checked passes untouched.
+    """Return one or several runs as validated :class:`Runs`; an instance is returned unchanged.
 
     Raises
     ------
     DataError
-        No run, something that is no run, or runs whose names or units differ.
+        No run, an object that is not a run, or runs with different signals or units.
     """
     return runs if isinstance(runs, Runs) else Runs(runs)

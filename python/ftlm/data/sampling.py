@@ -1,4 +1,4 @@
-"""Samples checked once: numbers, lengths, a regular time, a window, another step."""
+"""Sampling: regular time grids, data windows, intersample behavior, resampling, missing and nonuniform samples."""
 
 from __future__ import annotations
 
@@ -13,49 +13,50 @@ import numpy.typing as npt
 from numpy.typing import NDArray
 
 from ftlm.errors import DataError
-from ftlm.utils.validation import Floats, as_mapping, bad_rows, listed, nearest
+from ftlm.utils.validation import Floats, as_mapping, bad_rows, join_names, nearest
 
 Intersample: TypeAlias = Literal["zoh", "foh"]
-# Values are squared by every estimator; beyond this the square leaves double precision.
-LARGEST = 1e150
-FEWEST_ROWS = 3
-_MOST_ROWS = 50_000_000
-_SMALLEST_STEP, _LARGEST_STEP = 1e-30, 1e30
-_JITTER = 0.02
-_JITTER_WORTH_SAYING = 1e-3
-_GAP = 1.5
-# A limit typed by a person (1.1 s) must catch the row it names although t - t0 is off by a rounding error.
-_EDGE = 1e-6
-HELD: Intersample = "zoh"
+# Every estimator squares values; larger ones overflow in double precision.
+MAX_SAMPLE_VALUE = 1e150
+MIN_RUN_SAMPLES = 3
+_MAX_RUN_SAMPLES = 50_000_000
+_MIN_STEP_S, _MAX_STEP_S = 1e-30, 1e30
+_MAX_JITTER_SHARE = 0.02
+_MIN_REPORTED_JITTER_SHARE = 1e-3
+_GAP_STEP_RATIO = 1.5
+# A window limit such as 1.1 s must include its sample although t - t0 has a rounding error.
+_EDGE_TOLERANCE_STEPS = 1e-6
+ZERO_ORDER_HOLD: Intersample = "zoh"
 
 
-def grid_of(rows: int, step: float) -> Floats:
-    """Regular times from 0 [s]."""
+def uniform_times(rows: int, step: float) -> Floats:
+    """Uniform sample times from 0 [s], shape (rows,)."""
     return np.arange(rows, dtype=np.float64) * step
 
 
-def locked(values: Floats) -> Floats:
-    """Return numbers that nobody can change any more, without a copy."""
+def make_read_only(values: Floats) -> Floats:
+    """Return a read-only view of an array, without a copy."""
     owner = np.ascontiguousarray(values)
     if owner.flags.writeable:
         owner.setflags(write=False)
-    # A view of a locked array cannot be unlocked by the one who holds it.
+    # The caller cannot make a view of a read-only array writeable.
     return owner.view()
 
 
 def is_constant(values: Floats) -> bool:
-    """Whether all samples that are there are equal."""
+    """Whether all samples that are not missing are equal."""
     there = values[~np.isnan(values)]
     return bool((there == there[:1]).all())
 
 
-def checked_intersample(given: Mapping[str, str] | None, inputs: tuple[str, ...]) -> dict[str, Intersample]:
-    """Return what was said of inputs between rows, and refuse words that say nothing."""
+def check_intersample(given: Mapping[str, str] | None, inputs: tuple[str, ...]) -> dict[str, Intersample]:
+    """Return the intersample behavior of inputs; raise for unknown inputs or words."""
     checked: dict[str, Intersample] = {}
     for signal, kind in as_mapping("intersample", {} if given is None else given).items():
         if signal not in inputs:
             raise DataError(
-                f"intersample=: {signal!r} is not an input{nearest(signal, inputs)}; the inputs are {listed(inputs)}"
+                f"intersample=: {signal!r} is not an input{nearest(signal, inputs)}; the inputs are "
+                f"{join_names(inputs)}"
             )
         if kind != "zoh" and kind != "foh":  # noqa: PLR1714 — the type checker follows this
             raise DataError(
@@ -65,18 +66,18 @@ def checked_intersample(given: Mapping[str, str] | None, inputs: tuple[str, ...]
     return checked
 
 
-def checked_step(step: object, argument: str) -> float:
-    """Return a time between rows [s]."""
+def check_step(step: object, argument: str) -> float:
+    """Return a sampling interval [s]; raise if it is not positive and finite."""
     value = as_number(step)
     if value is None:
         raise DataError(f"{argument}={step!r} is not a number; give the time between rows in s")
-    if not _SMALLEST_STEP <= value <= _LARGEST_STEP:
+    if not _MIN_STEP_S <= value <= _MAX_STEP_S:
         raise DataError(f"{argument}={value!r} is not a positive, finite time; give the time between rows in s")
     return value
 
 
 def as_number(given: object) -> float | None:
-    """Return a real number as a float, infinity for one beyond its range, None for anything else."""
+    """Return a real number as a float: infinity on overflow, None if it is no number."""
     if isinstance(given, bool) or not isinstance(given, (int, float, np.integer, np.floating)):
         return None
     try:
@@ -86,7 +87,7 @@ def as_number(given: object) -> float | None:
 
 
 def as_vector(given: object, thing: str, *, gaps: bool = False) -> tuple[Floats, np.dtype[Any]]:
-    """Return a private float64 copy and the type the numbers came in; with gaps, what is masked or None is NaN."""
+    """Return a float64 copy of a vector and its original dtype; with `gaps`, masked values and None become NaN."""
     if gaps and isinstance(given, (list, tuple)):
         given = [np.nan if value is None else value for value in given]
     if gaps and np.ma.isMaskedArray(given) and np.asarray(given).dtype.kind in "biuf":
@@ -111,7 +112,7 @@ def as_vector(given: object, thing: str, *, gaps: bool = False) -> tuple[Floats,
             f"{thing}: shape {array.shape}, not one-dimensional; pass one column at a time, such as x[:, 0]"
         )
     if array.size == 0:
-        raise DataError(f"{thing}: empty, 0 rows; {FEWEST_ROWS} are needed")
+        raise DataError(f"{thing}: empty, 0 rows; {MIN_RUN_SAMPLES} are needed")
     if array.dtype.kind == "c":
         rows = np.flatnonzero(np.imag(array) != 0)
         first, count = (int(rows[0]), rows.size) if rows.size else (0, array.size)
@@ -123,14 +124,16 @@ def as_vector(given: object, thing: str, *, gaps: bool = False) -> tuple[Floats,
 
 
 def as_seconds(given: object, thing: str) -> tuple[Floats, str] | None:
-    """Return dates as seconds since the first and its words, lapses of time as seconds; None for anything else."""
+    """Convert dates to seconds since the first (and a note), time differences to seconds; None for other types."""
     try:
         array = np.asarray(given)
         first = array.flat[0] if array.dtype.kind == "O" and array.size else None
         if isinstance(first, datetime.date):
             # Dates with a time zone are in universal time then, as pandas knows and NumPy does not.
             plain = getattr(given, "dtype", None) is not None and array.dtype != getattr(given, "dtype", None)
-            array = np.asarray(given if plain else [_universal(moment) for moment in array.tolist()], "datetime64[ns]")
+            array = np.asarray(
+                given if plain else [_to_universal_time(moment) for moment in array.tolist()], "datetime64[ns]"
+            )
     except (ValueError, TypeError, OverflowError) as error:
         raise DataError(f"{thing}: not one date per row ({error}); pass datetime64, or seconds") from None
     if array.dtype.kind not in "mM" or array.ndim != 1 or array.size == 0:
@@ -146,8 +149,8 @@ def as_seconds(given: object, thing: str) -> tuple[Floats, str] | None:
     return nanoseconds.astype(np.int64) / 1e9, words
 
 
-def _universal(moment: Any) -> Any:
-    """A date in universal time, where it has a zone."""
+def _to_universal_time(moment: Any) -> Any:
+    """Convert a date with a time zone to UTC."""
     zone = getattr(moment, "tzinfo", None)
     return moment if zone is None else moment.astimezone(datetime.UTC).replace(tzinfo=None)
 
@@ -157,7 +160,7 @@ def _not_numbers(given: object, array: npt.NDArray[Any], thing: str) -> DataErro
         return bad_rows(thing, f"dates, not numbers ({array.dtype})", 0, array.size, "convert them to seconds first")
     if array.ndim == 0:
         return DataError(f"{thing}: {_short(array.item())} is not an array; pass one number per row")
-    # A list of numbers and words has become an array of words; the list still tells them apart.
+    # NumPy turns a list of numbers and text into an array of text; the list still distinguishes them.
     flat = list(given) if isinstance(given, (list, tuple)) and array.ndim == 1 else array.ravel().tolist()
     bad = [index for index, value in enumerate(flat) if not isinstance(value, (int, float, np.number, np.bool_))]
     if not bad:
@@ -173,7 +176,7 @@ def _short(value: object) -> str:
 
 
 def check_lengths(lengths: Mapping[str, int]) -> None:
-    """Refuse columns of different lengths; what most of them have is taken as right."""
+    """Raise if columns differ in length; the most frequent length is the expected one."""
     counts = list(lengths.values())
     expected = max(set(counts), key=lambda count: (counts.count(count), count))
     wrong = [(thing, count) for thing, count in lengths.items() if count != expected]
@@ -185,8 +188,8 @@ def check_lengths(lengths: Mapping[str, int]) -> None:
         )
 
 
-def trend_of(values: Floats, step: float, *, linear: bool) -> tuple[Callable[[Floats], Floats], str]:
-    """The mean of samples or their line of least squares as a function of time, and in words."""
+def fit_trend(values: Floats, step: float, *, linear: bool) -> tuple[Callable[[Floats], Floats], str]:
+    """Fit the mean or the least-squares line of a signal: a function of time [s] and its text."""
     there = ~np.isnan(values)
     mean = float(np.mean(values[there]))
     if not linear:
@@ -202,12 +205,12 @@ def trend_of(values: Floats, step: float, *, linear: bool) -> tuple[Callable[[Fl
 def check_values(
     values: Floats, thing: str, offset: int, *, gaps: bool = False, instead: str = "avoid them with slice="
 ) -> None:
-    """Refuse what is not finite, and numbers whose squares overflow; ``offset`` is the number of the first row.
+    """Raise for values that are not finite or whose squares overflow; ``offset`` is the number of the first row.
 
-    With gaps, NaN is let pass; ``instead`` is the other way out for what is NaN.
+    With `gaps`, NaN is accepted. ``instead`` is the second remedy in the error message for NaN.
     """
     with np.errstate(invalid="ignore"):
-        good = np.abs(values) <= LARGEST
+        good = np.abs(values) <= MAX_SAMPLE_VALUE
     if gaps:
         good |= np.isnan(values)
     if good.all():
@@ -219,12 +222,12 @@ def check_values(
         raise bad_rows(thing, "NaN", first, count, f"remove or fill these rows yourself, or {instead}")
     if math.isinf(value):
         raise bad_rows(thing, f"infinity ({value})", first, count, "correct these rows, or avoid them with slice=")
-    what = f"{value!r} is larger than {LARGEST:g} and its square overflows"
+    what = f"{value!r} is larger than {MAX_SAMPLE_VALUE:g} and its square overflows"
     raise bad_rows(thing, what, first, count, "correct these rows, scale the signal, or avoid them with slice=")
 
 
 def check_increasing(clock: Floats, thing: str, offset: int) -> None:
-    """Refuse a time that stands still or goes back."""
+    """Raise if the sample times are not strictly increasing."""
     steps = np.diff(clock)
     if (steps > 0).all():
         return
@@ -240,18 +243,18 @@ def check_increasing(clock: Floats, thing: str, offset: int) -> None:
 def regular_step(
     clock: Floats, thing: str, offset: int, resolution: float, known: float | None
 ) -> tuple[float, tuple[str, ...]]:
-    """Return the step of a regular time, in digits that read well, and what there is to say of its jitter."""
+    """Return the step [s] of a regular time axis, rounded to a short decimal, and a note on its jitter."""
     count = clock.size - 1
     since = clock - clock[0]
     mean = float(since[-1]) / count
-    if not _SMALLEST_STEP <= mean <= _LARGEST_STEP:
+    if not _MIN_STEP_S <= mean <= _MAX_STEP_S:
         raise DataError(f"{thing}: the mean step {mean!r} s cannot be used; check the unit of the time")
-    deviation = np.abs(since - grid_of(clock.size, mean))
+    deviation = np.abs(since - uniform_times(clock.size, mean))
     worst = float(deviation.max())
-    if worst > _JITTER * mean:
+    if worst > _MAX_JITTER_SHARE * mean:
         steps = np.diff(clock)
         usual = float(np.median(steps))
-        gaps = np.flatnonzero(steps > _GAP * usual)
+        gaps = np.flatnonzero(steps > _GAP_STEP_RATIO * usual)
         if gaps.size:
             what = f"gap of {steps[gaps[0]]:.6g} s where {usual:.6g} s is usual"
             way_out = (
@@ -259,12 +262,12 @@ def regular_step(
                 "the inputs on a regular grid with resample=STEP"
             )
             raise bad_rows(thing, what, offset + int(gaps[0]) + 1, gaps.size, way_out)
-        rows = np.flatnonzero(deviation > _JITTER * mean)
-        share = f"{100.0 * worst / mean:.3g} % of the mean step {mean:.6g} s ({100 * _JITTER:g} % allowed)"
+        rows = np.flatnonzero(deviation > _MAX_JITTER_SHARE * mean)
+        share = f"{100.0 * worst / mean:.3g} % of the mean step {mean:.6g} s ({100 * _MAX_JITTER_SHARE:g} % allowed)"
         way_out = "put the inputs on a regular grid with resample=STEP; outputs are compared when they were read"
         raise bad_rows(thing, f"jitter of up to {share}", offset + int(rows[0]), rows.size, way_out)
     fact: tuple[str, ...] = ()
-    if worst > _JITTER_WORTH_SAYING * mean:
+    if worst > _MIN_REPORTED_JITTER_SHARE * mean:
         row = offset + int(deviation.argmax())
         share = f"{100.0 * worst / mean:.2g} % of a step, the most at row {row}"
         fact = (f"time jitters by up to {share}; it was taken as regular",)
@@ -279,7 +282,7 @@ def regular_step(
 
 
 def _short_decimal(mean: float, count: int, rounding: float, observed: float) -> float:
-    """Return the shortest decimal number that explains the times as well as their mean step does, or the mean step."""
+    """Return the shortest decimal step consistent with the sample times, or the mean step."""
     for digits in range(12):
         short = float(f"{mean:.{digits}e}")
         drift = abs(short - mean) * count
@@ -289,7 +292,7 @@ def _short_decimal(mean: float, count: int, rounding: float, observed: float) ->
 
 
 def window_rows(clock: Floats, window: object, argument: str, thing: str = "time") -> tuple[int, int]:
-    """Return the first row and the row after the last one of start ≤ t < stop."""
+    """Return the half-open range of rows with start ≤ t < stop."""
     if not isinstance(window, Sequence) or isinstance(window, str) or len(window) != 2:
         raise DataError(f"{argument}={window!r} is not a pair (start, stop) of seconds; use None for an open end")
     limits: list[float | None] = []
@@ -309,49 +312,51 @@ def window_rows(clock: Floats, window: object, argument: str, thing: str = "time
     with np.errstate(over="ignore", invalid="ignore"):
         since = clock - clock[0]
         steps = np.diff(since)
-        # The median is the step although there may be a gap, a repeated or a missing time.
+        # The median interval is robust against gaps and repeated or missing times.
         steps = steps[np.isfinite(steps) & (steps > 0)]
         step = float(np.median(steps)) if steps.size else 0.0
         whole = float(since[-1]) + step
     way_out = f"the record has times from 0 to {whole:.12g} s since its first row"
     for limit in (start, stop):
-        if limit is not None and not -_EDGE * step <= limit <= whole + _EDGE * step:
+        if limit is not None and not -_EDGE_TOLERANCE_STEPS * step <= limit <= whole + _EDGE_TOLERANCE_STEPS * step:
             raise DataError(f"{argument}: limit {limit!r} s is out of range; {way_out}")
     low = 0.0 if start is None else start
     high = math.inf if stop is None else stop
     if low >= high:
         raise DataError(f"{argument}: the limits {start!r} and {stop!r} s do not increase; {way_out}")
     with np.errstate(invalid="ignore"):
-        rows = np.flatnonzero((since >= low - _EDGE * step) & (since < high - _EDGE * step))
+        rows = np.flatnonzero(
+            (since >= low - _EDGE_TOLERANCE_STEPS * step) & (since < high - _EDGE_TOLERANCE_STEPS * step)
+        )
     if rows.size == 0:
         raise DataError(f"{argument}: no row lies between {start!r} and {stop!r} s; {way_out}")
     return int(rows[0]), int(rows[-1]) + 1
 
 
 def check_rows(since: Floats, step: float) -> int:
-    """Return how many rows of this step a record has, and refuse too many or too few."""
+    """Return the number of samples at a new step; raise if there are too many or too few."""
     spans = float(since[-1]) / step
-    if spans + 1 > _MOST_ROWS:
-        raise DataError(f"resample={step!r} gives more than {_MOST_ROWS} rows; use a larger step")
-    rows = math.floor(spans + _EDGE) + 1
-    if rows < FEWEST_ROWS:
-        raise DataError(f"resample={step!r} leaves {rows} rows, {FEWEST_ROWS} are needed; use a smaller step")
+    if spans + 1 > _MAX_RUN_SAMPLES:
+        raise DataError(f"resample={step!r} gives more than {_MAX_RUN_SAMPLES} rows; use a larger step")
+    rows = math.floor(spans + _EDGE_TOLERANCE_STEPS) + 1
+    if rows < MIN_RUN_SAMPLES:
+        raise DataError(f"resample={step!r} leaves {rows} rows, {MIN_RUN_SAMPLES} are needed; use a smaller step")
     return rows
 
 
 def is_regular(since: Floats) -> bool:
-    """Whether rows keep to a regular step."""
+    """Whether sample times are regular within the jitter tolerance."""
     step = float(since[-1]) / (since.size - 1)
-    return bool(np.abs(since - grid_of(since.size, step)).max() <= _JITTER * step)
+    return bool(np.abs(since - uniform_times(since.size, step)).max() <= _MAX_JITTER_SHARE * step)
 
 
-def interpolated(
+def resample_uniform(
     since: Floats, data: Mapping[str, Floats], behaviour: Mapping[str, Intersample], step: float
 ) -> dict[str, Floats]:
-    """Return signals on another step: of held inputs the mean of the hold over each new interval, all else linearly."""
+    """Resample to another step: interval means of held inputs, linear interpolation of other signals."""
     rows = check_rows(since, step)
-    grid = grid_of(rows, step)
-    pieces = Pieces.of(since, rows, step)
+    grid = uniform_times(rows, step)
+    pieces = HoldSegments.of(since, rows, step)
     return {
         signal: pieces.means(values) if behaviour.get(signal) == "zoh" else np.interp(grid, since, values)
         for signal, values in data.items()
@@ -359,52 +364,52 @@ def interpolated(
 
 
 @dataclass(frozen=True)
-class Pieces:
-    """New intervals cut at the old rows: the row each piece holds, its share of a step, where each interval begins."""
+class HoldSegments:
+    """Segments of new intervals split at old samples: old row, share of a step, first segment of each interval."""
 
     row: npt.NDArray[np.intp]
     share: Floats
     first: npt.NDArray[np.intp]
 
     @classmethod
-    def of(cls, since: Floats, rows: int, step: float) -> Pieces:
-        """Cut; an old row within rounding of a new one counts as there. The last row holds on."""
-        edges = grid_of(rows + 1, step)
+    def of(cls, since: Floats, rows: int, step: float) -> HoldSegments:
+        """Split the new intervals; old samples within rounding of a new one coincide. The last value is held."""
+        edges = uniform_times(rows + 1, step)
         place = np.searchsorted(edges, since, side="left")
         near = np.minimum(place, rows)
-        near = np.where((near > 0) & (np.abs(edges[near - 1] - since) <= _EDGE * step), near - 1, near)
-        snapped = np.where(np.abs(edges[near] - since) <= _EDGE * step, edges[near], since)
+        near = np.where((near > 0) & (np.abs(edges[near - 1] - since) <= _EDGE_TOLERANCE_STEPS * step), near - 1, near)
+        snapped = np.where(np.abs(edges[near] - since) <= _EDGE_TOLERANCE_STEPS * step, edges[near], since)
         cuts = np.unique(np.concatenate([edges, snapped[snapped < edges[-1]]]))
         row = np.searchsorted(snapped, cuts[:-1], side="right") - 1
         return cls(row, np.diff(cuts) / step, np.searchsorted(cuts, edges[:-1]))
 
     def means(self, values: Floats) -> Floats:
-        """Exact means of a hold; what does not change within an interval keeps its bits."""
+        """Exact interval means of a zero-order hold; bit-exact where the value is constant within an interval."""
         begin = values[self.row[self.first]]
         counts = np.diff(np.append(self.first, self.row.size))
         risen = (values[self.row] - np.repeat(begin, counts)) * self.share
         return np.asarray(begin + np.add.reduceat(risen, self.first))
 
 
-def how_interpolated(behaviour: Mapping[str, Intersample]) -> str:
-    """Say what :func:`interpolated` does to each signal."""
+def describe_interpolation(behaviour: Mapping[str, Intersample]) -> str:
+    """Describe how :func:`resample_uniform` treats each signal."""
     held = [signal for signal, kind in behaviour.items() if kind == "zoh"]
     means = f"held: {', '.join(held)}, by means over the new intervals; " if held else ""
     return f"{means}others linear; no anti-alias filter"
 
 
-#: What becomes of rows and cells that are not there.
-Missing = Literal["refuse", "weight", "hold"]
-MISSING: tuple[Missing, ...] = ("refuse", "weight", "hold")
-#: Rows lie on a grid with holes where each is within this share of a step of a place on it.
-ON_GRID = 0.02
-#: A row within this share of the duration of a grid's end is there.
-_THERE = 1e-12
+#: Treatment of missing samples: raise, give outputs no weight, or hold inputs as well.
+MissingPolicy = Literal["refuse", "weight", "hold"]
+MISSING_POLICIES: tuple[MissingPolicy, ...] = ("refuse", "weight", "hold")
+#: Largest distance from a grid point, in steps, of samples on a regular grid with gaps.
+GRID_TOLERANCE_STEPS = 0.02
+#: Relative tolerance of comparisons of times, as a share of the duration.
+_RELATIVE_TIME_TOLERANCE = 1e-12
 
 
-def checked_missing(given: object) -> Missing:
-    """Return what to do about what is missing, and refuse words that say nothing."""
-    for known in MISSING:
+def check_missing_policy(given: object) -> MissingPolicy:
+    """Return the treatment of missing samples; raise for an unknown word."""
+    for known in MISSING_POLICIES:
         if given == known:
             return known
     raise DataError(
@@ -413,18 +418,18 @@ def checked_missing(given: object) -> Missing:
     )
 
 
-def unread(values: Floats) -> NDArray[np.bool_]:
-    """Rows that hold no value."""
+def missing_mask(values: Floats) -> NDArray[np.bool_]:
+    """Boolean mask of missing samples (NaN)."""
     return np.asarray(np.isnan(values))
 
 
-def read(values: Floats) -> Floats:
-    """The values that are there."""
+def drop_missing(values: Floats) -> Floats:
+    """Return the values without missing samples (NaN)."""
     return values[~np.isnan(values)]
 
 
-def bridged(values: Floats) -> Floats:
-    """Samples with straight lines over what is missing, the nearest value at the ends; what is whole stays as it is."""
+def interpolate_gaps(values: Floats) -> Floats:
+    """Interpolate missing samples linearly; use the nearest value at the ends."""
     gone = np.isnan(values)
     if not gone.any() or gone.all():
         return values
@@ -432,95 +437,97 @@ def bridged(values: Floats) -> Floats:
     return np.asarray(np.where(gone, np.interp(rows, rows[~gone], values[~gone]), values))
 
 
-def held(values: Floats, kind: Intersample) -> Floats:
-    """An input that goes on where it is not known: with its last value, or in a straight line where it is linear."""
-    if kind != HELD:
-        return bridged(values)
+def fill_input_gaps(values: Floats, kind: Intersample) -> Floats:
+    """Fill missing input samples: last value for a zero-order hold, else linear interpolation."""
+    if kind != ZERO_ORDER_HOLD:
+        return interpolate_gaps(values)
     gone = np.isnan(values)
     last = np.maximum.accumulate(np.where(gone, 0, np.arange(values.size)))
     return np.asarray(values[last])
 
 
-def places_on_grid(times: Floats) -> tuple[NDArray[np.intp], float] | None:
-    """Place of each row on a regular grid with holes, and its step; None where rows do not lie on one."""
+def grid_positions(times: Floats) -> tuple[NDArray[np.intp], float] | None:
+    """Fit a regular grid with gaps: index of each sample and the step [s]; None if there is no such grid."""
     since = times - times[0]
     usual = float(np.median(np.diff(since)))
     step = usual
-    # The first step is off by rounding; the whole record tells it better each time.
+    # The median interval is affected by rounding; each pass refines the step by least squares.
     for _ in range(4):
         places = np.rint(since / step).astype(np.intp)
         if places[-1] <= 0:
             return None
         step = float(since @ places) / float(places @ places)
     off = np.abs(since - places * step)
-    if off.max() > ON_GRID * step or (np.diff(places) <= 0).any():
+    if off.max() > GRID_TOLERANCE_STEPS * step or (np.diff(places) <= 0).any():
         return None
     return places, step
 
 
 @dataclass(frozen=True, eq=False)
-class Readings:
-    """Rows at times of their own: commands and outputs as they were recorded, not as a grid has them.
+class NonuniformSamples:
+    """Nonuniform samples: inputs and outputs at the times at which they were recorded.
 
     Parameters
     ----------
     times
-        When each row was recorded [s since the first row of the run's grid], ascending from 0.
+        Sample times [s since the first sample of the run's grid], ascending from 0.
     data
-        Values by signal; outputs are NaN where they were not read.
+        Values by signal; missing output samples are NaN.
     """
 
     times: Floats
     data: dict[str, Floats]
 
     def means(self, name: str, kind: Intersample, m: int, duration: float, delay: float, before: float) -> Floats:
-        """Exact means of an input over m equal pulses of the duration, after a delay [s]."""
-        times, values = self._late(name, delay, before)
+        """Block-pulse coefficients of an input: exact means over m equal intervals, after a delay [s]."""
+        times, values = self._apply_delay(name, delay, before)
         step = duration / m
-        if kind == HELD:
-            return Pieces.of(times, m, step).means(values)
-        edges = grid_of(m + 1, step)
+        if kind == ZERO_ORDER_HOLD:
+            return HoldSegments.of(times, m, step).means(values)
+        edges = uniform_times(m + 1, step)
         area = np.concatenate([[0.0], np.cumsum(0.5 * (values[1:] + values[:-1]) * np.diff(times))])
         row = np.clip(np.searchsorted(times, edges, side="right") - 1, 0, times.size - 1)
         there = np.interp(edges, times, values)
         return np.asarray(np.diff(area[row] + 0.5 * (values[row] + there) * (edges - times[row])) / step)
 
     def jumps(self, name: str, delay: float, before: float) -> tuple[Floats, Floats]:
-        """Times [s] and sizes of the jumps of a held input, the one from nothing at the start included."""
-        times, values = self._late(name, delay, before)
+        """Times [s] and heights of the jumps of a held input, including the jump from 0 at the start."""
+        times, values = self._apply_delay(name, delay, before)
         return times, np.diff(values, prepend=0.0)
 
     def at(self, name: str, kind: Intersample, times: Floats, delay: float, before: float) -> Floats:
-        """Values of an input at some times, after it has changed there."""
-        own, values = self._late(name, delay, before)
-        if kind != HELD:
+        """Values of an input at given times; at a jump, the value after it."""
+        own, values = self._apply_delay(name, delay, before)
+        if kind != ZERO_ORDER_HOLD:
             return np.asarray(np.interp(times, own, values))
-        # A time and a switch that are one but for rounding are one.
-        slack = _THERE * max(float(own[-1]), 1e-300)
+        # Times that differ from a switching instant only by rounding count as equal.
+        slack = _RELATIVE_TIME_TOLERANCE * max(float(own[-1]), 1e-300)
         return np.asarray(values[np.maximum(np.searchsorted(own, times + slack, side="right") - 1, 0)])
 
-    def _late(self, name: str, delay: float, before: float) -> tuple[Floats, Floats]:
+    def _apply_delay(self, name: str, delay: float, before: float) -> tuple[Floats, Floats]:
         if not delay:
             return self.times, self.data[name]
         return np.append(0.0, self.times + delay), np.append(before, self.data[name])
 
-    def compared(self, duration: float) -> NDArray[np.intp]:
-        """Rows within a grid of this duration."""
-        return np.flatnonzero(self.times <= duration * (1.0 + _THERE))
+    def indices_within(self, duration: float) -> NDArray[np.intp]:
+        """Indices of the samples within a duration [s]."""
+        return np.flatnonzero(self.times <= duration * (1.0 + _RELATIVE_TIME_TOLERANCE))
 
-    def on(self, behaviour: Mapping[str, Intersample], step: float) -> dict[str, Floats]:
-        """All signals on a regular grid: held inputs by their means over each interval, all else in straight lines."""
+    def resample(self, behaviour: Mapping[str, Intersample], step: float) -> dict[str, Floats]:
+        """Resample to a regular grid: interval means of held inputs, linear interpolation of other signals."""
         rows = int(np.floor(float(self.times[-1]) / step + 1e-6)) + 1
-        grid, pieces = grid_of(rows, step), Pieces.of(self.times, rows, step)
+        grid, pieces = uniform_times(rows, step), HoldSegments.of(self.times, rows, step)
         return {
             name: pieces.means(values)
-            if behaviour.get(name) == HELD
-            else np.interp(grid, self.times[~np.isnan(values)], read(values))
+            if behaviour.get(name) == ZERO_ORDER_HOLD
+            else np.interp(grid, self.times[~np.isnan(values)], drop_missing(values))
             for name, values in self.data.items()
         }
 
-    def part(self, behaviour: Mapping[str, Intersample], start: float, stop: float, step: float) -> Readings:
-        """Rows from one time to another [s], and what the inputs were when they began."""
+    def cut_window(
+        self, behaviour: Mapping[str, Intersample], start: float, stop: float, step: float
+    ) -> NonuniformSamples:
+        """Return the samples between two times [s], with the input values at the start."""
         tiny = 1e-9 * step
         kept = np.flatnonzero((self.times >= start - tiny) & (self.times <= stop + step))
         times, data = np.maximum(self.times[kept] - start, 0.0), {n: v[kept] for n, v in self.data.items()}
@@ -531,20 +538,20 @@ class Readings:
                 kind = behaviour.get(name)
                 first = np.array([np.nan]) if kind is None else self.at(name, kind, begin, 0.0, 0.0)
                 data[name] = np.append(first, data[name])
-        return Readings(times, data)
+        return NonuniformSamples(times, data)
 
-    def changed(self, **changes: Any) -> Readings:
-        """The same rows with other signals."""
-        return Readings(self.times, {**self.data, **changes})
-
-
-def few_read(values: Floats) -> bool:
-    """Whether too few values are there for anything."""
-    return int(np.sum(~np.isnan(values))) < FEWEST_ROWS
+    def replace_signals(self, **changes: Any) -> NonuniformSamples:
+        """Return a copy with some signals replaced."""
+        return NonuniformSamples(self.times, {**self.data, **changes})
 
 
-def said_missing(thing: str, gone: NDArray[np.bool_], what: str) -> str:
-    """What is missing of a signal, and what becomes of it, in a sentence."""
+def has_too_few_values(values: Floats) -> bool:
+    """Whether fewer than the required number of samples are present."""
+    return int(np.sum(~np.isnan(values))) < MIN_RUN_SAMPLES
+
+
+def describe_missing(thing: str, gone: NDArray[np.bool_], what: str) -> str:
+    """Describe the missing samples of a signal and their treatment, as one sentence."""
     first, count = int(np.flatnonzero(gone)[0]), int(gone.sum())
     rows = "row holds" if count == 1 else "rows hold"
     return f"{thing}: {count} of {gone.size} {rows} no value, the first is row {first}; {what}"

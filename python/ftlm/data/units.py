@@ -1,4 +1,4 @@
-"""Units of signals and of time, and their SI values."""
+"""Units of signals and of time, with SI conversion factors."""
 
 from __future__ import annotations
 
@@ -8,10 +8,10 @@ import unicodedata
 from collections.abc import Mapping
 
 from ftlm.errors import DataError
-from ftlm.utils.validation import as_mapping, listed, nearest
+from ftlm.utils.validation import as_mapping, join_names, nearest
 
-#: SI unit of each unit that a person may write, and its value in it.
-UNITS: dict[str, tuple[str, float]] = {
+#: SI unit and conversion factor of each accepted signal unit.
+SIGNAL_UNITS: dict[str, tuple[str, float]] = {
     "": ("", 1.0),
     "1": ("1", 1.0),
     "rad": ("rad", 1.0),
@@ -59,8 +59,8 @@ UNITS: dict[str, tuple[str, float]] = {
 }
 TIME_UNITS: dict[str, float] = {"s": 1.0, "ms": 1e-3, "us": 1e-6, "µs": 1e-6, "min": 60.0, "h": 3600.0}
 
-#: Other ways to write them in the header of a column, without capitals.
-_WRITTEN = {
+#: Spellings of time units in column headers, case-folded.
+_TIME_UNIT_ALIASES = {
     **{unit: unit for unit in TIME_UNITS},
     "μs": "us",  # the letter mu, into which casefold turns the micro sign
     **dict.fromkeys(("sec", "secs", "second", "seconds"), "s"),
@@ -79,8 +79,8 @@ _WRITTEN = {
     "std": "h",
     "mikrosekunden": "us",
 }
-#: Other ways to write units of signals in files, without capitals and spaces; of those of "" nothing is converted.
-_SPELLED = {
+#: Spellings of signal units in files, case-folded and without spaces; "" marks known units without conversion.
+_SIGNAL_UNIT_ALIASES = {
     **{
         name: unit
         for unit, names in {
@@ -154,58 +154,58 @@ _SPELLED = {
         "",
     ),
 }
-_BRACKETED = re.compile(r"(.*?)\s*\[\s*([^\[\]]*?)\s*\]")
-_OTHERWISE = re.compile(r"(.+?)(?:\s*\(\s*([^()]*?)\s*\)|\s*[/,]\s*(\S+)|\s+in\s+(\S+)|_(\S+))")
-_LONGEST_UNIT = 24
+_BRACKETED_UNIT_PATTERN = re.compile(r"(.*?)\s*\[\s*([^\[\]]*?)\s*\]")
+_UNBRACKETED_UNIT_PATTERN = re.compile(r"(.+?)(?:\s*\(\s*([^()]*?)\s*\)|\s*[/,]\s*(\S+)|\s+in\s+(\S+)|_(\S+))")
+_MAX_UNIT_CHARACTERS = 24
 _TIME_NAMES = frozenset(("t", "time", "seconds"))
 
 
-def header_time(name: str) -> tuple[str, str | None]:
-    """Split the name of a column of times into what it is called, without capitals, and the unit that it states.
+def split_time_header(name: str) -> tuple[str, str | None]:
+    """Split the header of a time column into its case-folded name and its unit.
 
-    The unit is one of :data:`TIME_UNITS`, None where none is stated, and as it stands where square brackets hold
-    something else. Written as in ``time [ms]``, ``time (ms)``, ``time/ms``, ``time, ms``, ``time in ms``, ``time_ms``.
+    The unit is a key of :data:`TIME_UNITS`, None if there is none, or the literal text of square brackets with another
+    unit. Accepted forms: ``time [ms]``, ``time (ms)``, ``time/ms``, ``time, ms``, ``time in ms``, ``time_ms``.
     """
     folded = " ".join(name.split()).casefold()  # runs of spaces would cost their cube below
-    bracketed = _BRACKETED.fullmatch(folded)
+    bracketed = _BRACKETED_UNIT_PATTERN.fullmatch(folded)
     if bracketed and bracketed[2]:
-        return bracketed[1], _WRITTEN.get(bracketed[2].rstrip("."), bracketed[2])
-    otherwise = _OTHERWISE.fullmatch(folded)
+        return bracketed[1], _TIME_UNIT_ALIASES.get(bracketed[2].rstrip("."), bracketed[2])
+    otherwise = _UNBRACKETED_UNIT_PATTERN.fullmatch(folded)
     stated = "" if otherwise is None else next((part for part in otherwise.groups()[1:] if part), "")
-    unit = _WRITTEN.get(stated.rstrip("."))
+    unit = _TIME_UNIT_ALIASES.get(stated.rstrip("."))
     return (folded, None) if otherwise is None or unit is None else (otherwise[1], unit)
 
 
-def spelled_unit(word: str) -> str | None:
-    """The unit of :data:`UNITS` that a word in a file means, "" where it is one of no conversion, None where none.
+def parse_unit(word: str) -> str | None:
+    """Return the key of :data:`SIGNAL_UNITS` for a unit in a file: "" if it has no conversion, None if unknown.
 
-    Short ones by their letters, since m and M differ; words without capitals; ``deg.``, ``N m`` and ``º`` as meant.
+    Short symbols are case-sensitive (m and M differ), words are not. ``deg.``, ``N m`` and ``º`` are normalized.
     """
-    if len(word) > _LONGEST_UNIT:
+    if len(word) > _MAX_UNIT_CHARACTERS:
         return None
     # The ordinal sign and the ring are typed for the degree; Ω and µ have two signs each.
     text = unicodedata.normalize("NFC", word.replace("º", "°").replace("˚", "°")).replace("μ", "µ").replace(" ", "")
     text = text.rstrip(".").replace("⁻¹", "^-1").replace("³", "3")
-    if text in UNITS:
+    if text in SIGNAL_UNITS:
         return text or None
     folded = text.casefold()
-    return "" if folded in _WRITTEN else _SPELLED.get(folded)
+    return "" if folded in _TIME_UNIT_ALIASES else _SIGNAL_UNIT_ALIASES.get(folded)
 
 
 def is_time_name(name: str) -> bool:
-    """Whether a column is called the time: t, time or seconds, with or without a unit."""
-    return header_time(name)[0] in _TIME_NAMES
+    """Whether a column name means time: t, time or seconds, with or without a unit."""
+    return split_time_header(name)[0] in _TIME_NAMES
 
 
 def time_unit_of(name: str, label: str, given: str | None) -> tuple[str, tuple[str, ...]]:
-    """Return the unit of a column of times, and what a run is to say of it.
+    """Return the unit of a time column, and a note for the run.
 
     Parameters
     ----------
     name, label
-        The column's own name, and what errors call it.
+        Name of the column, and its label in error messages.
     given
-        The unit that a person states, or None.
+        Unit given by the user, or None.
 
     Raises
     ------
@@ -213,15 +213,15 @@ def time_unit_of(name: str, label: str, given: str | None) -> tuple[str, tuple[s
         Two units that contradict each other, or a unit in the header that is not known where none is given.
     """
     if given is not None and (not isinstance(given, str) or given not in TIME_UNITS):
-        raise DataError(f"time_unit={given!r} is unknown; the known ones are {listed(TIME_UNITS)}")
-    stated = header_time(name)[1]
+        raise DataError(f"time_unit={given!r} is unknown; the known ones are {join_names(TIME_UNITS)}")
+    stated = split_time_header(name)[1]
     if stated is None:
         return given or "s", ()
     if stated not in TIME_UNITS:
         if given is None:
             raise DataError(
                 f"{label}: its header states the unit {stated!r}, which is unknown; the known ones are "
-                f"{listed(TIME_UNITS)}; say with time_unit= in which the numbers are"
+                f"{join_names(TIME_UNITS)}; say with time_unit= in which the numbers are"
             )
         return given, ()
     if given is not None and TIME_UNITS[given] != TIME_UNITS[stated]:
@@ -232,26 +232,26 @@ def time_unit_of(name: str, label: str, given: str | None) -> tuple[str, tuple[s
     return stated, () if stated == "s" else (f"time read in {stated}, as the header {name!r} says",)
 
 
-def checked_units(units: Mapping[str, str] | None, signals: tuple[str, ...]) -> dict[str, tuple[str, float]]:
-    """Return SI unit and factor of every signal; one without a unit is taken as it is."""
+def check_units(units: Mapping[str, str] | None, signals: tuple[str, ...]) -> dict[str, tuple[str, float]]:
+    """Return SI unit and conversion factor of every signal; a signal without a unit is not converted."""
     given = as_mapping("units", {} if units is None else units)
     for signal, unit in given.items():
         if signal not in signals:
             raise DataError(
-                f"units=: {signal!r} is not a signal{nearest(signal, signals)}; the signals are {listed(signals)}"
+                f"units=: {signal!r} is not a signal{nearest(signal, signals)}; the signals are {join_names(signals)}"
             )
-        if not isinstance(unit, str) or unit not in UNITS:
+        if not isinstance(unit, str) or unit not in SIGNAL_UNITS:
             raise DataError(
-                f"unit {unit!r} of signal {signal!r} is unknown{nearest(unit, UNITS)}; "
-                f"the known units are {listed(UNITS, len(UNITS))}; convert other data before loading"
+                f"unit {unit!r} of signal {signal!r} is unknown{nearest(unit, SIGNAL_UNITS)}; "
+                f"the known units are {join_names(SIGNAL_UNITS, len(SIGNAL_UNITS))}; convert other data before loading"
             )
-    return {signal: UNITS[str(given.get(signal, ""))] for signal in signals}
+    return {signal: SIGNAL_UNITS[str(given.get(signal, ""))] for signal in signals}
 
 
 def coefficient_unit(units: Mapping[str, str], output: str, alpha: float, signal: str, order: float) -> str:
     """Unit of the coefficient of D^order of a signal in the equation of D^alpha of an output, ``s^-1.8 rad/A``.
 
-    Empty where the unit of one of two signals is not known, and where there is none.
+    Empty if the unit of a signal is unknown or the coefficient is dimensionless.
     """
     seconds = round(order - alpha, 4)
     time = "" if seconds == 0 else f"s^{seconds:g}"

@@ -12,20 +12,20 @@ from ftlm.data.run import Run
 from ftlm.errors import DataError, ModelError
 from ftlm.estimation.estimators import Fit
 from ftlm.structure.structure import Structure
-from ftlm.utils.linalg import solved
+from ftlm.utils.linalg import minimum_norm_solution
 from ftlm.utils.statistics import autoregression, is_constant
 from ftlm.utils.validation import Floats, nearest
-from ftlm.validation.residual_tests import LAGS, past_columns
+from ftlm.validation.residual_tests import DEFAULT_LAGS, past_regressors
 
 #: Numbers of reference lags with a coefficient of their own, and fewest samples of the shortest run for each. Earlier
 #: samples are averaged over blocks of growing width.
-DENSE = (3, 6, 12, 25, 50, 100)
-ROWS_A_SAMPLE = 15
+DENSE_LAG_COUNTS = (3, 6, 12, 25, 50, 100)
+MIN_ROWS_PER_LAG = 15
 #: Smallest first-stage F statistic of a strong instrument (Staiger and Stock, doi:10.2307/2171753).
-WEAK = 10.0
+MIN_FIRST_STAGE_F = 10.0
 
 
-def driven_by(runs: Sequence[Run], structure: Structure, reference: str) -> tuple[list[Run], list[str]]:
+def instrument_runs(runs: Sequence[Run], structure: Structure, reference: str) -> tuple[list[Run], list[str]]:
     """Return runs whose inputs are replaced by their part explained by a reference, and warnings.
 
     Controller and loop form one linear filter from reference to input. Least squares over all runs fits it, as in the
@@ -47,7 +47,7 @@ def driven_by(runs: Sequence[Run], structure: Structure, reference: str) -> tupl
             "model does not read it"
         )
     for run in runs:
-        if run.readings is not None:
+        if run.sample_times is not None:
             raise DataError(
                 f"run {run.name!r} has rows with times of their own, but the answer of an input to reference= is found "
                 "on regular ones; give regular rows"
@@ -68,30 +68,33 @@ def driven_by(runs: Sequence[Run], structure: Structure, reference: str) -> tupl
     shortest = min(run.length for run in runs)
     ends = np.cumsum([run.length for run in runs])[:-1]
     laws = [
-        _columns(moves, shortest, dense) for dense in DENSE if dense == DENSE[0] or dense * ROWS_A_SAMPLE < shortest
+        _columns(moves, shortest, dense)
+        for dense in DENSE_LAG_COUNTS
+        if dense == DENSE_LAG_COUNTS[0] or dense * MIN_ROWS_PER_LAG < shortest
     ]
     answers: dict[str, list[Floats]] = {}
     warnings = []
     for name in inputs:
         measured = np.concatenate([run[name] for run in runs])
         # Every coefficient too many takes a share of the noise with it: the least Bayesian criterion.
-        fits = [columns @ solved(columns, measured, 1e-10) for columns in laws]
+        fits = [columns @ minimum_norm_solution(columns, measured, 1e-10) for columns in laws]
         costs = [_criterion(measured - fit, columns.shape[1]) for fit, columns in zip(fits, laws, strict=True)]
         best = int(np.argmin(costs))
         answers[name] = np.split(fits[best], ends)
-        found = strength(answers[name], np.split(measured - fits[best], ends), laws[best].shape[1])
-        if found < WEAK:
+        found = first_stage_f(answers[name], np.split(measured - fits[best], ends), laws[best].shape[1])
+        if found < MIN_FIRST_STAGE_F:
             warnings.append(
-                f"{reference} says little of {name} beside the noise in it (F = {found:.2g}, {WEAK:g} are needed): a "
+                f"{reference} says little of {name} beside the noise in it (F = {found:.2g}, {MIN_FIRST_STAGE_F:g} "
+                "are needed): a "
                 "weak instrument, with which estimates are biased and their intervals too narrow; move the reference "
                 "more, or longer"
             )
-    return [_answering(run, k, answers) for k, run in enumerate(runs)], warnings
+    return [_run_with_inputs(run, k, answers) for k, run in enumerate(runs)], warnings
 
 
-def strength(answers: Sequence[Floats], missed: Sequence[Floats], coefficients: int) -> float:
+def first_stage_f(answers: Sequence[Floats], missed: Sequence[Floats], coefficients: int) -> float:
     """Return the first-stage F statistic, with the long-run variance of the residuals."""
-    colour = autoregression(missed, LAGS)
+    colour = autoregression(missed, DEFAULT_LAGS)
     errors = np.concatenate([np.convolve(e - np.mean(e), colour, "valid") for e in missed])
     level = float(np.mean(errors**2)) / max(float(np.sum(colour)) ** 2, 1e-12)
     power = sum(float(np.var(a)) * a.size for a in answers)
@@ -100,7 +103,7 @@ def strength(answers: Sequence[Floats], missed: Sequence[Floats], coefficients: 
 
 def _columns(moves: Sequence[Floats], shortest: int, dense: int) -> Floats:
     """Return lagged reference values as regressors, and one constant for every run."""
-    parts = [np.stack(past_columns(r, 0, shortest // 2, dense=dense), axis=1) for r in moves]
+    parts = [np.stack(past_regressors(r, 0, shortest // 2, dense=dense), axis=1) for r in moves]
     levels = np.repeat(np.eye(len(moves)), [r.size for r in moves], axis=0)
     return np.hstack([np.concatenate(parts), levels])
 
@@ -110,7 +113,7 @@ def _criterion(missed: Floats, coefficients: int) -> float:
     return missed.size * math.log(max(power, 1e-300)) + coefficients * math.log(missed.size)
 
 
-def _answering(run: Run, number: int, answers: dict[str, list[Floats]]) -> Run:
+def _run_with_inputs(run: Run, number: int, answers: dict[str, list[Floats]]) -> Run:
     return Run.from_arrays(
         step=run.step,
         inputs={n: answers[n][number] if n in answers else run[n] for n in run.inputs},
@@ -122,7 +125,7 @@ def _answering(run: Run, number: int, answers: dict[str, list[Floats]]) -> Run:
     )
 
 
-def by_reference(fit: Fit, reference: str, warnings: Sequence[str]) -> Fit:
+def mark_reference_fit(fit: Fit, reference: str, warnings: Sequence[str]) -> Fit:
     """Return a fit with the reference recorded in its settings and warnings."""
     # The noise of a loop is coloured, and no sign of what the model leaves out; intervals count it.
     own = [w for w in fit.warnings if "are not white" not in w]

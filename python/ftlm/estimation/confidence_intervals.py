@@ -19,66 +19,66 @@ import numpy as np
 from ftlm.data.run import Run
 from ftlm.errors import ConvergenceError, FtlmError, ModelError
 from ftlm.estimation.free_parameters import FreeProblem
-from ftlm.estimation.objective import Attempt, Grid, covariance, covariance_of
+from ftlm.estimation.objective import Iterate, Objective, covariance, covariance_of
 from ftlm.estimation.output_error import JointFit, ProfileInterval, fit_output_error
-from ftlm.estimation.result import Judged
+from ftlm.estimation.result import IdentificationRecord
 from ftlm.order_search.options import Intervals, Loss
-from ftlm.utils.linalg import dot, projections, singular
-from ftlm.utils.resources import pool
+from ftlm.utils.linalg import dot, projections, thin_svd
+from ftlm.utils.resources import interruptible_pool
 from ftlm.utils.validation import Floats, real_number
 
 #: Largest relative error of a bound of the Wald interval, from one linear step of all other parameters. Above it the
 #: parameter is profiled.
-BENT = 0.1
+MAX_QUADRATIC_ERROR = 0.1
 #: A bound is found if the root of the rise is within RISE_TOLERANCE of its threshold and Newton's next step is shorter
 #: than BOUND_TOLERANCE times the distance from the optimum.
-NEAR = 0.1
-FOUND = 0.02
+RISE_TOLERANCE = 0.1
+BOUND_TOLERANCE = 0.02
 #: Half the refinement is enough if it moves the optimum by less than this many standard errors, or less than this
 #: fraction of each parameter.
-NEARBY, ALIKE = 2.0, 1e-3
+MAX_OPTIMUM_SHIFT_ERRORS, MAX_OPTIMUM_SHIFT_RATIO = 2.0, 1e-3
 #: Maximum number of evaluations of one refit, and of refits for one bound.
-LAP = 120
-REFITS = 40
+MAX_REFIT_EVALUATIONS = 120
+MAX_REFITS_PER_BOUND = 40
 #: Smallest budget of simulations with which the search for a bound continues.
-LEAST_SHARE = 10
+MIN_BUDGET_PER_BOUND = 10
 #: Largest distance of a bound, in half-widths of the Wald interval. Beyond it the interval is unbounded.
-FARTHEST = 1e3
+MAX_BOUND_DISTANCE = 1e3
 #: The first step is the Wald half-width or the value itself, but at least MIN_FIRST_STEP_RATIO times the former. A
 #: bracket is narrow if its width is BOUND_TOLERANCE of the value inside it, or of BRACKET_SCALE_RATIO times the
 #: distance.
-LEAST_WAY = 0.01
-FINEST = 0.1
+MIN_FIRST_STEP_RATIO = 0.01
+BRACKET_SCALE_RATIO = 0.1
 #: Smallest and largest factor by which the distance from the optimum grows in one step.
-LEAST_GROWTH, GROWTH = 1.1, 4.0
+MIN_STEP_FACTOR, MAX_STEP_FACTOR = 1.1, 4.0
 #: Tolerance of a refit as a fraction of the threshold, and the cost decrease that indicates another optimum.
-EXACT = 1e-4
-LOWER = 0.02
+REFIT_TOLERANCE = 1e-4
+LOWER_OPTIMUM_MARGIN = 0.02
 #: If a step moves another parameter by more than this fraction, power laws are tried as well, with exponents up to
 #: this.
-BY_POWERS, STEEPEST = 0.3, 4.0
+POWER_LAW_MOVE_RATIO, MAX_POWER_LAW_EXPONENT = 0.3, 4.0
 #: The cost levels off if its root rises by at most this fraction of the last rise and stays this far below the
 #: threshold.
-LEVEL_OFF, BELOW = 0.5, 0.05
+LEVELING_RATIO, LEVELING_MARGIN = 0.5, 0.05
 #: A lower optimum is reported if the sum of squares falls by more than this fraction of one standard error's rise.
-WORTH = 0.1
+MIN_COST_REDUCTION = 0.1
 #: Largest number of lower optima from which the search continues.
-DESCENTS = 5
+MAX_LOWER_OPTIMA = 5
 #: Relative singular value below which a direction of the other parameters has no effect.
-FLAT = 1e-12
+SINGULAR_VALUE_TOLERANCE = 1e-12
 
 
-class _LowerError(Exception):
+class _LowerOptimumError(Exception):
     """Refit with a cost below that of the optimum."""
 
-    def __init__(self, attempt: Attempt) -> None:
+    def __init__(self, attempt: Iterate) -> None:
         super().__init__()
         self.attempt = attempt
         self.evaluations = int(attempt.outcome["evaluations"])
 
 
 @dataclass(frozen=True)
-class Valley:
+class ProfileLikelihood:
     """Cost of a joint fit around its optimum, on its finest grid.
 
     Parameters
@@ -94,34 +94,38 @@ class Valley:
         colored residuals, so that a parabola gives the Wald interval.
     """
 
-    grid: Grid
-    best: Attempt
+    grid: Objective
+    best: Iterate
     shift: Floats
     bread: Floats
     errors: Floats
     units: Floats
 
     @classmethod
-    def of(cls, joint: JointFit, problem: FreeProblem, runs: Sequence[Run]) -> Valley:
+    def of(cls, joint: JointFit, problem: FreeProblem, runs: Sequence[Run]) -> ProfileLikelihood:
         """Return the profile likelihood around the optimum of a fit."""
         weights = [1.0 / max(joint.noise[o], 1e-300) for o in problem.structure.outputs]
         # Where a growing optimum was left, its valley is not this one.
-        steady = joint.growth is not None and not joint.growth.kept
-        grid = Grid(problem, runs, weights, joint.refinement, shares=joint.shares, steady=steady)
-        if joint.settled and joint.refinement > 1:
+        steady = joint.unstable_optimum is not None and not joint.unstable_optimum.is_accepted
+        grid = Objective(
+            problem, runs, weights, joint.refinement, robust_weights=joint.robust_weights, prefer_stable=steady
+        )
+        if joint.step_converged and joint.refinement > 1:
             # Half as fine a grid moved the optimum by less than its errors, and how steep it is by less still.
             with contextlib.suppress(FtlmError):
                 coarse = replace(grid, every=joint.refinement // 2)
-                found = cls.at(coarse, joint.on_grid, np.zeros(len(problem.names)))
-                near = np.maximum(NEARBY * found.errors, ALIKE * np.abs(joint.on_grid))
-                if found.best.converged and np.all(np.abs(found.best.values - joint.on_grid) <= near):
+                found = cls.at(coarse, joint.finest_grid_values, np.zeros(len(problem.names)))
+                near = np.maximum(
+                    MAX_OPTIMUM_SHIFT_ERRORS * found.errors, MAX_OPTIMUM_SHIFT_RATIO * np.abs(joint.finest_grid_values)
+                )
+                if found.best.has_converged and np.all(np.abs(found.best.values - joint.finest_grid_values) <= near):
                     return replace(found, shift=joint.values - found.best.values)
-        return cls.at(grid, joint.on_grid, joint.values - joint.on_grid)
+        return cls.at(grid, joint.finest_grid_values, joint.values - joint.finest_grid_values)
 
     @classmethod
-    def at(cls, grid: Grid, values: Floats, shift: Floats) -> Valley:
+    def at(cls, grid: Objective, values: Floats, shift: Floats) -> ProfileLikelihood:
         """Return the profile likelihood around the optimum reached from a point."""
-        best = grid.descend(_attempt(grid, values), LAP, plain=True)
+        best = grid.minimize(_attempt(grid, values), MAX_REFIT_EVALUATIONS, plain=True)
         bread = covariance_of(np.asarray(best.outcome["jacobian"]), [], 1.0)
         spread = np.diag(covariance(best, grid))
         with np.errstate(invalid="ignore", divide="ignore"):
@@ -132,7 +136,7 @@ class Valley:
         """Names of all free parameters."""
         return self.grid.problem.names
 
-    def seen(self, i: int) -> bool:
+    def is_identifiable(self, i: int) -> bool:
         """Whether the data determine a parameter at all."""
         return bool(0 < self.errors[i] < math.inf and 0 < self.units[i] < math.inf)
 
@@ -140,13 +144,13 @@ class Valley:
         """Return the rise of a sum of squares above the optimum, in standard deviations."""
         return math.sqrt(max(squares - 2.0 * float(self.best.outcome["cost"]), 0.0) / float(self.units[i]))
 
-    def bent(self, i: int, width: float) -> float:
+    def nonlinearity(self, i: int, width: float) -> float:
         """Return the relative error of the Wald interval of a parameter, from one evaluation at each bound.
 
         Each bound is moved along the conditional optimum, and all other parameters follow by one linear step. Infinite
         if a bound violates a constraint or its simulation is not finite.
         """
-        if not self.seen(i):
+        if not self.is_identifiable(i):
             return 0.0
         worst = 0.0
         for side in (-1.0, 1.0):
@@ -156,15 +160,15 @@ class Valley:
             if not low <= ends[i] <= high:
                 return math.inf
             try:
-                there = self._evaluated(i, self._along(i, self.best.values, self.bread[:, i], float(ends[i])))
+                there = self._evaluate(i, self._point_along(i, self.best.values, self.bread[:, i], float(ends[i])))
             except FtlmError:
                 return math.inf
-            left = _left(there, i)
+            left = _projected_residuals(there, i)
             with np.errstate(over="ignore"):
                 worst = max(worst, abs(self.rise(i, dot(left, left)) / width - 1.0))
         return worst
 
-    def end(self, i: int, side: float, width: float, stop: threading.Event | None = None) -> Search:
+    def search_bound(self, i: int, side: float, width: float, stop: threading.Event | None = None) -> BoundSearch:
         """Search one bound of the interval of a parameter by a bracketed Newton method.
 
         A generator: it receives the total budget of simulations, yields the number used whenever the budget is
@@ -174,28 +178,28 @@ class Valley:
         start, sigma = float(self.best.values[i]), float(self.errors[i])
         limit = self.grid.problem.all_bounds[i][0 if side < 0 else 1]
         # In a valley without end standard errors are no measure of it.
-        first = min(sigma * width, max(abs(start), LEAST_WAY * sigma * width))
-        farthest = min(FARTHEST * first, abs(limit - start))
+        first = min(sigma * width, max(abs(start), MIN_FIRST_STEP_RATIO * sigma * width))
+        farthest = min(MAX_BOUND_DISTANCE * first, abs(limit - start))
         within, inside, outside = self.best, 0.0, math.inf
         way, points, evaluations = min(first, farthest), [], 0
         reached, gained = 0.0, math.inf
         allowed = yield 0
-        for _ in range(REFITS):
+        for _ in range(MAX_REFITS_PER_BOUND):
             if not way > inside:
                 break
             if stop is not None and stop.is_set():
                 raise KeyboardInterrupt
             origin = within
             while True:
-                lap = max(min(LAP, allowed - evaluations), 0)
+                lap = max(min(MAX_REFIT_EVALUATIONS, allowed - evaluations), 0)
                 try:
-                    there, following = self.refitted(i, start + side * way, origin, lap) if lap > 0 else None, math.inf
-                except _LowerError as lower:
+                    there, following = self.refit(i, start + side * way, origin, lap) if lap > 0 else None, math.inf
+                except _LowerOptimumError as lower:
                     lower.evaluations += evaluations
                     raise
                 took = lap if there is None else int(there.outcome["evaluations"])
                 evaluations += took
-                if lap == LAP or took < lap:
+                if lap == MAX_REFIT_EVALUATIONS or took < lap:
                     break
                 # Cut short, a refit tells nothing, and goes on from where it was.
                 origin = there or origin
@@ -206,9 +210,9 @@ class Valley:
                 points.append((start + side * way + float(self.shift[i]), rise**2))
                 slope = side * _slope(there, i) / (float(self.units[i]) * rise) if rise > 0 else 0.0
                 following = way + (width - rise) / slope if slope > 0 else math.inf
-                near = abs(rise / width - 1.0) <= NEAR
-                if near and abs(following - way) <= FOUND * way and inside < following <= farthest:
-                    return End(start + side * following, points, evaluations)
+                near = abs(rise / width - 1.0) <= RISE_TOLERANCE
+                if near and abs(following - way) <= BOUND_TOLERANCE * way and inside < following <= farthest:
+                    return IntervalBound(start + side * following, points, evaluations)
             if there is None or rise > width:
                 if way >= outside:
                     # Followed closely, it is out as well: the profile jumps here, or the free run ends.
@@ -222,28 +226,34 @@ class Valley:
                 if way >= farthest:
                     break
             closed = math.isfinite(outside)
-            size = max(min(outside, abs(start + side * inside)), FINEST * outside) if closed else 0.0
-            narrow = closed and outside - inside <= FOUND * size
+            size = max(min(outside, abs(start + side * inside)), BRACKET_SCALE_RATIO * outside) if closed else 0.0
+            narrow = closed and outside - inside <= BOUND_TOLERANCE * size
             if near and not narrow and inside < following < min(outside, farthest):
                 # Newton's next step is worth more there than one of a size given beforehand.
                 way = following
             elif not closed:
                 gain, reached = rise - reached, rise
-                if gain <= LEVEL_OFF * gained and rise + gain < (1.0 - BELOW) * width and way > GROWTH * first:
+                if (
+                    gain <= LEVELING_RATIO * gained
+                    and rise + gain < (1.0 - LEVELING_MARGIN) * width
+                    and way > MAX_STEP_FACTOR * first
+                ):
                     break
                 gained = gain
-                way = min(max(following, LEAST_GROWTH * way), GROWTH * way, farthest)
+                way = min(max(following, MIN_STEP_FACTOR * way), MAX_STEP_FACTOR * way, farthest)
             elif narrow:
                 way = outside
             else:
                 margin = 0.05 * (outside - inside)
-                following = following if inside < following < outside else _middle(start, side, inside, outside)
+                following = (
+                    following if inside < following < outside else _bracket_midpoint(start, side, inside, outside)
+                )
                 way = min(max(following, inside + margin), outside - margin)
         # An end between two points of which the outer one has a cost; else the cost never rose that far.
         risen = math.isfinite(outside) and any(r >= width**2 for _, r in points)
-        return End(start + side * outside if risen else side * math.inf, points, evaluations)
+        return IntervalBound(start + side * outside if risen else side * math.inf, points, evaluations)
 
-    def refitted(self, i: int, value: float, near: Attempt, lap: int = LAP) -> Attempt | None:
+    def refit(self, i: int, value: float, near: Iterate, lap: int = MAX_REFIT_EVALUATIONS) -> Iterate | None:
         """Refit all other parameters at a value of one, from a nearby point; None if none is feasible.
 
         Raises
@@ -253,17 +263,17 @@ class Valley:
         """
         rise = float(self.units[i])
         least = 2.0 * float(self.best.outcome["cost"])
-        for point in self._starts(i, value, near):
+        for point in self._refit_starts(i, value, near):
             try:
-                there = self._descended(i, point, lap, EXACT * rise / max(least, rise))
+                there = self._minimize(i, point, lap, REFIT_TOLERANCE * rise / max(least, rise))
             except FtlmError:
                 continue
-            if 2.0 * float(there.outcome["cost"]) < least - LOWER * rise:
-                raise _LowerError(there)
+            if 2.0 * float(there.outcome["cost"]) < least - LOWER_OPTIMUM_MARGIN * rise:
+                raise _LowerOptimumError(there)
             return there
         return None
 
-    def _starts(self, i: int, value: float, near: Attempt) -> list[Floats]:
+    def _refit_starts(self, i: int, value: float, near: Iterate) -> list[Floats]:
         """Return initial guesses of the other parameters at a value of one, most promising first.
 
         Along the tangent; if that moves them far, also along power laws, for all parameters or for the orders only.
@@ -271,28 +281,28 @@ class Valley:
         """
         values, tangent = near.values, _tangent(near, i)
         orders = len(self.grid.problem.orders)
-        still = self._along(i, values, np.zeros_like(tangent), value)
-        points = [self._along(i, values, tangent, value), still]
+        still = self._point_along(i, values, np.zeros_like(tangent), value)
+        points = [self._point_along(i, values, tangent, value), still]
         # Of numbers that nothing tells a tangent has no end; a point there is none, and has no cost.
         with np.errstate(over="ignore", invalid="ignore"):
-            moves = np.abs(tangent * (value - values[i])) > BY_POWERS * np.abs(values)
+            moves = np.abs(tangent * (value - values[i])) > POWER_LAW_MOVE_RATIO * np.abs(values)
             if value * values[i] > 0 and moves.any():
                 powers = tangent * values[i] / np.where(values, values, 1.0)
-                power = values * (value / values[i]) ** np.clip(powers, -STEEPEST, STEEPEST)
+                power = values * (value / values[i]) ** np.clip(powers, -MAX_POWER_LAW_EXPONENT, MAX_POWER_LAW_EXPONENT)
                 mixed = np.where(np.arange(values.size) < orders, power, values + tangent * (value - values[i]))
                 for towards in (power, mixed):
                     towards[i] = value
-                    points.append(self._along(i, values, towards - values, value))
+                    points.append(self._point_along(i, values, towards - values, value))
         return sorted(points, key=lambda p: self._cost(i, p)) if len(points) > 2 else points
 
     def _cost(self, i: int, values: Floats) -> float:
         """Return the cost at a point; infinite if the simulation is not finite."""
         try:
-            return float(self._descended(i, values, 0, EXACT).outcome["cost"])
+            return float(self._minimize(i, values, 0, REFIT_TOLERANCE).outcome["cost"])
         except FtlmError:
             return math.inf
 
-    def _along(self, i: int, values: Floats, direction: Floats, value: float) -> Floats:
+    def _point_along(self, i: int, values: Floats, direction: Floats, value: float) -> Floats:
         """Return a point with a given value of one parameter, the others moved as far as feasible."""
         at = values.copy()
         at[i] = value
@@ -301,23 +311,23 @@ class Valley:
         with np.errstate(over="ignore", invalid="ignore"):
             towards = values + direction / direction[i] * (value - values[i])
         towards[i] = value
-        point = self.grid.problem.feasible(at, towards)
+        point = self.grid.problem.feasible_point(at, towards)
         point[i] = value
         return point
 
-    def _evaluated(self, i: int, values: Floats) -> Attempt:
-        return self._descended(i, values, 1, EXACT)
+    def _evaluate(self, i: int, values: Floats) -> Iterate:
+        return self._minimize(i, values, 1, REFIT_TOLERANCE)
 
-    def _descended(self, i: int, values: Floats, evaluations: int, tolerance: float) -> Attempt:
-        return self.grid.descend(_attempt(self.grid, values), evaluations, plain=True, held=i, tolerance=tolerance)
+    def _minimize(self, i: int, values: Floats, evaluations: int, tolerance: float) -> Iterate:
+        return self.grid.minimize(_attempt(self.grid, values), evaluations, plain=True, held=i, tolerance=tolerance)
 
 
 #: A search for an end: it yields the free runs it took, is sent how many it may have taken, and returns the end.
-Search = Generator[int, int, "End"]
+BoundSearch = Generator[int, int, "IntervalBound"]
 
 
 @dataclass(frozen=True)
-class End:
+class IntervalBound:
     """Bound of an interval: value on the grid, evaluated points and number of simulations."""
 
     value: float
@@ -326,7 +336,7 @@ class End:
 
 
 @dataclass(frozen=True)
-class Profiles:
+class ProfileResult:
     """Profile-likelihood intervals, and any lower optimum found on the way.
 
     Parameters
@@ -342,20 +352,20 @@ class Profiles:
     """
 
     intervals: dict[str, ProfileInterval]
-    lower: Floats | None = None
-    left: tuple[str, ...] = ()
+    lower_optimum: Floats | None = None
+    incomplete_names: tuple[str, ...] = ()
     evaluations: int = 0
 
 
-def profiled(
-    valley: Valley,
+def profile_intervals(
+    valley: ProfileLikelihood,
     names: Sequence[str],
     level: float,
     *,
     threads: int = 1,
     progress: Callable[[int, int], None] | None = None,
     most: int | None = None,
-) -> Profiles:
+) -> ProfileResult:
     """Compute profile-likelihood intervals of some parameters of a fit.
 
     Each bound is searched from the optimum independently, so results do not depend on the number of threads. A
@@ -381,21 +391,21 @@ def profiled(
         Ctrl-C, within one refit.
     """
     start, spent = valley, 0
-    for _ in range(DESCENTS):
-        ends, took = _ends(valley, names, level, threads, progress, None if most is None else most - spent)
+    for _ in range(MAX_LOWER_OPTIMA):
+        ends, took = _search_bounds(valley, names, level, threads, progress, None if most is None else most - spent)
         spent += took
-        below = [e.attempt for e in ends.values() if isinstance(e, _LowerError)]
+        below = [e.attempt for e in ends.values() if isinstance(e, _LowerOptimumError)]
         if not below:
             break
         # What was the limit for step 0 of another optimum is none of this one.
-        valley = Valley.at(valley.grid, below[0].values, np.zeros_like(valley.shift))
+        valley = ProfileLikelihood.at(valley.grid, below[0].values, np.zeros_like(valley.shift))
     fall = 2.0 * (float(start.best.outcome["cost"]) - float(valley.best.outcome["cost"]))
     known = valley.units[np.isfinite(valley.units)]
-    lower = valley.best.values if known.size and fall > WORTH * float(np.median(known)) else None
+    lower = valley.best.values if known.size and fall > MIN_COST_REDUCTION * float(np.median(known)) else None
     found: dict[str, ProfileInterval] = {}
     left = tuple(n for n in names if any(ends.get((n, side), 0) is None for side in (-1.0, 1.0)))
     for name in (n for n in names if n not in left):
-        both = [e for e in (ends.get((name, side)) for side in (-1.0, 1.0)) if isinstance(e, End)]
+        both = [e for e in (ends.get((name, side)) for side in (-1.0, 1.0)) if isinstance(e, IntervalBound)]
         if len(both) < 2:
             found[name] = ProfileInterval(-math.inf, math.inf, level)
             continue
@@ -405,49 +415,53 @@ def profiled(
         low, high = (min(max(v, first), last) if math.isfinite(v) else v for v in (low, high))
         points = tuple(sorted([*both[0].points, *both[1].points]))
         found[name] = ProfileInterval(low, high, level, points, sum(e.evaluations for e in both))
-    return Profiles(found, lower, left, spent)
+    return ProfileResult(found, lower, left, spent)
 
 
-def _ends(
-    valley: Valley,
+def _search_bounds(
+    valley: ProfileLikelihood,
     names: Sequence[str],
     level: float,
     threads: int,
     progress: Callable[[int, int], None] | None,
     most: int | None,
-) -> tuple[dict[tuple[str, float], End | _LowerError | None], int]:
+) -> tuple[dict[tuple[str, float], IntervalBound | _LowerOptimumError | None], int]:
     """Search both bounds of every identifiable parameter; return them and the number of simulations.
 
     The search stops at the first lower optimum, because the other bounds would belong to the wrong optimum.
     """
     width, stop = half_width(level), threading.Event()
-    asked = [(n, side) for n in names if valley.seen(valley.names.index(n)) for side in (-1.0, 1.0)]
-    searches = {one: valley.end(valley.names.index(one[0]), one[1], width, stop) for one in asked}
+    asked = [(n, side) for n in names if valley.is_identifiable(valley.names.index(n)) for side in (-1.0, 1.0)]
+    searches = {one: valley.search_bound(valley.names.index(one[0]), one[1], width, stop) for one in asked}
     for search in searches.values():
         next(search)
 
-    def followed(one: tuple[str, float], allowed: int) -> int | End | _LowerError:
+    def continue_search(one: tuple[str, float], allowed: int) -> int | IntervalBound | _LowerOptimumError:
         try:
             return searches[one].send(allowed)
         except StopIteration as found:
-            end: End = found.value
+            end: IntervalBound = found.value
             return end
-        except _LowerError as lower:
+        except _LowerOptimumError as lower:
             return lower
 
-    out: dict[tuple[str, float], End | _LowerError | None] = dict.fromkeys(asked)
+    out: dict[tuple[str, float], IntervalBound | _LowerOptimumError | None] = dict.fromkeys(asked)
     took = dict.fromkeys(asked, 0)
     left = asked
-    with pool(max(threads, 1)) as workers:
+    with interruptible_pool(max(threads, 1)) as workers:
         try:
             while left:
-                share = LAP * REFITS * 2 if most is None else (most - sum(took.values())) // len(left)
-                if share < LEAST_SHARE:
+                share = (
+                    MAX_REFIT_EVALUATIONS * MAX_REFITS_PER_BOUND * 2
+                    if most is None
+                    else (most - sum(took.values())) // len(left)
+                )
+                if share < MIN_BUDGET_PER_BOUND:
                     break
                 # In whole rounds, so that what an end may take does not depend on the number of threads.
                 allowed = [took[o] + share for o in left]
                 asked_now = [
-                    workers.submit(followed, one, most_now) for one, most_now in zip(left, allowed, strict=True)
+                    workers.submit(continue_search, one, most_now) for one, most_now in zip(left, allowed, strict=True)
                 ]
                 for one, future in zip(left, asked_now, strict=True):
                     found = future.result()
@@ -455,7 +469,7 @@ def _ends(
                         took[one] = found
                         continue
                     out[one], took[one] = found, found.evaluations
-                    if isinstance(found, _LowerError):
+                    if isinstance(found, _LowerOptimumError):
                         stop.set()
                         workers.shutdown(cancel_futures=True)
                         return out, sum(took.values())
@@ -468,10 +482,10 @@ def _ends(
     return out, sum(took.values())
 
 
-def bent_numbers(valley: Valley, level: float) -> list[str]:
+def nonlinear_parameters(valley: ProfileLikelihood, level: float) -> list[str]:
     """Return the parameters whose Wald interval is inaccurate, from two evaluations each."""
     width = half_width(level)
-    return [n for i, n in enumerate(valley.names) if valley.bent(i, width) > BENT]
+    return [n for i, n in enumerate(valley.names) if valley.nonlinearity(i, width) > MAX_QUADRATIC_ERROR]
 
 
 def half_width(level: float) -> float:
@@ -479,12 +493,12 @@ def half_width(level: float) -> float:
     return NormalDist().inv_cdf(0.5 + 0.5 * level)
 
 
-def _attempt(grid: Grid, values: Floats) -> Attempt:
+def _attempt(grid: Objective, values: Floats) -> Iterate:
     orders, coefficients, inputs = grid.problem.split(values.tolist())
-    return Attempt(orders, coefficients, "profile", {}, inputs)
+    return Iterate(orders, coefficients, "profile", {}, inputs)
 
 
-def _middle(start: float, side: float, inside: float, outside: float) -> float:
+def _bracket_midpoint(start: float, side: float, inside: float, outside: float) -> float:
     """Return the midpoint of a bracket; geometric if both values have the same sign."""
     near, far = start + side * inside, start + side * outside
     if near * far > 0:
@@ -492,7 +506,7 @@ def _middle(start: float, side: float, inside: float, outside: float) -> float:
     return 0.5 * (inside + outside)
 
 
-def _slope(attempt: Attempt, i: int) -> float:
+def _slope(attempt: Iterate, i: int) -> float:
     """Return half the derivative of the sum of squares by one parameter; 0 on overflow."""
     # Near where a free run has no value its derivatives overflow: they tell no step.
     with np.errstate(over="ignore", invalid="ignore"):
@@ -500,28 +514,28 @@ def _slope(attempt: Attempt, i: int) -> float:
     return slope if math.isfinite(slope) else 0.0
 
 
-def _span(attempt: Attempt, i: int) -> tuple[Any, Floats]:
+def _other_sensitivities(attempt: Iterate, i: int) -> tuple[Any, Floats]:
     """Return the SVD of the other parameters' sensitivities (unit rows), and the row norms."""
     others = np.delete(np.asarray(attempt.outcome["jacobian"]), i, axis=0)
     # Far out, sensitivities may be so large that their squares are no numbers.
     length = np.abs(others).max(axis=1, initial=0.0)
     length = np.where(length > 0, length, 1.0)
     length = length * np.maximum(np.linalg.norm(others / length[:, None], axis=1), 1.0)
-    tall, sizes, square = singular((others / length[:, None]).T)
-    kept = sizes > FLAT * sizes.max(initial=0.0)
+    tall, sizes, square = thin_svd((others / length[:, None]).T)
+    kept = sizes > SINGULAR_VALUE_TOLERANCE * sizes.max(initial=0.0)
     return (square.T[:, kept], sizes[kept], tall.T[kept]), length
 
 
-def _left(attempt: Attempt, i: int) -> Floats:
+def _projected_residuals(attempt: Iterate, i: int) -> Floats:
     """Return the residuals after one linear step of all other parameters."""
     residuals = np.asarray(attempt.outcome["residuals"])
-    (_, _, right), _ = _span(attempt, i)
+    (_, _, right), _ = _other_sensitivities(attempt, i)
     return np.asarray(residuals - right.T @ projections(right.T, residuals))
 
 
-def _tangent(attempt: Attempt, i: int) -> Floats:
+def _tangent(attempt: Iterate, i: int) -> Floats:
     """Return the direction of all parameters along the profile when one moves by 1."""
-    (left, sizes, right), length = _span(attempt, i)
+    (left, sizes, right), length = _other_sensitivities(attempt, i)
     along = np.asarray(attempt.outcome["jacobian"])[i]
     with np.errstate(over="ignore"):
         others = -(left @ (projections(right.T, along) / sizes)) / length
@@ -529,15 +543,15 @@ def _tangent(attempt: Attempt, i: int) -> Floats:
 
 
 #: Confidence level of the printed intervals.
-PRINTED = 0.95
+DEFAULT_INTERVAL_LEVEL = 0.95
 #: A lower optimum is reported if the residuals of an output fall by this fraction.
-TOLD = 1e-3
+MIN_NOISE_REDUCTION = 1e-3
 #: Largest number of restarts from a lower optimum found by the interval search.
-REFITS_INTERVALS = 2
+MAX_RESTARTS = 2
 #: Budget of block pulses for profiles under intervals="auto", and fewest simulations with which a bound is started.
 #: With free orders a pulse costs FREE_ORDER_COST_FACTOR times as much.
-UNASKED, FEWEST = 6_000_000, 20
-FRACTIONAL = 3
+MAX_AUTO_PULSES, MIN_INITIAL_BUDGET_PER_BOUND = 6_000_000, 20
+FREE_ORDER_COST_FACTOR = 3
 
 
 def with_intervals(
@@ -561,34 +575,34 @@ def with_intervals(
         return joint, []
     warnings: list[str] = []
     spent = 0
-    for turn in range(REFITS_INTERVALS + 1):
+    for turn in range(MAX_RESTARTS + 1):
         try:
-            valley = Valley.of(joint, problem, runs)
+            valley = ProfileLikelihood.of(joint, problem, runs)
         except FtlmError:
             # No finite free run where the weights of the last descent are taken anew: what is known stays.
             return joint, warnings
-        names = valley.names if intervals == "profile" else bent_numbers(valley, PRINTED)
-        pulses, least = joint.samples * joint.refinement, FEWEST * 2 * len(names)
-        pulses *= FRACTIONAL if joint.orders else 1
-        allowed = (UNASKED - spent) // pulses
+        names = valley.names if intervals == "profile" else nonlinear_parameters(valley, DEFAULT_INTERVAL_LEVEL)
+        pulses, least = joint.samples * joint.refinement, MIN_INITIAL_BUDGET_PER_BOUND * 2 * len(names)
+        pulses *= FREE_ORDER_COST_FACTOR if joint.orders else 1
+        allowed = (MAX_AUTO_PULSES - spent) // pulses
         if intervals == "auto" and least > allowed:
-            found = Profiles({}, None, tuple(names))
+            found = ProfileResult({}, None, tuple(names))
             break
         most = None if intervals == "profile" else allowed
-        found = profiled(valley, names, PRINTED, threads=threads, progress=progress, most=most)
+        found = profile_intervals(valley, names, DEFAULT_INTERVAL_LEVEL, threads=threads, progress=progress, most=most)
         spent += found.evaluations * pulses
-        if found.lower is None or turn == REFITS_INTERVALS:
+        if found.lower_optimum is None or turn == MAX_RESTARTS:
             break
-        if not is_lower(valley.grid, joint.on_grid, found.lower):
+        if not is_lower_on_finer_grid(valley.grid, joint.finest_grid_values, found.lower_optimum):
             # What only this grid carries is a mode of the scheme; along it the cost tells nothing of the numbers.
             return joint, warnings
-        start = dict(zip(problem.names, found.lower.tolist(), strict=True))
+        start = dict(zip(problem.names, found.lower_optimum.tolist(), strict=True))
         tried, level = len(joint.starts), joint.noise
         try:
             again = fit_output_error(runs, problem.structure, threads=threads, start=start, loss=loss)
         except FtlmError:
             break
-        if all(v > (1.0 - TOLD) * level[o] for o, v in again.noise.items()):
+        if all(v > (1.0 - MIN_NOISE_REDUCTION) * level[o] for o, v in again.noise.items()):
             joint = replace(again, starts=joint.starts, origin=joint.origin)
             continue
         joint = replace(again, origin="a lower optimum that the search for its intervals came upon")
@@ -597,15 +611,16 @@ def with_intervals(
             f"none of {tried} starts led to this optimum, but the search for intervals did (residuals {before} before, "
             f"{after} now): there may be others"
         ]
-    if found.left:
+    if found.incomplete_names:
         warnings.append(
-            f"the cost is no parabola along {', '.join(found.left)}, and its profile there would take long: these "
+            f"the cost is no parabola along {', '.join(found.incomplete_names)}, and its profile there would take "
+            "long: these "
             "intervals are rough; intervals='profile' finds them"
         )
     return replace(joint, profiles=found.intervals), warnings
 
 
-def is_lower(grid: Grid, before: Floats, after: Floats) -> bool:
+def is_lower_on_finer_grid(grid: Objective, before: Floats, after: Floats) -> bool:
     """Whether a point has a lower cost than another one on the next finer grid as well.
 
     The points are only evaluated there, because a mode of the scheme would otherwise adapt to that grid.
@@ -614,23 +629,27 @@ def is_lower(grid: Grid, before: Floats, after: Floats) -> bool:
     for values in (before, after):
         orders, coefficients, inputs = grid.problem.split(values.tolist())
         try:
-            there = finer.descend(Attempt(orders, coefficients, "finer grid", {}, inputs), 1, plain=True)
+            there = finer.minimize(Iterate(orders, coefficients, "finer grid", {}, inputs), 1, plain=True)
         except FtlmError:
             return False
         costs.append(float(there.outcome["cost"]))
     return costs[1] < costs[0]
 
 
-def valley_of(result: Judged) -> Valley:
+def likelihood_of(result: IdentificationRecord) -> ProfileLikelihood:
     """Return the profile likelihood around the optimum of an output-error result."""
-    if result.joint is None or result.task is None:
+    if result.fit is None or result.task is None:
         raise ModelError(f"method {result.method!r} has no likelihood to profile; identify by method='output-error'")
-    problem = FreeProblem.of(replace(result.task.structure, initial=result.joint.initial))
-    return Valley.of(result.joint, problem, result.task.runs)
+    problem = FreeProblem.of(replace(result.task.structure, initial=result.fit.initial))
+    return ProfileLikelihood.of(result.fit, problem, result.task.runs)
 
 
-def profile(
-    result: Judged, names: Sequence[str], level: float, threads: int, progress: Callable[[int, int], None] | None
+def result_profiles(
+    result: IdentificationRecord,
+    names: Sequence[str],
+    level: float,
+    threads: int,
+    progress: Callable[[int, int], None] | None,
 ) -> dict[str, ProfileInterval]:
     """Return profile-likelihood intervals of a result; see :meth:`ftlm.Identification.profile`."""
     if "reference" in result.settings:
@@ -638,7 +657,7 @@ def profile(
             "a fit with reference= is where residuals are orthogonal to instruments, and no minimum of a cost: it has "
             "no profile; use its standard errors"
         )
-    valley = valley_of(result)
+    valley = likelihood_of(result)
     unknown = [n for n in names if n not in valley.names]
     if unknown:
         others = f", nor {len(unknown) - 1} more" if len(unknown) > 1 else ""
@@ -647,8 +666,8 @@ def profile(
     if not 0.0 < probability < 1.0:
         raise ModelError(f"level = {level} is no probability between 0 and 1, such as 0.95")
     asked = list(dict.fromkeys(names)) or valley.names
-    found = profiled(valley, asked, probability, threads=threads, progress=progress)
-    if found.lower is not None:
+    found = profile_intervals(valley, asked, probability, threads=threads, progress=progress)
+    if found.lower_optimum is not None:
         raise ConvergenceError(
             "the profile leads to an optimum below this fit's, so its estimates are not the likeliest; identify again "
             "with intervals='profile', which goes on from there"

@@ -11,28 +11,28 @@ from typing import Any
 import numpy as np
 
 from ftlm.data.run import Run, as_runs
-from ftlm.data.sampling import FEWEST_ROWS
+from ftlm.data.sampling import MIN_RUN_SAMPLES
 from ftlm.errors import DataError, FtlmError, ModelError
 from ftlm.estimation.identify import identify
 from ftlm.estimation.result import Identification
 from ftlm.structure.structure import Structure
-from ftlm.svg.html_page import Page, Reported, Section, Table
+from ftlm.svg.html_page import Page, ReportMixin, Section, Table
 from ftlm.utils.files import to_frame
-from ftlm.utils.formatting import Cell, unbounded
+from ftlm.utils.formatting import Cell, format_bound
 from ftlm.utils.statistics import NORMAL_95, chi_squared_99
 from ftlm.utils.validation import whole_number
 from ftlm.validation.comparison import compare, finite
 
 #: Default number of segments of one run.
-PARTS = 2
+DEFAULT_SEGMENTS = 2
 #: Table entries for the comparison of two intervals.
-APART, TOGETHER, UNTOLD = "apart", "overlap", "not told"
+DISJOINT_TEXT, OVERLAP_TEXT, NOT_IDENTIFIABLE_TEXT = "apart", "overlap", "not told"
 #: Largest ratio of an interval bound to the Wald bound for which the covariance is used.
-SKEWED = 2.0
+MAX_ASYMMETRY_RATIO = 2.0
 
 
 @dataclass(frozen=True)
-class Difference:
+class ParameterDifference:
     """Difference of one parameter between two segments.
 
     Parameters
@@ -50,12 +50,12 @@ class Difference:
 
     name: str
     parts: tuple[int, int]
-    errors: float
-    apart: bool
+    difference_in_errors: float
+    disjoint: bool
 
 
 @dataclass(frozen=True)
-class Agreement(Reported):
+class Consistency(ReportMixin):
     """Segments of a run, or runs, identified separately, and whether they share one model.
 
     Parameters
@@ -75,17 +75,17 @@ class Agreement(Reported):
 
     names: tuple[str, ...]
     results: tuple[Identification, ...]
-    differences: tuple[Difference, ...]
+    differences: tuple[ParameterDifference, ...]
     distance: float | None
     degrees: int
-    crossed: tuple[tuple[dict[str, float], ...], ...] = field(repr=False)
+    cross_validation: tuple[tuple[dict[str, float], ...], ...] = field(repr=False)
 
     @property
-    def same(self) -> bool | None:
+    def consistent(self) -> bool | None:
         """Whether the segments share one model; None if no parameter is identifiable from two segments."""
-        if all(math.isnan(d.errors) for d in self.differences):
+        if all(math.isnan(d.difference_in_errors) for d in self.differences):
             return None
-        return not any(d.apart for d in self.differences) and not self._far
+        return not any(d.disjoint for d in self.differences) and not self._exceeds_limit
 
     @property
     def limit(self) -> float:
@@ -93,16 +93,16 @@ class Agreement(Reported):
         return chi_squared_99(self.degrees) if self.degrees else math.inf
 
     @property
-    def _far(self) -> bool:
+    def _exceeds_limit(self) -> bool:
         return self.distance is not None and self.distance > self.limit
 
     @property
-    def untold(self) -> tuple[str, ...]:
+    def not_identifiable(self) -> tuple[str, ...]:
         """Parameters not identifiable from some segment; they cannot contradict the others."""
-        return tuple(dict.fromkeys(d.name for d in self.differences if math.isnan(d.errors)))
+        return tuple(dict.fromkeys(d.name for d in self.differences if math.isnan(d.difference_in_errors)))
 
     @property
-    def _together(self) -> str:
+    def _joint_test_text(self) -> str:
         if self.distance is None or not self.degrees:
             return ""
         return f"{self.distance:.3g} where chance leaves less than {self.limit:.3g} in 99 of 100 cases"
@@ -110,42 +110,44 @@ class Agreement(Reported):
     def _values(self, part: int) -> dict[str, float]:
         return values_of(self.results[part])
 
-    def words(self, difference: Difference) -> str:
+    def describe_difference(self, difference: ParameterDifference) -> str:
         """Describe one parameter in two segments: values, intervals and difference in standard errors."""
         said = []
         for part in difference.parts:
             low, high = self.results[part].intervals[difference.name]
             value = f"{self._values(part)[difference.name]:.4g}"
-            said.append(f"{value} ({unbounded(low, '.4g')} to {unbounded(high, '.4g')}) in {self.names[part]}")
-        return f"{difference.name} is {said[0]} and {said[1]}, {difference.errors:.2g} standard errors apart"
+            said.append(f"{value} ({format_bound(low, '.4g')} to {format_bound(high, '.4g')}) in {self.names[part]}")
+        return (
+            f"{difference.name} is {said[0]} and {said[1]}, {difference.difference_in_errors:.2g} standard errors apart"
+        )
 
     @property
     def reason(self) -> str:
         """Conclusion in one sentence, with the parameters and segments that decide it."""
-        told = [d for d in self.differences if not math.isnan(d.errors)]
-        if self.same is None:
+        told = [d for d in self.differences if not math.isnan(d.difference_in_errors)]
+        if self.consistent is None:
             return "Not told: no number is known by two parts"
-        if self.same:
+        if self.consistent:
             words = "The same model as far as the parts tell: the 95 % intervals of every number overlap; the farthest "
-            words += f"from each other: {self.words(told[0])}"
-            return words + (f"; all numbers together: {self._together}" if self._together else "")
-        far = [d for d in told if d.apart]
+            words += f"from each other: {self.describe_difference(told[0])}"
+            return words + (f"; all numbers together: {self._joint_test_text}" if self._joint_test_text else "")
+        far = [d for d in told if d.disjoint]
         if far:
-            words = f"Not the same model: {'; '.join(self.words(d) for d in far)}"
-            return words + (f"; all numbers together: {self._together}" if self._far else "")
+            words = f"Not the same model: {'; '.join(self.describe_difference(d) for d in far)}"
+            return words + (f"; all numbers together: {self._joint_test_text}" if self._exceeds_limit else "")
         return (
             f"Not the same model: the 95 % intervals of each number overlap, but all numbers together do not agree "
-            f"({self._together}); the farthest from each other: {self.words(told[0])}"
+            f"({self._joint_test_text}); the farthest from each other: {self.describe_difference(told[0])}"
         )
 
     @property
     def warnings(self) -> tuple[str, ...]:
         """Limitations of the comparison: parameters that are not identifiable, and warnings of each segment."""
         out = []
-        if self.untold and self.same is not None:
-            out.append(f"{', '.join(self.untold)}: not told by some part, so any other agrees with it")
+        if self.not_identifiable and self.consistent is not None:
+            out.append(f"{', '.join(self.not_identifiable)}: not told by some part, so any other agrees with it")
         for name, result in zip(self.names, self.results, strict=True):
-            if result.joint is not None and not result.joint.converged:
+            if result.fit is not None and not result.fit.converged:
                 out.append(f"{name}: the fit ended before it stood still")
         if any(w.startswith("residuals of ") and "white" in w for r in self.results for w in r.warnings):
             out.append(
@@ -162,10 +164,18 @@ class Agreement(Reported):
             cells: list[Cell] = [name]
             for part, result in enumerate(self.results):
                 low, high = result.intervals[name]
-                interval = f"{unbounded(low, '.4g')} to {unbounded(high, '.4g')}"
+                interval = f"{format_bound(low, '.4g')} to {format_bound(high, '.4g')}"
                 cells.append(f"{self._values(part)[name]:.5g} ({interval})")
-            verdict = UNTOLD if math.isnan(worst.errors) else APART if worst.apart else TOGETHER
-            rows.append([*cells, None if math.isnan(worst.errors) else worst.errors, verdict])
+            verdict = (
+                NOT_IDENTIFIABLE_TEXT
+                if math.isnan(worst.difference_in_errors)
+                else DISJOINT_TEXT
+                if worst.disjoint
+                else OVERLAP_TEXT
+            )
+            rows.append(
+                [*cells, None if math.isnan(worst.difference_in_errors) else worst.difference_in_errors, verdict]
+            )
         return Table(
             "Numbers of each part, with 95 % intervals",
             ("number", *self.names, "standard errors between", "95 % intervals"),
@@ -177,9 +187,9 @@ class Agreement(Reported):
     def fits_table(self) -> Table:
         """Return a table of the fit of each segment's model on every segment."""
         rows: list[list[Cell]] = [
-            [f"{name}, {output}", *(self.crossed[k][j].get(output) for j in range(len(self.names)))]
+            [f"{name}, {output}", *(self.cross_validation[k][j].get(output) for j in range(len(self.names)))]
             for k, name in enumerate(self.names)
-            for output in self.crossed[k][k]
+            for output in self.cross_validation[k][k]
         ]
         return Table("Fit of each part's model on each part, in %", ("model of", *self.names), rows)
 
@@ -191,7 +201,7 @@ class Agreement(Reported):
             tables=[self.numbers_table(), self.fits_table()],
         )
         sections = [Section(n, paragraphs=str(r).splitlines()) for n, r in zip(self.names, self.results, strict=True)]
-        lead = {True: "the same model", False: "not the same model", None: "not told"}[self.same]
+        lead = {True: "the same model", False: "not the same model", None: "not told"}[self.consistent]
         return Page("Parts of a run", [first, *sections], lead)
 
     def to_frame(self) -> Any:
@@ -213,15 +223,15 @@ class Agreement(Reported):
     def to_dict(self) -> dict[str, Any]:
         """Return the result as a dictionary for JSON."""
         return {
-            "same": self.same,
+            "same": self.consistent,
             "reason": self.reason,
             "parts": list(self.names),
             "differences": [
                 {
                     "number": d.name,
                     "parts": [self.names[k] for k in d.parts],
-                    "standard_errors": finite(d.errors),
-                    "apart": d.apart,
+                    "standard_errors": finite(d.difference_in_errors),
+                    "apart": d.disjoint,
                 }
                 for d in self.differences
             ],
@@ -229,7 +239,7 @@ class Agreement(Reported):
             "degrees": self.degrees,
             "fits": {
                 name: dict(zip(self.names, row, strict=True))
-                for name, row in zip(self.names, self.crossed, strict=True)
+                for name, row in zip(self.names, self.cross_validation, strict=True)
             },
             "warnings": list(self.warnings),
             "identifications": [r.to_dict() for r in self.results],
@@ -251,17 +261,17 @@ def _cell(value: Cell) -> str:
 
 def values_of(result: Identification) -> dict[str, float]:
     """Return all parameters with a standard error, by name."""
-    return {**result.orders, **result.coefficients, **({} if result.joint is None else result.joint_values)}
+    return {**result.orders, **result.coefficients, **({} if result.fit is None else result.parameter_values)}
 
 
-def agreement(
+def consistency(
     runs: Run | Sequence[Run],
     structure: Structure,
     *,
     parts: int | None = None,
     progress: Callable[[int, int], None] | None = None,
     **options: Any,
-) -> Agreement:
+) -> Consistency:
     """Identify segments of a run separately and test whether they share one model.
 
     If the structure is right, every segment gives the same parameters. Segments are inconsistent if the 95 % intervals
@@ -298,15 +308,15 @@ def agreement(
     """
     every = as_runs(runs)
     given = None if parts is None else whole_number(parts)
-    if parts is not None and (given is None or given < PARTS):
-        raise ModelError(f"parts = {parts!r}; use a whole number, at least {PARTS}")
+    if parts is not None and (given is None or given < DEFAULT_SEGMENTS):
+        raise ModelError(f"parts = {parts!r}; use a whole number, at least {DEFAULT_SEGMENTS}")
     if len(every) > 1 and given is not None:
         raise ModelError(f"{len(every)} runs are parts by themselves; leave parts= out, or give one run")
     kept = [n for n in ("store", "start") if options.get(n) is not None]
     if kept:
         raise ModelError(f"{kept[0]}= is of one identification, and each part has its own; leave it out")
-    pieces = cut(every[0], given or PARTS) if len(every) == 1 else list(every)
-    names = _named(pieces)
+    pieces = split_run(every[0], given or DEFAULT_SEGMENTS) if len(every) == 1 else list(every)
+    names = _segment_names(pieces)
     results: list[Identification] = []
     for name, piece in zip(names, pieces, strict=True):
         try:
@@ -320,23 +330,23 @@ def agreement(
             )
         if progress is not None:
             progress(len(results), len(pieces))
-    crossed = tuple(tuple(_crossed(r, p, s) for p, s in zip(pieces, results, strict=True)) for r in results)
-    distance, degrees = together(results)
-    return Agreement(tuple(names), tuple(results), tuple(differences(results)), distance, degrees, crossed)
+    crossed = tuple(tuple(_cross_validated_fit(r, p, s) for p, s in zip(pieces, results, strict=True)) for r in results)
+    distance, degrees = joint_distance(results)
+    return Consistency(tuple(names), tuple(results), tuple(differences(results)), distance, degrees, crossed)
 
 
-def cut(run: Run, parts: int) -> list[Run]:
+def split_run(run: Run, parts: int) -> list[Run]:
     """Split a run into segments of equal length, up to one sample."""
-    if parts * FEWEST_ROWS > run.length:
+    if parts * MIN_RUN_SAMPLES > run.length:
         raise DataError(f"{run.name} has {run.length} rows, too few to be cut into {parts} parts; use fewer")
     ends = [k * run.length // parts for k in range(parts + 1)]
     return [
-        run.slice(a * run.step if a else None, b * run.step if b < run.length else None)
+        run.window(a * run.step if a else None, b * run.step if b < run.length else None)
         for a, b in itertools.pairwise(ends)
     ]
 
 
-def _named(pieces: Sequence[Run]) -> list[str]:
+def _segment_names(pieces: Sequence[Run]) -> list[str]:
     """Return segment names: the run names if they differ, otherwise the time intervals."""
     names = [p.name for p in pieces]
     if len(set(names)) == len(names):
@@ -347,7 +357,7 @@ def _named(pieces: Sequence[Run]) -> list[str]:
     return [f"{name} ({k})" for k, name in enumerate(names, 1)]
 
 
-def _crossed(result: Identification, piece: Run, own: Identification) -> dict[str, float]:
+def _cross_validated_fit(result: Identification, piece: Run, own: Identification) -> dict[str, float]:
     """Return the fit of one segment's model on another segment; empty if the simulation is not finite.
 
     The initial conditions are those of the other segment's own fit.
@@ -361,7 +371,7 @@ def _crossed(result: Identification, piece: Run, own: Identification) -> dict[st
         return {}
 
 
-def differences(results: Sequence[Identification]) -> list[Difference]:
+def differences(results: Sequence[Identification]) -> list[ParameterDifference]:
     """Return the differences of each parameter between each two segments, largest first, NaN last."""
     out = []
     for places in itertools.combinations(range(len(results)), 2):
@@ -371,13 +381,20 @@ def differences(results: Sequence[Identification]) -> list[Difference]:
             # Of each interval the end that faces the other part: those by profile likelihood are not symmetric.
             width = (low[1] - first, second - high[0])
             error = math.hypot(*width) / NORMAL_95
-            told = 0.0 < error < math.inf and all(tells(r, name) for r in pair)
+            told = 0.0 < error < math.inf and all(is_identifiable(r, name) for r in pair)
             apart = told and second - first > sum(width)
-            out.append(Difference(name, places, (second - first) / error if told else math.nan, apart))
-    return sorted(out, key=lambda d: (not d.apart, math.isnan(d.errors), 0.0 if math.isnan(d.errors) else -d.errors))
+            out.append(ParameterDifference(name, places, (second - first) / error if told else math.nan, apart))
+    return sorted(
+        out,
+        key=lambda d: (
+            not d.disjoint,
+            math.isnan(d.difference_in_errors),
+            0.0 if math.isnan(d.difference_in_errors) else -d.difference_in_errors,
+        ),
+    )
 
 
-def tells(result: Identification, name: str) -> bool:
+def is_identifiable(result: Identification, name: str) -> bool:
     """Whether a parameter is identifiable from a segment: finite standard error and a bounded side."""
     low, high = result.intervals[name]
     return 0.0 < result.standard_errors[name] < math.inf and (low > -math.inf or high < math.inf)
@@ -387,16 +404,18 @@ def is_quadratic(result: Identification, name: str) -> bool:
     """Whether both bounds of an interval are close to those of the Wald interval."""
     value, usual = values_of(result)[name], NORMAL_95 * result.standard_errors[name]
     low, high = result.intervals[name]
-    return tells(result, name) and all(usual / SKEWED <= end <= SKEWED * usual for end in (value - low, high - value))
+    return is_identifiable(result, name) and all(
+        usual / MAX_ASYMMETRY_RATIO <= end <= MAX_ASYMMETRY_RATIO * usual for end in (value - low, high - value)
+    )
 
 
-def together(results: Sequence[Identification]) -> tuple[float | None, int]:
+def joint_distance(results: Sequence[Identification]) -> tuple[float | None, int]:
     """Return the chi-squared distance of all parameters from their mean, and its degrees of freedom.
 
     Parameters without an approximately quadratic cost in every segment are left out, because their covariance says
     little. Each is scaled by its standard errors, so that units do not determine the numerical rank.
     """
-    joints = [r.joint for r in results if r.joint is not None]
+    joints = [r.fit for r in results if r.fit is not None]
     if len(joints) < len(results):
         return None, 0
     known = np.array([all(is_quadratic(r, n) for r in results) for n in joints[0].names])

@@ -9,20 +9,20 @@ import numpy as np
 
 from ftlm.errors import FtlmError, ModelError
 from ftlm.estimation.free_parameters import FreeProblem
-from ftlm.estimation.objective import Attempt, Grid
+from ftlm.estimation.objective import Iterate, Objective
 from ftlm.estimation.output_error import JointFit
-from ftlm.estimation.result import Judged, Task
+from ftlm.estimation.result import IdentificationRecord, Task
 from ftlm.svg.heat_map import Landscape
-from ftlm.utils.linalg import dot, projections, singular
+from ftlm.utils.linalg import dot, projections, thin_svd
 from ftlm.utils.validation import Floats
 
 #: Points on each axis of the cost surface, and its half-width in standard errors.
-SIDE, HALF_WIDTH = 11, 4.0
+POINTS_PER_AXIS, HALF_WIDTH_ERRORS = 11, 4.0
 #: Maximum number of evaluations that find the optimum on the finest grid.
-REFITS = 20
+OPTIMUM_EVALUATIONS = 20
 
 
-def correlated_orders(result: Judged) -> tuple[str, str, float] | None:
+def correlated_orders(result: IdentificationRecord) -> tuple[str, str, float] | None:
     """Return the two most correlated orders of a joint fit, and their correlation.
 
     Parameters
@@ -35,19 +35,19 @@ def correlated_orders(result: Judged) -> tuple[str, str, float] | None:
     tuple or None
         None with fewer than two free orders, or without a known correlation.
     """
-    if result.joint is None:
+    if result.fit is None:
         return None
-    names = list(result.joint.orders)
-    sizes = np.abs(result.joint.correlation[: len(names), : len(names)])
+    names = list(result.fit.orders)
+    sizes = np.abs(result.fit.correlation[: len(names), : len(names)])
     sizes = np.where(np.isfinite(sizes) & ~np.eye(len(names), dtype=bool), sizes, -1.0)
     if len(names) < 2 or sizes.max() < 0:
         return None
     i, j = sorted(int(k) for k in np.unravel_index(int(np.argmax(sizes)), sizes.shape))
-    return names[i], names[j], float(result.joint.correlation[i, j])
+    return names[i], names[j], float(result.fit.correlation[i, j])
 
 
 def output_error_landscape(
-    result: Judged, orders: tuple[str, str] | None = None, *, refit: bool = True
+    result: IdentificationRecord, orders: tuple[str, str] | None = None, *, refit: bool = True
 ) -> Landscape | None:
     """Compute the cost of an output-error fit over two orders, four standard errors around the optimum.
 
@@ -71,7 +71,7 @@ def output_error_landscape(
     ModelError
         A name that is no free order.
     """
-    joint, task, pair = result.joint, result.task, orders
+    joint, task, pair = result.fit, result.task, orders
     chosen = correlated_orders(result)
     if joint is None or task is None or (pair is None and chosen is None):
         return None
@@ -82,14 +82,17 @@ def output_error_landscape(
     errors = joint.standard_errors
     if not all(0 < errors[n] < math.inf for n in (first, second)):
         return None
-    around = Around.of(joint, task, (first, second), refit=refit)
+    around = CostSurface.of(joint, task, (first, second), refit=refit)
     bounds = dict(zip(around.grid.problem.orders, around.grid.problem.bounds, strict=True))
     axes = []
     for name, k in zip((first, second), around.at, strict=True):
-        low, high = around.centre[k] - HALF_WIDTH * errors[name], around.centre[k] + HALF_WIDTH * errors[name]
-        axes.append(np.linspace(max(low, bounds[name][0]), min(high, bounds[name][1]), SIDE))
+        low, high = (
+            around.center[k] - HALF_WIDTH_ERRORS * errors[name],
+            around.center[k] + HALF_WIDTH_ERRORS * errors[name],
+        )
+        axes.append(np.linspace(max(low, bounds[name][0]), min(high, bounds[name][1]), POINTS_PER_AXIS))
     scores = np.array([[around.cost(x, y) for x in axes[0]] for y in axes[1]])
-    least = min(around.rest(around.best), float(scores.min()))
+    least = min(around.residual_sum_of_squares(around.best), float(scores.min()))
     kept = "All other numbers refitted, by one linear step." if refit else "All other numbers held at the optimum."
     i, j = names.index(first), names.index(second)
     return Landscape(
@@ -104,34 +107,34 @@ def output_error_landscape(
 
 
 @dataclass(frozen=True)
-class Around:
+class CostSurface:
     """Cost surface around the optimum of a joint fit."""
 
-    grid: Grid
-    best: Attempt
+    grid: Objective
+    best: Iterate
     at: list[int]
     basis: Floats | None
 
     @classmethod
-    def of(cls, joint: JointFit, task: Task, names: tuple[str, str], *, refit: bool) -> Around:
+    def of(cls, joint: JointFit, task: Task, names: tuple[str, str], *, refit: bool) -> CostSurface:
         """Return the surface around the optimum of the finest grid, close to the estimate."""
         problem = FreeProblem.of(replace(task.structure, initial=joint.initial))
         weights = [1.0 / joint.noise[o] for o in problem.structure.outputs]
-        grid = Grid(problem, task.runs, weights, joint.refinement, shares=joint.shares)
-        best = _moved(grid, joint.values, REFITS)
+        grid = Objective(problem, task.runs, weights, joint.refinement, robust_weights=joint.robust_weights)
+        best = _minimize_from(grid, joint.values, OPTIMUM_EVALUATIONS)
         at = [problem.names.index(n) for n in names]
         others = np.delete(np.asarray(best.outcome["jacobian"]), at, axis=0)
         size = np.linalg.norm(others, axis=1, keepdims=True)
         spanned = refit and bool(others.size)
         scaled = others / np.where(size > 0, size, 1.0)
-        return cls(grid, best, at, singular(scaled.T)[0].T if spanned else None)
+        return cls(grid, best, at, thin_svd(scaled.T)[0].T if spanned else None)
 
     @property
-    def centre(self) -> Floats:
+    def center(self) -> Floats:
         """Parameters at the optimum."""
         return self.best.values
 
-    def rest(self, attempt: Attempt) -> float:
+    def residual_sum_of_squares(self, attempt: Iterate) -> float:
         """Return the residual sum of squares after one linear step of all other parameters."""
         residuals = np.asarray(attempt.outcome["residuals"])
         if self.basis is not None:
@@ -140,15 +143,15 @@ class Around:
 
     def cost(self, x: float, y: float) -> float:
         """Return the sum of squares at two parameter values; infinite if the simulation is not finite."""
-        values = self.centre.copy()
+        values = self.center.copy()
         values[self.at] = x, y
         try:
-            return self.rest(_moved(self.grid, values, 1))
+            return self.residual_sum_of_squares(_minimize_from(self.grid, values, 1))
         except FtlmError:
             return math.inf
 
 
-def _moved(grid: Grid, values: Floats, evaluations: int) -> Attempt:
+def _minimize_from(grid: Objective, values: Floats, evaluations: int) -> Iterate:
     """Minimize the cost from given parameters."""
     orders, coefficients, inputs = grid.problem.split(values.tolist())
-    return grid.descend(Attempt(orders, coefficients, "landscape", {}, inputs), evaluations, plain=True)
+    return grid.minimize(Iterate(orders, coefficients, "landscape", {}, inputs), evaluations, plain=True)

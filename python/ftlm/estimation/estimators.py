@@ -15,39 +15,41 @@ import numpy as np
 from ftlm.data.run import Run
 from ftlm.errors import FtlmError, ModelError
 from ftlm.estimation.confidence_intervals import with_intervals
-from ftlm.estimation.free_parameters import FreeProblem, known_starts, values_of_model
+from ftlm.estimation.free_parameters import FreeProblem, values_of_model, warm_starts
 from ftlm.estimation.genetic import Genetic, genetic_search
-from ftlm.estimation.linear import estimate_coefficients, step_bias
-from ftlm.estimation.model_checks import broken_law, irregular, uncertain
-from ftlm.estimation.nuisance_parameters import errors_with_orders, fit_any_start
-from ftlm.estimation.objective import Attempt, Grid, long_run
+from ftlm.estimation.linear import estimate_coefficients, step_bias_warnings
+from ftlm.estimation.model_checks import coefficient_law_warnings, identifiability_warnings, sample_warnings
+from ftlm.estimation.nuisance_parameters import errors_with_orders, fit_with_initial_conditions
+from ftlm.estimation.objective import Iterate, Objective, long_run_covariance
 from ftlm.estimation.output_error import JointFit
 from ftlm.estimation.result import Task
-from ftlm.model.model import Model, Solved
+from ftlm.model.model import Model, ModelData
 from ftlm.order_search.checkpoint import Store
 from ftlm.order_search.options import Intervals, Loss, Settings
 from ftlm.order_search.result import SearchResult
-from ftlm.order_search.search import announce, make_job, run_job
-from ftlm.progress import Course
+from ftlm.order_search.search import announce_time, make_job, run_job
+from ftlm.progress import ShareTracker
 from ftlm.simulation.discretization import prepare
-from ftlm.structure.order_grid import Lattice
+from ftlm.structure.order_grid import OrderGrid
 from ftlm.structure.structure import History, Initial, Structure
-from ftlm.utils.linalg import length, orthonormal, projections
+from ftlm.utils.linalg import orthonormal, projections, vector_norm
 from ftlm.utils.validation import Floats
 from ftlm.validation.comparison import compare_means
 
 #: Maximum number of Gauss-Newton steps, and of halvings of one step.
-STEPS = 40
-HALVINGS = 6
+MAX_GAUSS_NEWTON_STEPS = 40
+MAX_STEP_HALVINGS = 6
 #: Largest step of a converged fit, in standard errors of each parameter.
-STILL = 1e-3
+STEP_TOLERANCE_ERRORS = 1e-3
 #: Relative size below which a singular direction of the instruments is rounding.
-ALIKE = 1e-12
+INSTRUMENT_RANK_TOLERANCE = 1e-12
 #: Fewest pulses a sample interval. The estimates are those of one grid.
-EVERY = 2
+MIN_PULSES_PER_SAMPLE = 2
 
 
-def instrumented(joint: JointFit, problem: FreeProblem, runs: Sequence[Run], answers: Sequence[Run]) -> JointFit:
+def fit_with_instruments(
+    joint: JointFit, problem: FreeProblem, runs: Sequence[Run], answers: Sequence[Run]
+) -> JointFit:
     """Fit so that the residuals are uncorrelated with instruments simulated from noise-free inputs.
 
     The residuals e are those of the measured runs. The instruments are the sensitivities for `answers`, the parts of
@@ -56,28 +58,28 @@ def instrumented(joint: JointFit, problem: FreeProblem, runs: Sequence[Run], ans
     Gauss-Newton starts from the fit to `answers`. The covariance is robust to colored residuals.
     """
     weights = [1.0 / max(joint.noise[o], 1e-300) for o in problem.structure.outputs]
-    every = max(joint.refinement, EVERY)
-    measured, clean = (Grid(problem, each, weights, every=every) for each in (runs, answers))
+    every = max(joint.refinement, MIN_PULSES_PER_SAMPLE)
+    measured, clean = (Objective(problem, each, weights, every=every) for each in (runs, answers))
     values, converged = joint.values, False
-    here = _moment(measured, clean, values)
-    for _ in range(STEPS):
+    here = _evaluate_moments(measured, clean, values)
+    for _ in range(MAX_GAUSS_NEWTON_STEPS):
         attempt, slopes, instruments = here
         residuals = np.asarray(attempt.outcome["residuals"])
         bread = np.linalg.pinv(instruments @ slopes.T)
         step = -bread @ (instruments @ residuals)
         errors = np.sqrt(np.diag(_covariance(measured, attempt, bread @ instruments)))
-        if np.all(np.abs(step) <= STILL * errors):
+        if np.all(np.abs(step) <= STEP_TOLERANCE_ERRORS * errors):
             converged = True
             break
-        level = _size(here)
-        for halving in range(HALVINGS):
-            tried = problem.feasible(values, values + 0.5**halving * step)
+        level = _moment_norm(here)
+        for halving in range(MAX_STEP_HALVINGS):
+            tried = problem.feasible_point(values, values + 0.5**halving * step)
             try:
-                there = _moment(measured, clean, tried)
+                there = _evaluate_moments(measured, clean, tried)
             except FtlmError:
                 # No finite free run that far.
                 continue
-            if _size(there) < level:
+            if _moment_norm(there) < level:
                 values, here = tried, there
                 break
         else:
@@ -85,7 +87,7 @@ def instrumented(joint: JointFit, problem: FreeProblem, runs: Sequence[Run], ans
     attempt, slopes, instruments = here
     covariance = _covariance(measured, attempt, np.linalg.pinv(instruments @ slopes.T) @ instruments)
     orders, coefficients, inputs = problem.split(values.tolist())
-    levels = measured.levels(attempt)
+    levels = measured.rms_residuals(attempt)
     return replace(
         joint,
         orders=dict(zip(problem.orders, orders, strict=True)),
@@ -100,33 +102,33 @@ def instrumented(joint: JointFit, problem: FreeProblem, runs: Sequence[Run], ans
     )
 
 
-def _moment(measured: Grid, clean: Grid, values: Floats) -> tuple[Attempt, Floats, Floats]:
+def _evaluate_moments(measured: Objective, clean: Objective, values: Floats) -> tuple[Iterate, Floats, Floats]:
     """Return residuals, sensitivities on measured inputs, and sensitivities on noise-free inputs."""
     orders, coefficients, inputs = measured.problem.split(values.tolist())
-    start = Attempt(orders, coefficients, "instruments", {}, inputs)
-    at = measured.descend(start, 1, plain=True)
-    instruments = clean.descend(start, 1, plain=True)
+    start = Iterate(orders, coefficients, "instruments", {}, inputs)
+    at = measured.minimize(start, 1, plain=True)
+    instruments = clean.minimize(start, 1, plain=True)
     return at, np.asarray(at.outcome["jacobian"]), np.asarray(instruments.outcome["jacobian"])
 
 
-def _size(moment: tuple[Attempt, Floats, Floats]) -> float:
+def _moment_norm(moment: tuple[Iterate, Floats, Floats]) -> float:
     """Return the norm of the residuals projected onto the span of the instruments."""
     attempt, _, instruments = moment
-    basis = orthonormal(instruments.T, ALIKE)
-    return length(projections(basis, np.asarray(attempt.outcome["residuals"])))
+    basis = orthonormal(instruments.T, INSTRUMENT_RANK_TOLERANCE)
+    return vector_norm(projections(basis, np.asarray(attempt.outcome["residuals"])))
 
 
-def _covariance(grid: Grid, attempt: Attempt, influence: Floats) -> Floats:
+def _covariance(grid: Objective, attempt: Iterate, influence: Floats) -> Floats:
     """Return the covariance of the parameters from the influence of each residual on each of them."""
     series = [residuals for part in grid.residuals(attempt) for residuals in part.values()]
-    return long_run(influence, series)
+    return long_run_covariance(influence, series)
 
 
 #: Largest number of block pulses a run for the final instrumental-variable fit if m is not given.
-MOST_PULSES = 1 << 14
+MAX_IV_PULSES = 1 << 14
 #: Largest ratio of the final errors of two seeds. Above it some seeds have missed the optimum.
-SCATTERED = 1.2
-Told = Callable[[int, int], None] | None
+MAX_SEED_ERROR_RATIO = 1.2
+ProgressCallback = Callable[[int, int], None] | None
 
 
 @dataclass(frozen=True)
@@ -164,14 +166,16 @@ class Fit:
     covariance: tuple[tuple[float, ...], ...] | None = None
 
 
-def solved(task: Task, method: str, structure: Structure, orders: Mapping[str, float], m: int, **about: Any) -> Model:
+def make_model(
+    task: Task, method: str, structure: Structure, orders: Mapping[str, float], m: int, **about: Any
+) -> Model:
     """Return the structure of the task as a model with all parameters fixed."""
     units = {n: u for n, u in task.runs[0].units.items() if n in structure.signals}
     told = {"method": method, "runs": ", ".join(r.name for r in task.runs), **about}
     return Model(structure, orders=orders, units=units, m=m, about=told)
 
 
-def in_words(initial: Initial) -> str:
+def initial_terms_text(initial: Initial) -> str:
     """Return decided initial terms as text for the settings."""
     if isinstance(initial, History):
         return f"history, {len(initial)} powers of t up to {initial[-1]:g}"
@@ -188,15 +192,15 @@ def loss_setting(joint: JointFit) -> dict[str, Any]:
     return {} if joint.robust is None else {"loss": "huber", **asdict(joint.robust)}
 
 
-def by_output_error(
+def estimate_output_error(
     task: Task,
     m: int | None,
     threads: int,
-    progress: Told,
+    progress: ProgressCallback,
     answers: Sequence[Run] | None = None,
     loss: Loss = "squares",
     intervals: Intervals = "auto",
-    begin: Solved | Mapping[str, float] | None = None,
+    begin: ModelData | Mapping[str, float] | None = None,
     more: Mapping[str, float] | None = None,
     alone: bool = False,
 ) -> Fit:
@@ -208,36 +212,36 @@ def by_output_error(
     # An order with one value is known.
     known = {n: v[0] for n, v in task.structure.order_values.items() if len(v) == 1}
     structure = task.structure.with_orders(known)
-    record = prepare(task.runs, structure.as_given(), m, power_of_two=False, gaps=True)[0]
+    record = prepare(task.runs, structure.without_input_nonlinearities(), m, power_of_two=False, gaps=True)[0]
     start = record.initial
     begins: list[dict[str, float]] = []
     if begin is not None:
         free = FreeProblem.of(replace(structure, initial="rest"))
-        given = values_of_model(free, begin, more or {}) if isinstance(begin, Solved) else begin
-        begins = known_starts(free, given)
+        given = values_of_model(free, begin, more or {}) if isinstance(begin, ModelData) else begin
+        begins = warm_starts(free, given)
     # A fit that is made twice, with a history or without, is rare; profiles of intervals take a third, where they do.
-    course = Course(progress)
-    joint = fit_any_start(
+    course = ShareTracker(progress)
+    joint = fit_with_initial_conditions(
         answers or task.runs,
         structure,
         start,
         threads=threads,
-        progress=course.until(0.7, 0.9),
+        progress=course.subtask(0.7, 0.9),
         loss=loss,
         known=begins,
         alone=alone,
     )
-    course.at(0.7)
+    course.advance_to(0.7)
     problem = FreeProblem.of(replace(structure, initial=joint.initial))
     lower: list[str] = []
     if answers is not None:
-        joint = instrumented(joint, problem, task.runs, answers)
+        joint = fit_with_instruments(joint, problem, task.runs, answers)
     else:
         joint, lower = with_intervals(
-            joint, problem, task.runs, intervals, threads=threads, progress=course.until(1.0, 0.9), loss=loss
+            joint, problem, task.runs, intervals, threads=threads, progress=course.subtask(1.0, 0.9), loss=loss
         )
-    course.at(1.0)
-    warnings = [*lower, *uncertain(joint, problem), *irregular(task.runs, joint, problem)]
+    course.advance_to(1.0)
+    warnings = [*lower, *identifiability_warnings(joint, problem), *sample_warnings(task.runs, joint, problem)]
     if start == "rest" and joint.initial != "rest":
         # The first value alone would tell a comparison otherwise.
         structure = replace(structure, initial="history")
@@ -246,7 +250,7 @@ def by_output_error(
             "rest ask for what was before; initial='history' was used"
         )
     orders, coefficients = list(joint.orders.values()), list(joint.coefficients.values())
-    identified = structure.with_orders(joint.orders).with_coefficients(problem.named(coefficients))
+    identified = structure.with_orders(joint.orders).with_coefficients(problem.coefficients_by_name(coefficients))
     moved = problem.number_jacobian(orders, coefficients)
     with np.errstate(invalid="ignore", over="ignore"):
         # Of directions that the runs do not see covariances are no numbers, or beyond them; then none is given.
@@ -254,12 +258,12 @@ def by_output_error(
     return Fit(
         Task(task.runs, structure),
         "output-error",
-        solved(task, "output-error", identified.with_inputs(joint.inputs), {**known, **joint.orders}, record.m),
+        make_model(task, "output-error", identified.with_inputs(joint.inputs), {**known, **joint.orders}, record.m),
         len(joint.names),
         {
             "method": "output-error",
             "m": record.m,
-            "initial": in_words(joint.initial),
+            "initial": initial_terms_text(joint.initial),
             "refinement": joint.refinement,
             "starts": len(joint.starts),
             "noise": joint.noise,
@@ -273,17 +277,17 @@ def by_output_error(
     )
 
 
-def by_lattice(
+def estimate_order_search(
     task: Task,
     settings: Settings,
     m: int | None,
-    progress: Told,
+    progress: ProgressCallback,
     store: str | os.PathLike[str] | None,
     executor: Executor | None,
 ) -> Fit:
     """Search the orders on the order grid, then estimate the coefficients by the same linear method."""
     method, structure = settings.coefficients, task.structure
-    searches = searched(task, settings, m, progress, store, executor) if structure.order_names else {}
+    searches = run_order_searches(task, settings, m, progress, store, executor) if structure.order_names else {}
     orders = {n: v for search in searches.values() for n, v in search.orders.items()}
     rank = 1
     if "stage" in searches and method == "instrumental-variables" and structure.coupling == "simulated":
@@ -291,16 +295,16 @@ def by_lattice(
         orders = searches["stage"].table[rank - 1].orders
     if m is None and method == "instrumental-variables":
         # Coefficients without the bias of noise show that of the step: all samples, once the orders are found.
-        m = min(MOST_PULSES, *(run.length - 1 for run in task.runs))
+        m = min(MAX_IV_PULSES, *(run.length - 1 for run in task.runs))
     at_orders = structure.with_orders(orders)
     fit = estimate_coefficients(task.runs, at_orders, settings, m)
     errors: Mapping[str, float] = fit.errors
-    free = structure.with_orders({n: v for n, v in orders.items() if n in settled(task)})
+    free = structure.with_orders({n: v for n, v in orders.items() if n in fixed_orders(task)})
     if free.order_names and fit.errors:
         # At orders that are themselves estimates, those of the coefficients alone are too sure.
         errors = errors_with_orders(task.runs, free, {**orders, **fit.values}) or {}
-    model = solved(task, method, at_orders.with_coefficients(fit.values), orders, fit.m, **settings.to_dict())
-    edges = [(n, v) for search in searches.values() for n, v in search.edges.items()]
+    model = make_model(task, method, at_orders.with_coefficients(fit.values), orders, fit.m, **settings.to_dict())
+    edges = [(n, v) for search in searches.values() for n, v in search.at_grid_edge.items()]
     return Fit(
         task,
         method,
@@ -309,14 +313,14 @@ def by_lattice(
         {
             **settings.to_dict(),
             "m": fit.m,
-            "initial": in_words(fit.initial),
+            "initial": initial_terms_text(fit.initial),
             **({"rank": rank} if rank > 1 else {}),
             **offset_setting(structure),
         },
         [
             *fit.warnings,
-            *step_bias(task.runs, at_orders, settings, fit),
-            *broken_law(model),
+            *step_bias_warnings(task.runs, at_orders, settings, fit),
+            *coefficient_law_warnings(model),
             *(f"order {n} = {v:g} is on the edge of its interval; widen it" for n, v in edges),
         ],
         searches,
@@ -324,30 +328,30 @@ def by_lattice(
     )
 
 
-def settled(task: Task) -> set[str]:
+def fixed_orders(task: Task) -> set[str]:
     """Return the orders with one grid value, which are not estimated."""
-    parts = task.structure.parts().values() if task.structure.order_names else []
-    axes = [(task.lattice_of(part) or Lattice()).values(part) for part in parts]
+    parts = task.structure.independent_groups().values() if task.structure.order_names else []
+    axes = [(task.part_order_grid(part) or OrderGrid()).values(part) for part in parts]
     return {n for values in axes for n, v in values.items() if len(v) == 1}
 
 
-def searched(
+def run_order_searches(
     task: Task,
     settings: Settings,
     m: int | None,
-    progress: Told,
+    progress: ProgressCallback,
     store: str | os.PathLike[str] | None,
     executor: Executor | None,
 ) -> dict[str, SearchResult]:
     """Run the order searches of all independent groups of equations, with one checkpoint file."""
     jobs = {
-        name: make_job(task.runs, part, task.lattice_of(part), m=m, progress=progress, **asdict(settings))
-        for name, part in task.structure.parts().items()
+        name: make_job(task.runs, part, task.part_order_grid(part), m=m, progress=progress, **asdict(settings))
+        for name, part in task.structure.independent_groups().items()
     }
     with contextlib.ExitStack() as stack:
         requests = [job.request(name) for name, job in jobs.items()]
         kept = None if store is None else stack.enter_context(Store(store, requests))
-        announce(progress, list(jobs.values()), kept)
+        announce_time(progress, list(jobs.values()), kept)
         return {
             name: run_job(job, store=kept, number=number, executor=executor)
             for number, (name, job) in enumerate(jobs.items())
@@ -375,7 +379,9 @@ def coupled_rank(task: Task, settings: Settings, m: int | None, search: SearchRe
     return rank
 
 
-def by_genetic_algorithm(task: Task, settings: Genetic, norm: str, m: int | None, threads: int, progress: Told) -> Fit:
+def estimate_genetic(
+    task: Task, settings: Genetic, norm: str, m: int | None, threads: int, progress: ProgressCallback
+) -> Fit:
     """Estimate orders and coefficients by a genetic algorithm, one equation at a time or jointly."""
     structure = task.structure
     parts = {"stage": structure} if structure.has_order_law else {o: structure.equation(o) for o in structure.outputs}
@@ -390,21 +396,21 @@ def by_genetic_algorithm(task: Task, settings: Genetic, norm: str, m: int | None
         own = replace(settings, bounds={n: b for n, b in settings.bounds.items() if n in free[name]})
         records = prepare(task.runs, part, record.m, power_of_two=True)
         ends[name] = genetic_search(
-            records, part, task.lattice_of(part), own, norm=norm, threads=threads, progress=progress
+            records, part, task.part_order_grid(part), own, norm=norm, threads=threads, progress=progress
         )
     orders = {n: v for end in ends.values() for n, v in end.orders.items()}
     coefficients = {n: v for end in ends.values() for n, v in end.coefficients.items()}
     bounds = {n: b for end in ends.values() for n, b in end.bounds.items()}
     seeds, identified = list(settings.seeds), structure.with_orders(orders).with_coefficients(coefficients)
-    model = solved(task, "genetic", identified, orders, record.m, seeds=str(seeds))
-    warnings = broken_law(model)
+    model = make_model(task, "genetic", identified, orders, record.m, seeds=str(seeds))
+    warnings = coefficient_law_warnings(model)
     for name, (low, high) in bounds.items():
         value = {**orders, **coefficients}[name]
         if min(value - low, high - value) < 1e-3 * (high - low) and value not in (0.0, 2.0):
             warnings.append(f"{name} = {value:.4g} is on its bound for the genetic algorithm; widen it")
     for name, end in ends.items():
         low, high = min(end.errors.values()), max(end.errors.values())
-        if high > SCATTERED * low:
+        if high > MAX_SEED_ERROR_RATIO * low:
             warnings.append(
                 f"{name}: the seeds of the genetic algorithm end at errors from {low:.4g} to {high:.4g}; "
                 "it has not found the optimum of each"

@@ -13,15 +13,15 @@ import numpy as np
 
 from ftlm import _core
 from ftlm.data.run import Run
-from ftlm.data.sampling import bridged
+from ftlm.data.sampling import interpolate_gaps
 from ftlm.errors import ModelError
-from ftlm.model.model import Solved
+from ftlm.model.model import ModelData
 from ftlm.simulation.discretization import affine, initial_tuple
 from ftlm.structure.equation import Friction, Stribeck
-from ftlm.structure.input_nonlinearity import FreeInput
+from ftlm.structure.input_nonlinearity import FreeInputParameter
 from ftlm.structure.order import Order
 from ftlm.structure.structure import Hints, History, Offset, Structure
-from ftlm.utils.linalg import dot, length
+from ftlm.utils.linalg import dot, vector_norm
 from ftlm.utils.validation import Floats, check_known, real_number
 
 
@@ -37,7 +37,7 @@ class FreeProblem:
     @cached_property
     def core(self) -> _core.JointProblem:
         """Estimation problem of the core, built from the structure."""
-        return _core.JointProblem(told(self.structure))
+        return _core.JointProblem(core_arguments(self.structure))
 
     @cached_property
     def orders(self) -> tuple[str, ...]:
@@ -60,7 +60,7 @@ class FreeProblem:
         return tuple(self.core.bounds[: len(self.orders)])
 
     @property
-    def inputs(self) -> tuple[FreeInput, ...]:
+    def inputs(self) -> tuple[FreeInputParameter, ...]:
         """Free delays, saturations and dead zones of inputs."""
         return self.structure.free_inputs
 
@@ -87,11 +87,11 @@ class FreeProblem:
         """Bounds of all free parameters. Coefficients are unbounded, except that friction must dissipate."""
         return self.core.bounds
 
-    def feasible(self, at: Floats, towards: Floats) -> Floats:
+    def feasible_point(self, at: Floats, towards: Floats) -> Floats:
         """Return the last feasible point on the line from a feasible point to another one."""
         return self.core.feasible(at, towards)
 
-    def named(self, values: Sequence[float]) -> dict[str, float]:
+    def coefficients_by_name(self, values: Sequence[float]) -> dict[str, float]:
         """Return every coefficient of the structure by name, from the free ones."""
         free = dict(zip(self.coefficients, map(float, values), strict=True))
         out: dict[str, float] = {}
@@ -132,12 +132,12 @@ class FreeProblem:
                 rows.append(row)
         return np.stack(rows)
 
-    def free_from(self, estimated: Mapping[str, float]) -> list[float]:
+    def free_coefficients(self, estimated: Mapping[str, float]) -> list[float]:
         """Return the free coefficients from separately estimated ones; ratios are medians over equations."""
         return self.core.free_from(dict(estimated))
 
 
-def told(structure: Structure) -> Any:
+def core_arguments(structure: Structure) -> Any:
     """Return a structure with decided initial terms as keyword data of the core."""
     signals, hints = structure.signals, structure.hints or Hints()
     states = structure.filter_states(structure.initial)
@@ -173,21 +173,21 @@ def told(structure: Structure) -> Any:
         "inputs": [(i.name, signals.index(i.signal), i.law, i.bounds) for i in structure.free_inputs],
         "laws": list(structure.coefficient_law),
         "hints": {
-            "highest": hints.highest,
-            "natural": [(name, list(values)) for name, values in hints.natural.items()],
-            "exceeds": list(hints.exceeds.items()),
-            "positive": list(hints.positive),
-            "known": list(hints.known.items()),
+            "highest": hints.highest_order_range,
+            "natural": [(name, list(values)) for name, values in hints.nominal_orders.items()],
+            "exceeds": list(hints.min_ratios.items()),
+            "positive": list(hints.positive_coefficients),
+            "known": list(hints.nominal_coefficients.items()),
         },
     }
 
 
 #: Integer orders at which a term starts that the known values lack, and the largest number of warm starts.
-WHOLE = (0.0, 1.0, 2.0)
-MOST = 9
+DEFAULT_START_ORDERS = (0.0, 1.0, 2.0)
+MAX_WARM_STARTS = 9
 
 
-def known_starts(problem: FreeProblem, known: Mapping[str, float]) -> list[dict[str, float]]:
+def warm_starts(problem: FreeProblem, known: Mapping[str, float]) -> list[dict[str, float]]:
     """Return warm starts from values by name.
 
     A coefficient without a value starts at 0, so its term has no effect at first. An order without a value starts at
@@ -211,14 +211,14 @@ def known_starts(problem: FreeProblem, known: Mapping[str, float]) -> list[dict[
         if name in known:
             places[name] = [float(known[name])]
         elif name in problem.orders:
-            places[name] = [v for v in WHOLE if low <= v <= high] or [0.5 * (low + high)]
+            places[name] = [v for v in DEFAULT_START_ORDERS if low <= v <= high] or [0.5 * (low + high)]
         else:
             places[name] = [0.0 if low <= 0.0 <= high else low if math.isfinite(low) else high]
-    points = itertools.islice(itertools.product(*places.values()), MOST)
+    points = itertools.islice(itertools.product(*places.values()), MAX_WARM_STARTS)
     return [dict(zip(places, point, strict=True)) for point in points]
 
 
-def values_of_model(problem: FreeProblem, model: Solved, more: Mapping[str, float]) -> dict[str, float]:
+def values_of_model(problem: FreeProblem, model: ModelData, more: Mapping[str, float]) -> dict[str, float]:
     """Return the values that a model of the same outputs gives to the free parameters of a problem.
 
     `more` are values that the model has under a coefficient law. A fixed order of the model is used for the free order
@@ -233,7 +233,7 @@ def values_of_model(problem: FreeProblem, model: Solved, more: Mapping[str, floa
     found = {**model.orders, **model.coefficients, **more}
     there = {e.output: e for e in model.equations}
 
-    def tell(order: Order, value: Order) -> None:
+    def set_order(order: Order, value: Order) -> None:
         if order.is_single and not value.names:
             found.setdefault(order.names[0], value.constant)
 
@@ -241,43 +241,43 @@ def values_of_model(problem: FreeProblem, model: Solved, more: Mapping[str, floa
         other = there.get(item.output)
         if other is None:
             continue
-        tell(item.order, other.order)
+        set_order(item.order, other.order)
         named = {t.name: t for t in other.terms if t.name is not None}
         for term in item.terms:
             if term.coefficient in named:
-                tell(term.order, named[str(term.coefficient)].order)
+                set_order(term.order, named[str(term.coefficient)].order)
     return {n: v for n, v in found.items() if n in problem.names}
 
 
-def spans(runs: Sequence[Run]) -> list[tuple[float, float]]:
+def sampling_spans(runs: Sequence[Run]) -> list[tuple[float, float]]:
     """Return sample interval and duration of each run [s]."""
     return [(run.step, run.length * run.step) for run in runs]
 
 
-def clock(problem: FreeProblem, runs: Sequence[Run]) -> _core.JointClock:
+def time_scaling(problem: FreeProblem, runs: Sequence[Run]) -> _core.JointClock:
     """Return the time scaling: the geometric mean of the frequencies of the run length and of Nyquist.
 
     A coefficient of D^nu y beside D^alpha y has the unit of time to the power -(alpha - nu), which changes with free
     orders.
     """
-    return problem.core.clock(spans(runs))
+    return problem.core.clock(sampling_spans(runs))
 
 
 #: Relative difference up to which two signals are multiples of each other: rounding of files.
-ROUNDED = 1e-9
+COLLINEARITY_TOLERANCE = 1e-9
 
 
-def twin_words(runs: Sequence[Run], structure: Structure) -> str | None:
+def describe_collinear_inputs(runs: Sequence[Run], structure: Structure) -> str | None:
     """Return a message that names two proportional inputs of one equation and order, or None."""
     for item in structure.equations:
         driving = [t for t in item.terms if t.signal != item.output and isinstance(t.coefficient, str)]
         for one, other in itertools.combinations(driving, 2):
             if one.signal == other.signal or one.order != other.order:
                 continue
-            first, second = (np.concatenate([bridged(run[t.signal]) for run in runs]) for t in (one, other))
+            first, second = (np.concatenate([interpolate_gaps(run[t.signal]) for run in runs]) for t in (one, other))
             size = dot(first, first)
             ratio = dot(first, second) / size if size > 0 else 0.0
-            if length(second - ratio * first) <= ROUNDED * length(second):
+            if vector_norm(second - ratio * first) <= COLLINEARITY_TOLERANCE * vector_norm(second):
                 return (
                     f"{other.signal} is {ratio:.6g} times {one.signal} on every run, which no run tells apart: leave "
                     f"out the term of {other.coefficient} or that of {one.coefficient}, fix one of them, or add a run "

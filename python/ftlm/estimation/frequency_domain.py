@@ -15,25 +15,25 @@ from numpy.typing import ArrayLike, NDArray
 from ftlm.data.frequency_data import FrequencyData, as_frequency_data
 from ftlm.errors import ConvergenceError, DataError, ModelError
 from ftlm.estimation.frequency_result import FrequencyIdentification
-from ftlm.estimation.levenberg_marquardt import Fitted, damped
+from ftlm.estimation.levenberg_marquardt import LeastSquaresResult, constrained_least_squares
 from ftlm.estimation.objective import covariance_of
 from ftlm.model.model import Estimate, Model
-from ftlm.progress import Course, Progress
+from ftlm.progress import Progress, ShareTracker
 from ftlm.structure.equation import Equation, Term
-from ftlm.structure.order import MAX_EXCESS, MAX_ORDER, MIN_INPUT_ORDER, SEARCHED_ORDER, Order, Values
+from ftlm.structure.order import MAX_DEFAULT_SEARCH_ORDER, MAX_IMPROPER_ORDER, MAX_ORDER, MIN_INPUT_ORDER, Order, Values
 from ftlm.structure.parser import equation
 from ftlm.structure.structure import Structure
-from ftlm.utils.files import LOG
-from ftlm.utils.resources import between, expected
-from ftlm.utils.statistics import ROUNDING, chi_squared_99, is_white
+from ftlm.utils.files import PACKAGE_LOGGER
+from ftlm.utils.resources import duration_bounds, estimate_duration
+from ftlm.utils.statistics import NEGLIGIBLE_RESIDUAL_SHARE, chi_squared_99, is_white
 from ftlm.utils.validation import Complex, Floats, as_floats, check_known
 
 #: Smallest highest order of an equation, and smallest gap between it and the order of an own term.
-LEAST_ORDER, GAP = 0.01, 0.005
+MIN_HIGHEST_ORDER, MIN_ORDER_GAP = 0.01, 0.005
 
 
 @dataclass(frozen=True)
-class Measured:
+class ResponseRecord:
     """One measured frequency response in scaled time, with its weights."""
 
     output: int
@@ -59,7 +59,7 @@ class ResponseProblem:
         every = np.concatenate([r.frequency for r in records])
         self.unit = float(np.exp(np.mean(np.log(every))))
         self.records = [
-            Measured(structure.outputs.index(r.output), r.input, r.frequency / self.unit, r.response, w)
+            ResponseRecord(structure.outputs.index(r.output), r.input, r.frequency / self.unit, r.response, w)
             for r, w in zip(records, weights, strict=True)
         ]
         self.known_delays = {name: value * self.unit for name, value in structure.delay.items()}
@@ -74,15 +74,15 @@ class ResponseProblem:
         """Return the value of an order."""
         return order.constant + math.fsum(w * float(values[self._place[n]]) for n, w in order.weights)
 
-    def scaled(self, values: Floats) -> Floats:
+    def in_problem_units(self, values: Floats) -> Floats:
         """Convert parameters from seconds to the time unit of this problem."""
-        return self._turned(values, -1.0)
+        return self._convert_time_unit(values, -1.0)
 
     def in_seconds(self, values: Floats) -> Floats:
         """Convert parameters from the time unit of this problem to seconds."""
-        return self._turned(values, 1.0)
+        return self._convert_time_unit(values, 1.0)
 
-    def _turned(self, values: Floats, way: float) -> Floats:
+    def _convert_time_unit(self, values: Floats, way: float) -> Floats:
         out = values.astype(np.float64).copy()
         for name, at in self._coefficient.items():
             item, term = self.term_of[name]
@@ -124,7 +124,7 @@ class ResponseProblem:
         """Return the model response at every record, and its derivatives by all parameters (one column each)."""
         return [self._response(record, values, slopes) for record in self.records]
 
-    def _response(self, record: Measured, values: Floats, slopes: bool) -> tuple[Complex, Complex | None]:
+    def _response(self, record: ResponseRecord, values: Floats, slopes: bool) -> tuple[Complex, Complex | None]:
         s = 1j * record.frequency
         log = np.log(s)
         items, names = self.structure.equations, self.structure.outputs
@@ -207,11 +207,11 @@ class ResponseProblem:
 
         for item in self.structure.equations:
             keep(item.order, MAX_ORDER, f"the highest order of {item.output} is at most 10")
-            keep(item.order, -LEAST_ORDER, f"the highest order of {item.output} is above 0", -1.0)
+            keep(item.order, -MIN_HIGHEST_ORDER, f"the highest order of {item.output} is above 0", -1.0)
             for term in item.terms:
                 own = term.signal == item.output
                 name = str(term.order)
-                low, above = (0.0, -GAP) if own else (MIN_INPUT_ORDER, MAX_EXCESS - GAP)
+                low, above = (0.0, -MIN_ORDER_GAP) if own else (MIN_INPUT_ORDER, MAX_IMPROPER_ORDER - MIN_ORDER_GAP)
                 keep(term.order, -low, f"order {name} is from {low:g} on", -1.0)
                 both = dict(term.order.weights)
                 for n, w in item.order.weights:
@@ -233,7 +233,7 @@ class ResponseProblem:
         table = np.array(rows) if rows else np.zeros((0, len(self.names)))
         return table, np.array(limits), words
 
-    def searched(self) -> dict[str, tuple[float, ...] | tuple[float, float]]:
+    def search_ranges(self) -> dict[str, tuple[float, ...] | tuple[float, float]]:
         """Return the grid values of each free order, or the interval of its default search."""
         out: dict[str, tuple[float, ...] | tuple[float, float]] = {}
         for name in self.orders:
@@ -247,19 +247,19 @@ class ResponseProblem:
     def _highest(self) -> float:
         """Return the highest order of the default search."""
         orders = [o for e in self.structure.equations for o in (e.order, *(t.order for t in e.terms))]
-        return max([SEARCHED_ORDER, *(o.constant for o in orders if not o.names)])
+        return max([MAX_DEFAULT_SEARCH_ORDER, *(o.constant for o in orders if not o.names)])
 
 
 #: Largest number of grid points, of frequencies, of reweighting iterations, and of initial guesses returned.
-MOST_POINTS, MOST_FREQUENCIES, REWEIGHTED, KEPT = 3000, 160, 4, 8
+MAX_GRID_POINTS, MAX_START_FREQUENCIES, REWEIGHTING_ITERATIONS, MAX_STARTS = 3000, 160, 4, 8
 #: Points whose exact cost is computed, corner frequencies tried for one own term, and points at which they are tried.
-JUDGED, CORNERS, CORNERED = 60, 14, 120
+MAX_EVALUATED_POINTS, CORNERS_PER_POINT, MAX_CORNER_POINTS = 60, 14, 120
 
 
-def starts(problem: ResponseProblem) -> list[Floats]:
+def initial_guesses(problem: ResponseProblem) -> list[Floats]:
     """Return feasible initial guesses, most promising first."""
     points = _points(problem)
-    found = _solved(problem, points) if problem.coefficients else list(points)
+    found = _linear_coefficients(problem, points) if problem.coefficients else list(points)
     judged = []
     for values in found:
         left, _ = problem.residuals(values, slopes=False)
@@ -273,20 +273,20 @@ def starts(problem: ResponseProblem) -> list[Floats]:
     for _, values in judged:
         if all(np.max(np.abs(values[free] - other[free]), initial=0.0) > 0.1 for other in kept) or not kept:
             kept.append(values)
-        if len(kept) == KEPT:
+        if len(kept) == MAX_STARTS:
             break
     return kept
 
 
 def _points(problem: ResponseProblem) -> Floats:
     """Return the grid points of orders and delays, one row each, with coefficients 0."""
-    axes = list(problem.searched().values())
+    axes = list(problem.search_ranges().values())
     given = [n in problem.structure.order_values for n in problem.orders]
     delays = [(item.bounds[0] * problem.unit, item.bounds[1] * problem.unit) for item in problem.structure.free_inputs]
     # A delay that is off by a third of a period at the highest frequency still leads downhill.
     fastest = max(float(r.frequency.max()) for r in problem.records)
     fine = [int(np.clip(np.ceil((high - low) * fastest / 2.0) + 1, 2, 60)) for low, high in delays]
-    room = max(MOST_POINTS // int(np.prod(fine, initial=1)), 60)
+    room = max(MAX_GRID_POINTS // int(np.prod(fine, initial=1)), 60)
     count = len(axes)
     lattice = int(np.prod([len(a) if g else 1 for a, g in zip(axes, given, strict=True)], initial=1))
     free = count - sum(given)
@@ -331,10 +331,13 @@ def _halton(count: int, width: int) -> Floats:
     return out
 
 
-def _solved(problem: ResponseProblem, points: Floats) -> list[Floats]:
+def _linear_coefficients(problem: ResponseProblem, points: Floats) -> list[Floats]:
     """Return the coefficients at the most promising points, one equation after the other."""
-    slow = points[np.unique(np.linspace(0, len(points) - 1, min(CORNERED, len(points))).astype(int))]
-    points, corners = np.concatenate([points, np.repeat(slow, CORNERS, axis=0)]), _corners(problem, len(points), slow)
+    slow = points[np.unique(np.linspace(0, len(points) - 1, min(MAX_CORNER_POINTS, len(points))).astype(int))]
+    points, corners = (
+        np.concatenate([points, np.repeat(slow, CORNERS_PER_POINT, axis=0)]),
+        _corner_frequencies(problem, len(points), slow),
+    )
     table = points.copy()
     total = np.zeros(len(points))
     for i, item in enumerate(problem.structure.equations):
@@ -342,38 +345,40 @@ def _solved(problem: ResponseProblem, points: Floats) -> list[Floats]:
         records = [r for r in problem.records if r.output == i]
         if not records:
             continue
-        answers, cost = _equation(problem, i, names, [_thinned_levy(r) for r in records], points, corners)
+        answers, cost = _equation(problem, i, names, [_subsample_record(r) for r in records], points, corners)
         for k, name in enumerate(names):
             table[:, problem.names.index(name)] = answers[:, k]
         total += np.where(np.isfinite(cost), cost, np.inf)
-    best = np.argsort(total, kind="stable")[:JUDGED]
+    best = np.argsort(total, kind="stable")[:MAX_EVALUATED_POINTS]
     return [table[k] for k in best if np.isfinite(total[k])]
 
 
-def _corners(problem: ResponseProblem, first: int, slow: Floats) -> Floats:
+def _corner_frequencies(problem: ResponseProblem, first: int, slow: Floats) -> Floats:
     """Return corner frequencies imposed on the slowest own term, for points after the first; else NaN.
 
     If noise hides a small arc, reweighted least squares are biased and own terms are far too small or too large. With
     the slowest own term fixed, the remaining bias is small.
     """
     every = np.concatenate([r.frequency for r in problem.records])
-    tried = np.geomspace(every.min(), every.max(), CORNERS)
+    tried = np.geomspace(every.min(), every.max(), CORNERS_PER_POINT)
     return np.concatenate([np.full(first, np.nan), np.tile(tried, len(slow))])
 
 
-def _thinned_levy(record: Measured) -> Measured:
+def _subsample_record(record: ResponseRecord) -> ResponseRecord:
     """Return a record subsampled to the number of frequencies that an initial guess needs."""
     order = np.argsort(record.frequency, kind="stable")
-    if order.size > MOST_FREQUENCIES:
-        order = order[np.linspace(0, order.size - 1, MOST_FREQUENCIES).astype(int)]
-    return Measured(record.output, record.input, record.frequency[order], record.response[order], record.weight[order])
+    if order.size > MAX_START_FREQUENCIES:
+        order = order[np.linspace(0, order.size - 1, MAX_START_FREQUENCIES).astype(int)]
+    return ResponseRecord(
+        record.output, record.input, record.frequency[order], record.response[order], record.weight[order]
+    )
 
 
 def _equation(
     problem: ResponseProblem,
     place: int,
     names: Sequence[str],
-    records: Sequence[Measured],
+    records: Sequence[ResponseRecord],
     points: Floats,
     corners: Floats,
 ) -> tuple[Floats, Floats]:
@@ -412,7 +417,7 @@ def _equation(
     answers = np.zeros((len(points), len(names)))
     cost = np.full(len(points), np.inf)
     with np.errstate(all="ignore"):
-        for _ in range(REWEIGHTED):
+        for _ in range(REWEIGHTING_ITERATIONS):
             scaled = weight / np.abs(bottom)
             if left is not None:
                 answers = _least_squares(left * scaled[..., None], goal * scaled)
@@ -466,7 +471,7 @@ def _shifts(problem: ResponseProblem, signal: str, points: Floats) -> Floats:
     return np.full(len(points), problem.known_delays.get(signal, 0.0))
 
 
-def _signal(problem: ResponseProblem, record: Measured, name: str, late: Complex) -> Complex | float:
+def _signal(problem: ResponseProblem, record: ResponseRecord, name: str, late: Complex) -> Complex | float:
     """Return the factor of a term: a measured response, the delayed input, or 0."""
     outputs = problem.structure.outputs
     if name not in outputs:
@@ -485,17 +490,17 @@ def _signal(problem: ResponseProblem, record: Measured, name: str, late: Complex
 
 Weights = Literal["auto", "relative", "uniform", "deviation"]
 #: Largest relative difference of the sums of squares of one and the same optimum.
-SAME = 1e-6
+SAME_OPTIMUM_TOLERANCE = 1e-6
 #: Relative size of the residuals below which they are rounding.
-FLOOR = 1e-13
+RESIDUAL_FLOOR_RATIO = 1e-13
 #: Largest number of frequencies of a record in the multistart.
-RACING = 800
+MAX_MULTISTART_FREQUENCIES = 800
 #: Fractions of the progress at which the initial guesses are found, and at which the multistart ends.
-STARTED, RACED = 0.25, 0.85
+STARTS_END_FRACTION, MULTISTART_END_FRACTION = 0.25, 0.85
 #: Range of the measured durations, relative to the time estimate.
-CAME_TO = (0.4, 4.0)
+DURATION_FACTOR_RANGE = (0.4, 4.0)
 #: Number of lags of the whiteness test, from one frequency to the next.
-LAGS = 8
+WHITENESS_LAGS = 8
 
 
 def identify_frequency(
@@ -551,7 +556,7 @@ def identify_frequency(
         No initial guess has a finite response.
     """
     wanted = _structure(structure, orders, fixed, delay)
-    records = _fitting(as_frequency_data(data), wanted)
+    records = _match_records(as_frequency_data(data), wanted)
     kind, weight = _weights(records, weights)
     problem = ResponseProblem(wanted, records, weight)
     count, numbers = 2 * sum(r.frequency.size for r in records), len(problem.names)
@@ -561,37 +566,58 @@ def identify_frequency(
             "measure more frequencies, or fix numbers"
         )
     if isinstance(progress, Progress):
-        progress.expect("the fit", *between(expected(0.007 * numbers**2 + 2e-6 * numbers * count, 1), CAME_TO))
-    course = Course(progress)
+        progress.expect(
+            "the fit",
+            *duration_bounds(estimate_duration(0.007 * numbers**2 + 2e-6 * numbers * count, 1), DURATION_FACTOR_RANGE),
+        )
+    course = ShareTracker(progress)
     rows, limits, words = problem.constraints()
-    LOG.info("identifying %s from %s", ", ".join(problem.names), ", ".join(r.name for r in records))
+    PACKAGE_LOGGER.info("identifying %s from %s", ", ".join(problem.names), ", ".join(r.name for r in records))
     total = sum(float(np.sum(np.abs(r.response * w) ** 2)) for r, w in zip(records, weight, strict=True))
     # Starts race on no more frequencies than tell them apart; the best goes on with all.
-    few, light = zip(*(_thinned(r, w) for r, w in zip(records, weight, strict=True)), strict=True)
-    racing = problem if count <= 2 * RACING else ResponseProblem(wanted, few, light)
-    begun = [*_begun(racing, start, *racing.constraints()[:2]), *starts(racing)]
-    course.at(STARTED)
+    few, light = zip(*(_subsample_data(r, w) for r, w in zip(records, weight, strict=True)), strict=True)
+    racing = problem if count <= 2 * MAX_MULTISTART_FREQUENCIES else ResponseProblem(wanted, few, light)
+    begun = [*_user_start(racing, start, *racing.constraints()[:2]), *initial_guesses(racing)]
+    course.advance_to(STARTS_END_FRACTION)
     fits = []
     for values in begun:
-        fits.append(_fit(racing, values, *racing.constraints()[:2], FLOOR**2 * total))
-        course.at(STARTED + (RACED - STARTED) * len(fits) / len(begun))
+        fits.append(_fit(racing, values, *racing.constraints()[:2], RESIDUAL_FLOOR_RATIO**2 * total))
+        course.advance_to(
+            STARTS_END_FRACTION + (MULTISTART_END_FRACTION - STARTS_END_FRACTION) * len(fits) / len(begun)
+        )
     fits = [f for f in fits if math.isfinite(f.cost)]
     if not fits:
         raise ConvergenceError(
             "no start has a finite response: the lattice of orders is empty or singular; widen orders=, or give start="
         )
     first = min(fits, key=lambda f: f.cost)
-    reached = sum(f.cost <= first.cost * (1 + SAME) + 1e4 * FLOOR**2 * total for f in fits)
+    reached = sum(
+        f.cost <= first.cost * (1 + SAME_OPTIMUM_TOLERANCE) + 1e4 * RESIDUAL_FLOOR_RATIO**2 * total for f in fits
+    )
     # A last race from where the best ended, so that what a wall had cut goes on.
-    best = _fit(problem, problem.scaled(racing.in_seconds(first.values)), rows, limits, FLOOR**2 * total)
+    best = _fit(
+        problem,
+        problem.in_problem_units(racing.in_seconds(first.values)),
+        rows,
+        limits,
+        RESIDUAL_FLOOR_RATIO**2 * total,
+    )
     if racing is problem and first.cost < best.cost:
         best = first
-    course.at(1.0)
-    held = [words[k] for k in best.held]
-    result = _result(problem, records, best, kind, (reached, len(fits)), held, exact=best.cost <= ROUNDING**2 * total)
-    LOG.info("identified: %s", result.verdict())
+    course.advance_to(1.0)
+    held = [words[k] for k in best.active_constraints]
+    result = _result(
+        problem,
+        records,
+        best,
+        kind,
+        (reached, len(fits)),
+        held,
+        exact=best.cost <= NEGLIGIBLE_RESIDUAL_SHARE**2 * total,
+    )
+    PACKAGE_LOGGER.info("identified: %s", result.verdict())
     for warning in result.warnings:
-        LOG.warning("%s", warning)
+        PACKAGE_LOGGER.warning("%s", warning)
     return result
 
 
@@ -624,7 +650,7 @@ def _structure(
     return replace(wanted, coupling="simulated", initial="auto")
 
 
-def _fitting(records: Sequence[FrequencyData], structure: Structure) -> list[FrequencyData]:
+def _match_records(records: Sequence[FrequencyData], structure: Structure) -> list[FrequencyData]:
     """Return the records with their signal names; raise if signals or equations have no counterpart."""
     outputs = structure.outputs
     inputs = tuple(s for s in structure.signals if s not in outputs)
@@ -662,7 +688,7 @@ def _weights(records: Sequence[FrequencyData], weights: object) -> tuple[str, li
         if len(records) > 1:
             raise ModelError("weights= as an array are of one record; give each record its deviation instead")
         (record,) = records
-        return "deviation", [1.0 / _stated(record, weights)]
+        return "deviation", [1.0 / _given_deviations(record, weights)]
     if weights not in ("auto", "relative", "uniform", "deviation"):
         raise ModelError(
             f"weights={weights!r} is not known; use 'auto', 'relative', 'uniform', 'deviation' or standard deviations"
@@ -686,7 +712,7 @@ def _weights(records: Sequence[FrequencyData], weights: object) -> tuple[str, li
     return "relative", [1.0 / np.abs(r.response) for r in records]
 
 
-def _stated(record: FrequencyData, weights: object) -> Floats:
+def _given_deviations(record: FrequencyData, weights: object) -> Floats:
     """Return standard deviations given by the user in place of those of a record."""
     given = as_floats("weights", weights)
     if given.shape != record.frequency.shape:
@@ -694,18 +720,20 @@ def _stated(record: FrequencyData, weights: object) -> Floats:
     return np.asarray(replace(record, deviation=given).deviation)
 
 
-def _thinned(record: FrequencyData, weight: Floats) -> tuple[FrequencyData, Floats]:
+def _subsample_data(record: FrequencyData, weight: Floats) -> tuple[FrequencyData, Floats]:
     """Return a record and its weights, subsampled evenly to the number of frequencies of the multistart."""
-    if record.frequency.size <= RACING:
+    if record.frequency.size <= MAX_MULTISTART_FREQUENCIES:
         return record, weight
     order = np.argsort(record.frequency, kind="stable")
-    kept = order[np.linspace(0, order.size - 1, RACING).astype(int)]
+    kept = order[np.linspace(0, order.size - 1, MAX_MULTISTART_FREQUENCIES).astype(int)]
     return replace(record, frequency=record.frequency[kept], response=record.response[kept], deviation=None), weight[
         kept
     ]
 
 
-def _begun(problem: ResponseProblem, start: Mapping[str, float] | None, rows: Floats, limits: Floats) -> list[Floats]:
+def _user_start(
+    problem: ResponseProblem, start: Mapping[str, float] | None, rows: Floats, limits: Floats
+) -> list[Floats]:
     """Return the initial guess of the user, if any."""
     if start is None:
         return []
@@ -714,26 +742,26 @@ def _begun(problem: ResponseProblem, start: Mapping[str, float] | None, rows: Fl
     check_known("start", start, problem.names)
     free = len(problem.orders) + len(problem.coefficients)
     values = np.array([float(start.get(n, 1.0 if k < free else 0.0)) for k, n in enumerate(problem.names)])
-    begun = problem.scaled(values)
+    begun = problem.in_problem_units(values)
     if not (np.all(np.isfinite(values)) and np.all(rows @ begun <= limits + 1e-9)):
         raise ModelError("start= is out of the bounds of orders or delays, or not finite; choose values within them")
     return [begun]
 
 
-def _fit(problem: ResponseProblem, values: Floats, rows: Floats, limits: Floats, floor: float) -> Fitted:
+def _fit(problem: ResponseProblem, values: Floats, rows: Floats, limits: Floats, floor: float) -> LeastSquaresResult:
     def cost(numbers: Floats) -> float:
         left, _ = problem.residuals(numbers, slopes=False)
         return float(left @ left)
 
     if not math.isfinite(cost(values)):
-        return Fitted(values, math.inf, False, 1, ())
-    return damped(problem.residuals, cost, values, rows, limits, floor=floor)
+        return LeastSquaresResult(values, math.inf, False, 1, ())
+    return constrained_least_squares(problem.residuals, cost, values, rows, limits, floor=floor)
 
 
 def _result(
     problem: ResponseProblem,
     records: list[FrequencyData],
-    best: Fitted,
+    best: LeastSquaresResult,
     kind: str,
     reached: tuple[int, int],
     held: list[str],
@@ -743,7 +771,7 @@ def _result(
     left, slopes = problem.residuals(best.values)
     steep = problem.slopes_in_seconds(best.values, slopes)
     values = problem.in_seconds(best.values)
-    rising = _rising(records)
+    rising = _frequency_order(records)
     left, steep = left[rising], steep[rising]
     series = _series(records, left)
     free = left.size - values.size
@@ -755,7 +783,7 @@ def _result(
     else:
         covariance = covariance_of(steep.T, series, best.cost)
     errors = np.sqrt(np.maximum(np.diag(covariance), 0.0))
-    white = exact or all(is_white(e, min(LAGS, max(e.size // 4, 1))) for e in series)
+    white = exact or all(is_white(e, min(WHITENESS_LAGS, max(e.size // 4, 1))) for e in series)
     factor = float(_student(free)) if kind != "deviation" or too_large else NormalDist().inv_cdf(0.975)
     names = problem.names
     standard = dict(zip(names, errors.tolist(), strict=True))
@@ -772,7 +800,7 @@ def _result(
     if not best.converged:
         warnings.append("the fit ended before it stood still")
     warnings += [f"an order or a delay is on its bound: {w}" for w in held]
-    warnings += _untold(problem, values, standard)
+    warnings += _identifiability_warnings(problem, values, standard)
     named = dict(zip(names, values.tolist(), strict=True))
     model = _model(problem, records, named, values, covariance, standard, warnings)
     intervals = {n: (named[n] - factor * e, named[n] + factor * e) for n, e in standard.items()}
@@ -793,7 +821,7 @@ def _result(
     )
 
 
-def _rising(records: Sequence[FrequencyData]) -> NDArray[np.intp]:
+def _frequency_order(records: Sequence[FrequencyData]) -> NDArray[np.intp]:
     """Return indices that sort the residuals of each record by frequency."""
     places, at = [], 0
     for record in records:
@@ -810,7 +838,7 @@ def _series(records: Sequence[FrequencyData], left: Floats) -> list[Floats]:
     return [*np.split(left[:half], ends[:-1]), *np.split(left[half:], ends[:-1])]
 
 
-def _untold(problem: ResponseProblem, values: Floats, standard: Mapping[str, float]) -> list[str]:
+def _identifiability_warnings(problem: ResponseProblem, values: Floats, standard: Mapping[str, float]) -> list[str]:
     """Return warnings about parameters that the data determine poorly or not at all."""
     unseen = [n for n, e in standard.items() if not math.isfinite(e)]
     out = []

@@ -16,50 +16,50 @@ from markupsafe import Markup
 from ftlm.analysis.frequency_response import frequency_response, response_deviation, response_inputs
 from ftlm.data.frequency_data import FrequencyData, as_frequency_data
 from ftlm.errors import DataError, FtlmError
-from ftlm.estimation.verdict import TRUST, Verdict, verdict_html
+from ftlm.estimation.verdict import TRUST_LEVEL, Verdict, verdict_html
 from ftlm.model.model import Model
 from ftlm.svg.complex_plane import locus_chart
-from ftlm.svg.figure import SMALL, Figure
+from ftlm.svg.figure import SMALL_WIDTH_PX, Figure
 from ftlm.svg.html_page import Section, Table, write_page
 from ftlm.svg.line_chart import line_chart
-from ftlm.utils.formatting import Cell, number, symbol, unbounded, wrapped
+from ftlm.utils.formatting import Cell, format_bound, number, symbol, wrap_text
 from ftlm.utils.statistics import NORMAL_95
 from ftlm.utils.validation import Complex, Floats
-from ftlm.validation.findings import BAD, CARE, concerns
+from ftlm.validation.findings import LEVEL_DO_NOT_USE, LEVEL_WITH_CARE, group_warnings
 
 if TYPE_CHECKING:
     pass
 
-DECIBEL = 20.0 / np.log(10.0)
+DECIBELS_PER_NEPER = 20.0 / np.log(10.0)
 #: Points of a smooth curve over the measured band.
-CURVE = 160
+CURVE_POINTS = 160
 
 
-def grid_of(record: FrequencyData) -> tuple[Floats, Floats]:
+def curve_frequencies(record: FrequencyData) -> tuple[Floats, Floats]:
     """Return the frequencies of a smooth curve, and those of a record among them.
 
     One frequency lies between each two measured ones, so that every measured point is drawn as a separate dot.
     """
     measured = np.unique(record.frequency)
     between = np.sqrt(measured[1:] * measured[:-1])
-    smooth = np.geomspace(measured[0], measured[-1], CURVE) if measured.size > 1 else measured
+    smooth = np.geomspace(measured[0], measured[-1], CURVE_POINTS) if measured.size > 1 else measured
     return np.unique(np.concatenate([measured, between, smooth])), measured
 
 
-def curve_of(model: Model, record: FrequencyData, omega: Floats) -> tuple[Complex, Floats | None, Floats | None]:
+def model_curve(model: Model, record: FrequencyData, omega: Floats) -> tuple[Complex, Floats | None, Floats | None]:
     """Return the model response, and half-widths of the 95 % bands of its gain [dB] and phase [degrees]."""
     at = model.outputs.index(record.output), response_inputs(model, coupled=True).index(record.input)
     response = frequency_response(model, omega)[at]
     if model.estimate is None or model.estimate.covariance is None:
         return response, None, None
     gain, phase = (part[at] for part in response_deviation(model, omega))
-    return response, DECIBEL * NORMAL_95 * gain, np.degrees(NORMAL_95 * phase)
+    return response, DECIBELS_PER_NEPER * NORMAL_95 * gain, np.degrees(NORMAL_95 * phase)
 
 
-def bode_of(model: Model, record: FrequencyData) -> list[Figure]:
+def bode_figures(model: Model, record: FrequencyData) -> list[Figure]:
     """Return gain and phase charts of a record and the model with its 95 % band."""
-    omega, _ = grid_of(record)
-    response, wide, turned = curve_of(model, record, omega)
+    omega, _ = curve_frequencies(record)
+    response, wide, turned = model_curve(model, record, omega)
     phase = np.degrees(np.unwrap(np.angle(response)))
     order = np.argsort(record.frequency, kind="stable")
     place = np.searchsorted(omega, record.frequency[order])
@@ -71,7 +71,7 @@ def bode_of(model: Model, record: FrequencyData) -> list[Figure]:
     size = f"gain [dB of {record.unit}]" if record.unit else "gain [dB]"
     figures = []
     for kind, label, ours, theirs, half in (
-        ("gain", size, DECIBEL * np.log(np.abs(response)), record.gain[order], wide),
+        ("gain", size, DECIBELS_PER_NEPER * np.log(np.abs(response)), record.gain[order], wide),
         ("phase", "phase [degrees]", phase, angles, turned),
     ):
         dots = np.full(omega.size, np.nan)
@@ -85,7 +85,7 @@ def bode_of(model: Model, record: FrequencyData) -> list[Figure]:
                 bands=bands,
                 title=f"{title}: {kind}",
                 dots=("measured",),
-                width=SMALL,
+                width=SMALL_WIDTH_PX,
                 height=220,
                 x_label="frequency [rad/s]",
                 y_label=label,
@@ -95,10 +95,10 @@ def bode_of(model: Model, record: FrequencyData) -> list[Figure]:
     return figures
 
 
-def locus_of(model: Model, record: FrequencyData) -> Figure:
+def nyquist_figure(model: Model, record: FrequencyData) -> Figure:
     """Return the Nyquist chart of a record and the model; impedances with -Im upwards."""
-    omega, _ = grid_of(record)
-    response, _, _ = curve_of(model, record, omega)
+    omega, _ = curve_frequencies(record)
+    response, _, _ = model_curve(model, record, omega)
     impedance = record.unit.endswith("Ω")
     unit = f" [{record.unit}]" if record.unit else ""
     upward = -1.0 if impedance else 1.0
@@ -113,18 +113,18 @@ def locus_of(model: Model, record: FrequencyData) -> Figure:
     )
 
 
-def misses_of(model: Model, record: FrequencyData) -> Figure:
+def relative_residual_figure(model: Model, record: FrequencyData) -> Figure:
     """Return the chart of the residuals relative to the measured response, by frequency."""
     order = np.argsort(record.frequency, kind="stable")
     omega = record.frequency[order]
-    response, _, _ = curve_of(model, record, omega)
+    response, _, _ = model_curve(model, record, omega)
     size = np.abs(record.response[order])
     missed = 100.0 * (response - record.response[order]) / np.where(size > 0, size, np.max(size) or 1.0)
     return line_chart(
         omega,
         [("real part", missed.real), ("imaginary part", missed.imag)],
         log_x=True,
-        width=SMALL,
+        width=SMALL_WIDTH_PX,
         height=220,
         title=f"{symbol(record.output)} from {symbol(record.input)}, {record.name}: residuals",
         x_label="frequency [rad/s]",
@@ -133,9 +133,9 @@ def misses_of(model: Model, record: FrequencyData) -> Figure:
 
 
 #: Largest relative error of a usable model.
-USELESS = 0.5
+MAX_RELATIVE_ERROR = 0.5
 #: A validation is worse if its error exceeds this multiple of the estimation error and this relative error.
-MORE, LITTLE = 3.0, 0.02
+VALIDATION_ERROR_RATIO, MIN_VALIDATION_ERROR = 3.0, 0.02
 NOT_TRIED = "no response that it was not fitted to has been tried"
 
 
@@ -186,7 +186,7 @@ class FrequencyValidation:
         return {"errors": [vars(e) for e in self.errors], "verdict": self.verdict.to_dict()}
 
     def __str__(self) -> str:
-        return "\n".join([*wrapped(str(self.verdict)), *_errors_in_words(self.errors)])
+        return "\n".join([*wrap_text(str(self.verdict)), *_errors_in_words(self.errors)])
 
 
 @dataclass(frozen=True, eq=False)
@@ -227,7 +227,7 @@ class FrequencyIdentification:
     covariance: Floats
     chi_squared: float | None
     converged: bool
-    reached: tuple[int, int]
+    start_counts: tuple[int, int]
     white: bool
     warnings: tuple[str, ...] = field(default=())
 
@@ -259,9 +259,9 @@ class FrequencyIdentification:
         DataError
             A record has other signals.
         """
-        others = tuple(placed(self.model, record) for record in as_frequency_data(data))
+        others = tuple(assign_signals(self.model, record) for record in as_frequency_data(data))
         errors = tuple(error_of(self.model, record) for record in others)
-        return FrequencyValidation(others, errors, self._judged(errors, others))
+        return FrequencyValidation(others, errors, self._assess(errors, others))
 
     def verdict(self, validation: FrequencyValidation | None = None) -> Verdict:
         """Return the verdict on the model.
@@ -271,36 +271,42 @@ class FrequencyIdentification:
         a fit that did not converge or ended on a bound, a validation error above 2 % and three times the estimation
         error, or no validation.
         """
-        return self._judged(None) if validation is None else validation.verdict
+        return self._assess(None) if validation is None else validation.verdict
 
-    def _judged(self, others: tuple[ResponseError, ...] | None, data: Sequence[FrequencyData] = ()) -> Verdict:
+    def _assess(self, others: tuple[ResponseError, ...] | None, data: Sequence[FrequencyData] = ()) -> Verdict:
         found: list[tuple[str, str, str]] = []
         own = self.errors
         for error in (*own, *(others or ())):
-            if not error.rms <= 100 * USELESS:
+            if not error.rms <= 100 * MAX_RELATIVE_ERROR:
                 what = f"it misses {error.rms:.3g} % of {error.output} from {error.input} ({error.name})"
-                found.append((BAD, what, "add a term, a delay or a free order"))
+                found.append((LEVEL_DO_NOT_USE, what, "add a term, a delay or a free order"))
         grows = self._grows()
         if grows:
-            found.append((BAD, grows, "measure a wider band, bound the coefficient that pushes, or take fewer terms"))
-        for concern in concerns(self.warnings):
-            if concern.kind.level in (BAD, CARE):
+            found.append(
+                (
+                    LEVEL_DO_NOT_USE,
+                    grows,
+                    "measure a wider band, bound the coefficient that pushes, or take fewer terms",
+                )
+            )
+        for concern in group_warnings(self.warnings):
+            if concern.kind.level in (LEVEL_DO_NOT_USE, LEVEL_WITH_CARE):
                 found.append((concern.kind.level, concern.warnings[0].partition(";")[0], concern.kind.remedy))
         if others is not None:
             most = max(e.rms for e in own)
-            lost = [e for e in others if e.rms > MORE * most and e.rms > 100 * LITTLE]
+            lost = [e for e in others if e.rms > VALIDATION_ERROR_RATIO * most and e.rms > 100 * MIN_VALIDATION_ERROR]
             if lost:
                 words = f"it misses {most:.3g} % of its own data and {lost[0].rms:.3g} % of {lost[0].name}"
-                found.append((CARE, words, "fewer free numbers, or both records in one fit"))
+                found.append((LEVEL_WITH_CARE, words, "fewer free numbers, or both records in one fit"))
         same = any(np.array_equal(a.response, b.response) for a in data for b in self.data)
         if others is None or same:
-            found.append((CARE, NOT_TRIED, "validate(load_frequency(file)), or --validation FILE"))
-        found.sort(key=lambda item: item[0] != BAD)
+            found.append((LEVEL_WITH_CARE, NOT_TRIED, "validate(load_frequency(file)), or --validation FILE"))
+        found.sort(key=lambda item: item[0] != LEVEL_DO_NOT_USE)
         if found:
             level, reason, remedy = found[0]
             return Verdict(level, reason, remedy, tuple(dict.fromkeys(r for _, r, _ in found)))
         shown = ", ".join(f"{e.name} {e.rms:.2g} %" for e in others or ())
-        return Verdict(TRUST, f"it predicts what it was not fitted to (error {shown}), residuals are noise")
+        return Verdict(TRUST_LEVEL, f"it predicts what it was not fitted to (error {shown}), residuals are noise")
 
     def _grows(self) -> str:
         """Return a text about poles with a positive real part; empty if there are none."""
@@ -315,17 +321,17 @@ class FrequencyIdentification:
 
     def summary(self, validation: FrequencyValidation | None = None) -> str:
         """Return the summary: verdict, equations, parameters, modes, errors and warnings."""
-        from ftlm.report.text_summary import behaviour_in_words, concerns_in_words, equations_in_words
+        from ftlm.report.text_summary import behavior_lines, equation_lines, finding_lines
 
-        lines = [*wrapped(str(self.verdict(validation))), "", *equations_in_words(self.model), ""]
+        lines = [*wrap_text(str(self.verdict(validation))), "", *equation_lines(self.model), ""]
         lines += self._numbers()
-        lines += [*behaviour_in_words(self.model), ""]
+        lines += [*behavior_lines(self.model), ""]
         lines += _errors_in_words(self.errors)
         if validation is not None:
             lines += ["validation", *_errors_in_words(validation.errors)[1:]]
         if self.chi_squared is not None:
             lines.append(f"residuals over stated deviations: {math.sqrt(self.chi_squared):.3g} (1 of a right model)")
-        same, tried = self.reached
+        same, tried = self.start_counts
         lines.append(
             f"residuals white: {'yes' if self.white else 'no'}; weights: {self.weights}; {same} of {tried} "
             "starts ended here"
@@ -334,7 +340,7 @@ class FrequencyIdentification:
             [
                 *lines,
                 *(f"note: {w}" for r in self.data for w in r.warnings),
-                *concerns_in_words(self.warnings, "result.warnings"),
+                *finding_lines(self.warnings, "result.warnings"),
             ]
         )
 
@@ -345,8 +351,10 @@ class FrequencyIdentification:
         rows = []
         for name, value in self.values.items():
             low, high = self.intervals[name]
-            ends = f"[{unbounded(low, '.5g')}, {unbounded(high, '.5g')}]"
-            rows.append((name, f"{value:.6g}", f"± {unbounded(self.standard_errors[name])}", ends, units.get(name, "")))
+            ends = f"[{format_bound(low, '.5g')}, {format_bound(high, '.5g')}]"
+            rows.append(
+                (name, f"{value:.6g}", f"± {format_bound(self.standard_errors[name])}", ends, units.get(name, ""))
+            )
         widths = [max(len(row[k]) for row in rows) for k in range(4)]
         lines = [
             f"  {a:<{widths[0]}}  {b:>{widths[1]}} {c:<{widths[2]}}  {d:<{widths[3]}}  {e}".rstrip()
@@ -357,7 +365,11 @@ class FrequencyIdentification:
     def figures(self) -> list[Figure]:
         """Return Bode and Nyquist charts with the measured points, and residual charts."""
         model = self.model
-        return [f for r in self.data for f in (*bode_of(model, r), locus_of(model, r), misses_of(model, r))]
+        return [
+            f
+            for r in self.data
+            for f in (*bode_figures(model, r), nyquist_figure(model, r), relative_residual_figure(model, r))
+        ]
 
     def report(
         self, path: str | os.PathLike[str], *, validation: FrequencyValidation | None = None, force: bool = False
@@ -378,7 +390,7 @@ class FrequencyIdentification:
         DataError
             The file exists and ``force`` is not set, or cannot be written.
         """
-        from ftlm.report.html_report import behaviour_figures, behaviour_tables, first_warnings, title_of, verdict_box
+        from ftlm.report.html_report import behavior_figures, behavior_tables, first_warnings, title_of, verdict_box
         from ftlm.report.typesetting import equation_html, parameter_table
 
         shown, more = first_warnings(self.warnings)
@@ -388,8 +400,8 @@ class FrequencyIdentification:
             [Markup("<p>{}</p>").format(e) for e in equations],
             warnings=shown,
             more=more,
-            tables=[parameter_table(self.model), *behaviour_tables(self.model)],
-            figures=behaviour_figures(self.model),
+            tables=[parameter_table(self.model), *behavior_tables(self.model)],
+            figures=behavior_figures(self.model),
             small=True,
         )
         rows: list[list[Cell]] = [_error_row("estimation", e) for e in self.errors]
@@ -398,7 +410,7 @@ class FrequencyIdentification:
         notes = [w for r in self.data for w in r.warnings]
         figures = self.figures()
         for record in () if validation is None else validation.data:
-            figures += [*bode_of(self.model, record), locus_of(self.model, record)]
+            figures += [*bode_figures(self.model, record), nyquist_figure(self.model, record)]
         response = Section(
             "Measured and modelled response",
             [f"Weights: {self.weights}. Residuals white: {'yes' if self.white else 'no'} (99 %).", *notes],
@@ -429,7 +441,7 @@ class FrequencyIdentification:
             "chi_squared": self.chi_squared,
             "errors": [vars(e) for e in self.errors],
             "converged": self.converged,
-            "starts": list(self.reached),
+            "starts": list(self.start_counts),
             "white": self.white,
             "warnings": list(self.warnings),
         }
@@ -447,7 +459,7 @@ class FrequencyIdentification:
         return str(verdict_html(self.verdict()) + equations + parameter_table(self.model).to_html() + drawn)
 
 
-def placed(model: Model, record: FrequencyData) -> FrequencyData:
+def assign_signals(model: Model, record: FrequencyData) -> FrequencyData:
     """Return a record with the output and input names of the model it is compared with."""
     inputs = response_inputs(model, coupled=True)
     out = {"output": record.output, "input": record.input}
@@ -462,7 +474,7 @@ def placed(model: Model, record: FrequencyData) -> FrequencyData:
     return replace(record, output=out["output"], input=out["input"])
 
 
-def modelled(model: Model, record: FrequencyData, omega: Floats | None = None) -> Complex:
+def model_response(model: Model, record: FrequencyData, omega: Floats | None = None) -> Complex:
     """Return the model response at the frequencies of a record, or at `omega`."""
     response = frequency_response(model, record.frequency if omega is None else omega)
     inputs = response_inputs(model, coupled=True)
@@ -473,7 +485,7 @@ def modelled(model: Model, record: FrequencyData, omega: Floats | None = None) -
 def error_of(model: Model, record: FrequencyData) -> ResponseError:
     """Return the error of a model on one record."""
     size = np.abs(record.response)
-    missed = np.abs(modelled(model, record) - record.response) / np.where(size > 0, size, np.max(size) or 1.0)
+    missed = np.abs(model_response(model, record) - record.response) / np.where(size > 0, size, np.max(size) or 1.0)
     at = int(np.argmax(missed))
     rms = 100 * float(np.sqrt(np.mean(missed**2)))
     return ResponseError(

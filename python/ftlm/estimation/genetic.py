@@ -14,32 +14,32 @@ from numpy.typing import NDArray
 from ftlm import _core
 from ftlm.errors import ModelError
 from ftlm.progress import Progress
-from ftlm.simulation.discretization import Record, lattice_tuple
+from ftlm.simulation.discretization import Record, order_grid_tuple
 from ftlm.structure.equation import Equation
 from ftlm.structure.order import Order
-from ftlm.structure.order_grid import Lattice
+from ftlm.structure.order_grid import OrderGrid
 from ftlm.structure.structure import Structure
 from ftlm.utils.validation import Floats, check_threads, whole_number
 
 #: Increment of the coded orders. It is as fine as the paper prints, so regressors are shared.
-RESOLUTION = 0.001
+ORDER_RESOLUTION = 0.001
 #: Bounds of a coefficient with a nominal value: plus and minus this multiple of it.
 STATED_RANGE = 2.0
 #: Bounds of any other coefficient: this multiple of the value at which its term alone is as large as the output.
 SCALE_RANGE = 4.0
 #: Fraction of the population that survives and mates.
-PARENTS = 0.25
+PARENT_FRACTION = 0.25
 #: Distribution indices of simulated binary crossover and of polynomial mutation, and the crossover probability: the
 #: values of Deb and Agrawal (Complex Systems 1995).
-CROSSOVER_SPREAD, MUTATION_SPREAD, CROSSED = 15.0, 20.0, 0.9
+CROSSOVER_DISTRIBUTION_INDEX, MUTATION_DISTRIBUTION_INDEX, CROSSOVER_PROBABILITY = 15.0, 20.0, 0.9
 #: Copies of parents are not evaluated again. The number of generations may exceed the nominal one by this factor.
-MOST_COPIES = 4
+MAX_GENERATION_FACTOR = 4
 #: Range of the time estimate, relative to the first generation: most later candidates are abandoned early.
-FOLLOWED = (0.1, 1.5)
+DURATION_FACTOR_RANGE = (0.1, 1.5)
 #: Fitness of candidates that diverge or cannot become parents. PyGAD accepts finite numbers only.
-HOPELESS = -1e300
+INFEASIBLE_FITNESS = -1e300
 #: Largest number of evaluations used without an explicit request: an order grid under an order law has millions.
-MOST_EVALUATIONS = 1_000_000
+MAX_DEFAULT_EVALUATIONS = 1_000_000
 
 
 @dataclass(frozen=True)
@@ -118,13 +118,13 @@ class _Rows:
         """Return the rows for the core; `repaired` limits each order to the largest that alpha allows."""
         rows = genes @ self.weights + self.constants
         if repaired:
-            highest = rows[:, :1] - np.where(self.own, RESOLUTION, 0.0)
+            highest = rows[:, :1] - np.where(self.own, ORDER_RESOLUTION, 0.0)
             n = self.own.size
             rows[:, 1 : 1 + n] = np.minimum(rows[:, 1 : 1 + n], highest)
         return rows
 
 
-class Problem:
+class GeneticProblem:
     """Genetic coding of a structure and the evaluation of candidates.
 
     Parameters
@@ -138,7 +138,13 @@ class Problem:
     """
 
     def __init__(
-        self, records: list[Record], structure: Structure, lattice: Lattice, settings: Genetic, norm: str, threads: int
+        self,
+        records: list[Record],
+        structure: Structure,
+        lattice: OrderGrid,
+        settings: Genetic,
+        norm: str,
+        threads: int,
     ) -> None:
         values = lattice.values(structure)
         self.order_names, self.coefficient_names = structure.order_names, structure.coefficient_names
@@ -188,27 +194,27 @@ class Problem:
         """Return the size of the order grid; under an order law an upper bound of it."""
         if self.law:
             return math.prod(len(v) for v in values.values())
-        orders = lattice_tuple(structure.equations[0], records[0].signals, values)
+        orders = order_grid_tuple(structure.equations[0], records[0].signals, values)
         return _core.lattice_size(orders, list(records[0].inputs))
 
-    def tidy(self, genes: Floats) -> Floats:
+    def round_orders(self, genes: Floats) -> Floats:
         """Round the orders to the order resolution."""
         tidied = np.array(genes, dtype=np.float64)
         n = len(self.order_names)
-        tidied[:, :n] = np.round(tidied[:, :n] / RESOLUTION) * RESOLUTION
+        tidied[:, :n] = np.round(tidied[:, :n] / ORDER_RESOLUTION) * ORDER_RESOLUTION
         return tidied
 
     def errors(self, genes: Floats, limit: float) -> Floats:
         """Return the error of each row of genes, or infinity above the limit."""
-        tidied, total = self.tidy(genes), np.zeros(genes.shape[0])
+        tidied, total = self.round_orders(genes), np.zeros(genes.shape[0])
         for part in self.rows:
             rows = np.ascontiguousarray(part.candidates(tidied, repaired=not self.law))
             total += part.points.scores(rows, limit * part.scale, self.threads) / part.scale
         return np.where(total <= limit, total, np.inf)
 
-    def named(self, genes: Floats) -> tuple[dict[str, float], dict[str, float]]:
+    def values_by_name(self, genes: Floats) -> tuple[dict[str, float], dict[str, float]]:
         """Return orders and coefficients by name."""
-        tidied = self.tidy(genes[None, :])
+        tidied = self.round_orders(genes[None, :])
         n = len(self.order_names)
         values = dict(zip(self.names, tidied[0].tolist(), strict=True))
         if not self.law:
@@ -245,7 +251,7 @@ def default_bounds(
 def genetic_search(
     records: list[Record],
     structure: Structure,
-    lattice: Lattice,
+    lattice: OrderGrid,
     settings: Genetic,
     *,
     norm: str = "l1",
@@ -277,9 +283,9 @@ def genetic_search(
             "the genetic baseline knows no initial terms and needs runs that start at rest; "
             "slice the runs, or give the structure initial='rest'"
         )
-    problem = Problem(records, structure, lattice, settings, norm, check_threads(threads))
+    problem = GeneticProblem(records, structure, lattice, settings, norm, check_threads(threads))
     wanted = settings.evaluations or problem.size
-    if settings.evaluations is None and wanted > MOST_EVALUATIONS:
+    if settings.evaluations is None and wanted > MAX_DEFAULT_EVALUATIONS:
         raise ModelError(
             f"the lattice has {wanted} candidates, too many to evaluate one by one; give Genetic(evaluations=…)"
         )
@@ -288,65 +294,65 @@ def genetic_search(
     if isinstance(progress, Progress):
         name = "the stage" if structure.has_order_law else structure.outputs[0]
         progress.expect(f"the genetic algorithm on {name}", *_seconds(problem, settings.population, total))
-    ends: dict[int, _Kept] = {}
+    ends: dict[int, _ParentThreshold] = {}
     for number, seed in enumerate(settings.seeds):
 
-        def told(count: int, before: int = number * wanted) -> None:
+        def report_evaluations(count: int, before: int = number * wanted) -> None:
             if progress is not None:
                 progress(min(before + count, total), total)
 
-        ends[int(seed)] = _evolved(pygad.GA, problem, settings.population, int(seed), wanted, told)
+        ends[int(seed)] = _evolve(pygad.GA, problem, settings.population, int(seed), wanted, report_evaluations)
     best = min(ends.values(), key=lambda kept: kept.best)
     if not math.isfinite(best.best):
         raise ModelError("no candidate of the genetic algorithm had a finite error; narrow its bounds")
-    orders, coefficients = problem.named(best.genes)
+    orders, coefficients = problem.values_by_name(best.genes)
     errors = {seed: kept.best for seed, kept in ends.items()}
     return GeneticRun(orders, coefficients, errors, {s: kept.count for s, kept in ends.items()}, problem.bounds)
 
 
-def _seconds(problem: Problem, population: int, evaluations: int) -> tuple[float, float]:
+def _seconds(problem: GeneticProblem, population: int, evaluations: int) -> tuple[float, float]:
     """Return the shortest and longest expected time [s], extrapolated from the first generation."""
     low, high = np.array([problem.bounds[n] for n in problem.names]).T
     genes = low + np.random.default_rng(0).random((population, low.size)) * (high - low)
     begun = time.perf_counter()
     problem.errors(genes, math.inf)
     each = (time.perf_counter() - begun) / population
-    return FOLLOWED[0] * each * evaluations, FOLLOWED[1] * each * evaluations
+    return DURATION_FACTOR_RANGE[0] * each * evaluations, DURATION_FACTOR_RANGE[1] * each * evaluations
 
 
-def _evolved(
-    algorithm: Any, problem: Problem, population: int, seed: int, wanted: int, told: Callable[[int], None]
-) -> _Kept:
+def _evolve(
+    algorithm: Any, problem: GeneticProblem, population: int, seed: int, wanted: int, told: Callable[[int], None]
+) -> _ParentThreshold:
     """Run the genetic algorithm from one seed until its evaluations are spent.
 
     Real-coded genes, simulated binary crossover, polynomial mutation and truncation selection; survivors are the
     parents of the next generation. A candidate is abandoned once its partial error excludes it from the parents, which
     changes no generation.
     """
-    parents = max(2, round(PARENTS * population))
-    kept = _Kept(parents)
+    parents = max(2, round(PARENT_FRACTION * population))
+    kept = _ParentThreshold(parents)
     bounds = [problem.bounds[n] for n in problem.names]
     low, high = np.array(bounds).T
 
-    def enough(_: Any) -> str | None:
+    def check_budget(_: Any) -> str | None:
         return "stop" if kept.count >= wanted else None
 
     def crossover(chosen: Any, size: tuple[int, int], running: Any) -> Floats:
-        return simulated_binary(np.asarray(chosen, dtype=np.float64), size, running.numpy_random_generator)
+        return simulated_binary_crossover(np.asarray(chosen, dtype=np.float64), size, running.numpy_random_generator)
 
     def mutation(children: Any, running: Any) -> Floats:
-        return polynomial(np.asarray(children, dtype=np.float64), low, high, running.numpy_random_generator)
+        return polynomial_mutation(np.asarray(children, dtype=np.float64), low, high, running.numpy_random_generator)
 
     def fitness(_: Any, genes: Any, __: Any) -> list[float]:
         candidates = np.asarray(genes, dtype=np.float64)
         errors = problem.errors(candidates, kept.limit)
-        kept.take(errors, candidates)
+        kept.add_generation(errors, candidates)
         told(kept.count)
-        return np.where(np.isfinite(errors), -errors, HOPELESS).tolist()  # type: ignore[no-any-return]
+        return np.where(np.isfinite(errors), -errors, INFEASIBLE_FITNESS).tolist()  # type: ignore[no-any-return]
 
     algorithm(
-        num_generations=MOST_COPIES * math.ceil(wanted / (population - parents)),
-        on_generation=enough,
+        num_generations=MAX_GENERATION_FACTOR * math.ceil(wanted / (population - parents)),
+        on_generation=check_budget,
         num_parents_mating=parents,
         keep_elitism=parents,
         sol_per_pop=population,
@@ -364,29 +370,29 @@ def _evolved(
     return kept
 
 
-def simulated_binary(parents: Floats, size: tuple[int, int], random: Any) -> Floats:
+def simulated_binary_crossover(parents: Floats, size: tuple[int, int], random: Any) -> Floats:
     """Return children by simulated binary crossover (Deb and Agrawal, Complex Systems 9, 1995)."""
     pairs = (size[0] + 1) // 2
     first, second = (parents[random.randint(0, parents.shape[0], pairs)] for _ in range(2))
     u = random.random_sample(first.shape)
     with np.errstate(divide="ignore"):
-        spread = np.where(u <= 0.5, 2.0 * u, 0.5 / (1.0 - u)) ** (1.0 / (CROSSOVER_SPREAD + 1.0))
-    crossed = (random.random_sample(first.shape) < 0.5) & (random.random_sample((pairs, 1)) < CROSSED)
+        spread = np.where(u <= 0.5, 2.0 * u, 0.5 / (1.0 - u)) ** (1.0 / (CROSSOVER_DISTRIBUTION_INDEX + 1.0))
+    crossed = (random.random_sample(first.shape) < 0.5) & (random.random_sample((pairs, 1)) < CROSSOVER_PROBABILITY)
     spread = np.where(crossed, spread, 1.0)
     middle, half = 0.5 * (first + second), 0.5 * (first - second)
     return np.concatenate([middle + spread * half, middle - spread * half])[: size[0]]
 
 
-def polynomial(children: Floats, low: Floats, high: Floats, random: Any) -> Floats:
+def polynomial_mutation(children: Floats, low: Floats, high: Floats, random: Any) -> Floats:
     """Return children after polynomial mutation, about one gene each (Deb and Goyal 1996)."""
     u = random.random_sample(children.shape)
-    power = 1.0 / (MUTATION_SPREAD + 1.0)
+    power = 1.0 / (MUTATION_DISTRIBUTION_INDEX + 1.0)
     move = np.where(u < 0.5, (2.0 * u) ** power - 1.0, 1.0 - (2.0 * (1.0 - u)) ** power)
     moved = random.random_sample(children.shape) < 1.0 / children.shape[1]
     return np.clip(children + np.where(moved, move * (high - low), 0.0), low, high)
 
 
-class _Kept:
+class _ParentThreshold:
     """Error threshold of the parents: the smallest errors so far, as many as there are parents."""
 
     def __init__(self, parents: int) -> None:
@@ -400,7 +406,7 @@ class _Kept:
         """Largest error among the current parents."""
         return float(self._errors[-1])
 
-    def take(self, errors: Floats, genes: Floats) -> None:
+    def add_generation(self, errors: Floats, genes: Floats) -> None:
         """Add the errors of one generation."""
         self.count += errors.size
         first = int(np.argmin(errors))
@@ -410,15 +416,15 @@ class _Kept:
 
 
 #: Candidates of one generation for each gene: the default of SciPy.
-EACH = 15
+CANDIDATES_PER_GENE = 15
 #: Logarithm that replaces an error that is not finite; larger than that of any finite error.
-DIVERGED = 1e3
+MAX_LOG_ERROR = 1e3
 
 
 def differential_evolution_search(
     records: list[Record],
     structure: Structure,
-    lattice: Lattice,
+    lattice: OrderGrid,
     settings: Genetic,
     *,
     norm: str = "l1",
@@ -441,10 +447,10 @@ def differential_evolution_search(
         raise ModelError("differential evolution needs SciPy; pip install 'ftlm[genetic]'") from None
     if records[0].start != (False, []) or records[0].offset != "none":
         raise ModelError("differential evolution knows no initial terms and no offset; slice the runs to start at rest")
-    problem = Problem(records, structure, lattice, settings, norm, check_threads(threads))
+    problem = GeneticProblem(records, structure, lattice, settings, norm, check_threads(threads))
     wanted = settings.evaluations or problem.size
     bounds = [problem.bounds[n] for n in problem.names]
-    generation = EACH * sum(low < high for low, high in bounds)
+    generation = CANDIDATES_PER_GENE * sum(low < high for low, high in bounds)
     generations = max(0, math.ceil(wanted / generation) - 1)
     total, done = (generations + 1) * generation * len(settings.seeds), 0
 
@@ -456,7 +462,7 @@ def differential_evolution_search(
             progress(min(done, total), total)
         # Only comparisons count, and the spread of errors over hundreds of decades is no number.
         with np.errstate(divide="ignore"):
-            return np.clip(np.log(problem.errors(rows, math.inf)), -DIVERGED, DIVERGED)
+            return np.clip(np.log(problem.errors(rows, math.inf)), -MAX_LOG_ERROR, MAX_LOG_ERROR)
 
     ends: dict[int, Any] = {}
     for seed in settings.seeds:
@@ -464,7 +470,7 @@ def differential_evolution_search(
             errors,
             bounds,
             maxiter=generations,
-            popsize=EACH,
+            popsize=CANDIDATES_PER_GENE,
             tol=0.0,
             polish=False,
             updating="deferred",
@@ -472,10 +478,10 @@ def differential_evolution_search(
             rng=np.random.default_rng(int(seed)),
         )
     best = min(ends.values(), key=lambda end: float(end.fun))
-    if best.fun >= DIVERGED:
+    if best.fun >= MAX_LOG_ERROR:
         raise ModelError("no candidate of differential evolution had a finite error; narrow its bounds")
-    orders, coefficients = problem.named(np.asarray(best.x, dtype=np.float64))
-    each = {seed: math.exp(end.fun) if end.fun < DIVERGED else math.inf for seed, end in ends.items()}
+    orders, coefficients = problem.values_by_name(np.asarray(best.x, dtype=np.float64))
+    each = {seed: math.exp(end.fun) if end.fun < MAX_LOG_ERROR else math.inf for seed, end in ends.items()}
     # SciPy counts calls, of a generation each.
     evaluations = {seed: int(end.nfev) * generation for seed, end in ends.items()}
     return GeneticRun(orders, coefficients, each, evaluations, problem.bounds)

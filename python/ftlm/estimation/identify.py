@@ -14,32 +14,53 @@ from msgspec import UNSET
 
 from ftlm.data.run import Run, as_runs
 from ftlm.errors import ConvergenceError, DataError, FtlmError, InternalError, ModelError
-from ftlm.estimation.closed_loop import by_reference, driven_by
-from ftlm.estimation.estimators import Fit, by_genetic_algorithm, by_lattice, by_output_error
+from ftlm.estimation.closed_loop import instrument_runs, mark_reference_fit
+from ftlm.estimation.estimators import Fit, estimate_genetic, estimate_order_search, estimate_output_error
 from ftlm.estimation.genetic import Genetic
-from ftlm.estimation.model_checks import discretisation, growing, one_sided, silent, unexcited, unslowed
-from ftlm.estimation.nuisance_parameters import EVERY, OffsetTest, instead_of_history, offset_test, unasked_offset
-from ftlm.estimation.output_error import freedom
+from ftlm.estimation.model_checks import (
+    dead_channel_warnings,
+    discretization_warnings,
+    excitation_warnings,
+    friction_direction_warnings,
+    stability_warnings,
+    stribeck_warnings,
+)
+from ftlm.estimation.nuisance_parameters import (
+    DEFAULT_PULSES_PER_SAMPLE,
+    OffsetTest,
+    fit_without_history,
+    offset_test,
+    unrequested_offset_warnings,
+)
+from ftlm.estimation.output_error import parameter_set
 from ftlm.estimation.result import Identification, Task
-from ftlm.estimation.verdict import against_result, against_saved
-from ftlm.model.model import Estimate, Solved
-from ftlm.order_search.options import INTERVALS, LOSSES, METHODS, Intervals, Loss, Settings, check_used
+from ftlm.estimation.verdict import result_findings, saved_findings
+from ftlm.model.model import Estimate, ModelData
+from ftlm.order_search.options import (
+    INTERVAL_CHOICES,
+    LOSS_CHOICES,
+    METHOD_CHOICES,
+    Intervals,
+    Loss,
+    Settings,
+    check_options_used,
+)
 from ftlm.simulation.discretization import default_m
-from ftlm.structure.order_grid import Lattice, check_lattice, check_lattice_names
+from ftlm.structure.order_grid import OrderGrid, check_order_grid, check_order_grid_names
 from ftlm.structure.structure import History, Structure, check_offset
-from ftlm.utils.files import LOG
-from ftlm.utils.statistics import ROUNDING
+from ftlm.utils.files import PACKAGE_LOGGER
+from ftlm.utils.statistics import NEGLIGIBLE_RESIDUAL_SHARE
 from ftlm.utils.validation import check_choice
-from ftlm.validation.comparison import Comparison, compared_samples, finite, free_runs
+from ftlm.validation.comparison import Comparison, compare_samples, finite, simulate_runs
 from ftlm.validation.information_criteria import InformationCriteria, information_criteria
-from ftlm.validation.residual_tests import LAGS, Residuals, residual_warnings, tested_residuals
+from ftlm.validation.residual_tests import DEFAULT_LAGS, Residuals, residual_warnings, run_residual_tests
 
 #: Largest number of samples with which an offset is tested without request: the test stores a sensitivity of each
 #: parameter at every sample.
-MOST_SAMPLES = 400_000
+MAX_OFFSET_TEST_SAMPLES = 400_000
 
 
-def with_decided_offset(runs: Sequence[Run], structure: Structure, estimate: Callable[[Structure], Fit]) -> Fit:
+def fit_with_offset_decision(runs: Sequence[Run], structure: Structure, estimate: Callable[[Structure], Fit]) -> Fit:
     """Fit a structure; under ``offset="auto"`` with a constant if the offset test is significant.
 
     The constant is fitted first, because a fit that lacks a needed constant may end anywhere.
@@ -47,28 +68,28 @@ def with_decided_offset(runs: Sequence[Run], structure: Structure, estimate: Cal
     if structure.offset != "auto":
         fit = estimate(structure)
         # Where a body may stick, what a constant does is no sensitivity alone: it decides where the body rests.
-        if structure.offset != "none" or structure.has_friction or not _small(fit.task.runs):
+        if structure.offset != "none" or structure.has_friction or not _is_testable(fit.task.runs):
             return fit
-        said = unasked_offset(tested(fit), fit.model.outputs) or _in_place_of_a_past(fit)
+        said = unrequested_offset_warnings(fit_offset_test(fit), fit.model.outputs) or _history_offset_warnings(fit)
         return replace(fit, warnings=[*fit.warnings, *said])
     try:
         asked = replace(structure, offset="constant")
     except ModelError as error:
         # One of the initial terms that were given is what an offset integrates to.
-        return _told(estimate(replace(structure, offset="none")), f"none: {error}")
-    twin = same_as_offset(runs, structure)
+        return _with_offset_decision(estimate(replace(structure, offset="none")), f"none: {error}")
+    twin = constant_input(runs, structure)
     if twin is not None:
         words = f"none: {twin} is constant on every run, which an offset cannot be told from"
-        return _told(estimate(replace(structure, offset="none")), words)
+        return _with_offset_decision(estimate(replace(structure, offset="none")), words)
     fit = estimate(asked)
-    test = tested(fit)
+    test = fit_offset_test(fit)
     if test is not None and test.exceeds():
-        return _told(fit, test.decision)
+        return _with_offset_decision(fit, test.decision)
     decision = "none: its test has no finite free run" if test is None else test.decision
-    return _told(estimate(replace(structure, offset="none")), decision)
+    return _with_offset_decision(estimate(replace(structure, offset="none")), decision)
 
 
-def _in_place_of_a_past(fit: Fit) -> list[str]:
+def _history_offset_warnings(fit: Fit) -> list[str]:
     """Return a warning if a constant explains the data as well as a history of initial terms.
 
     A constant is part of the model, whereas initial terms hold for one run only.
@@ -76,7 +97,7 @@ def _in_place_of_a_past(fit: Fit) -> list[str]:
     joint, structure = fit.joint, fit.task.structure
     if joint is None or structure.initial != "auto" or not isinstance(joint.initial, History):
         return []
-    few = instead_of_history(joint, fit.task.runs, structure)
+    few = fit_without_history(joint, fit.task.runs, structure)
     if few is None:
         return []
     less = joint.initial_terms - few.initial_terms
@@ -87,7 +108,7 @@ def _in_place_of_a_past(fit: Fit) -> list[str]:
     ]
 
 
-def same_as_offset(runs: Sequence[Run], structure: Structure) -> str | None:
+def constant_input(runs: Sequence[Run], structure: Structure) -> str | None:
     """Return an input with a free coefficient that is constant on every run, or None."""
     for item in structure.equations:
         for term in item.terms:
@@ -97,7 +118,7 @@ def same_as_offset(runs: Sequence[Run], structure: Structure) -> str | None:
     return None
 
 
-def tested(fit: Fit) -> OffsetTest | None:
+def fit_offset_test(fit: Fit) -> OffsetTest | None:
     """Return the offset test at a fit, with or without an offset; None if not available."""
     structure = replace(fit.task.structure, offset="none")
     if fit.joint is not None:
@@ -107,15 +128,15 @@ def tested(fit: Fit) -> OffsetTest | None:
     if fit.method == "genetic":
         return None
     values = {**fit.model.orders, **fit.model.coefficients}
-    return offset_test(fit.task.runs, replace(structure, coefficient_law=()), values, every=EVERY)
+    return offset_test(fit.task.runs, replace(structure, coefficient_law=()), values, every=DEFAULT_PULSES_PER_SAMPLE)
 
 
-def _told(fit: Fit, decision: str) -> Fit:
+def _with_offset_decision(fit: Fit, decision: str) -> Fit:
     return replace(fit, settings={**fit.settings, "offset_test": decision})
 
 
-def _small(runs: tuple[Run, ...]) -> bool:
-    return sum(run.length for run in runs) <= MOST_SAMPLES
+def _is_testable(runs: tuple[Run, ...]) -> bool:
+    return sum(run.length for run in runs) <= MAX_OFFSET_TEST_SAMPLES
 
 
 def identify(
@@ -126,7 +147,7 @@ def identify(
         "output-error", "instrumental-variables", "multi-innovation", "least-squares", "genetic"
     ] = "output-error",
     criterion: Literal["output-error", "equation-error"] | None = None,
-    lattice: Lattice | None = None,
+    lattice: OrderGrid | None = None,
     norm: Literal["l1", "l2"] | None = None,
     innovation_length: int | None = None,
     prior_covariance: float | None = None,
@@ -142,7 +163,7 @@ def identify(
     reference: str | None = None,
     loss: Loss | None = None,
     intervals: Intervals | None = None,
-    start: Identification | Solved | Mapping[str, float] | None = None,
+    start: Identification | ModelData | Mapping[str, float] | None = None,
 ) -> Identification:
     """Identify a structure from measured runs.
 
@@ -229,15 +250,15 @@ def identify(
         Regressors that cannot be told apart at the given orders, or an executor that has lost its workers.
     """
     several = as_runs(runs)
-    check_choice("method", method, METHODS)
+    check_choice("method", method, METHOD_CHOICES)
     if not isinstance(structure, Structure):
         raise ModelError(f"structure is {type(structure).__name__}; use ftlm.equation(…) or ftlm.flexible_link(…)")
     if offset is not None:
         structure = replace(structure, offset=check_offset(offset))
     if structure.has_friction:
         _check_friction(structure, method, reference)
-    check_lattice(lattice)
-    check_lattice_names(lattice, structure)
+    check_order_grid(lattice)
+    check_order_grid_names(lattice, structure)
     if not (genetic is None or isinstance(genetic, Genetic)):
         raise ModelError(f"genetic is {type(genetic).__name__}, not Genetic; use ftlm.Genetic(seeds=…)")
     words: dict[str, Any] = {
@@ -250,9 +271,9 @@ def identify(
     }
     words = {n: value for n, value in words.items() if value is not None}
     if loss is not None:
-        check_choice("loss", loss, LOSSES)
+        check_choice("loss", loss, LOSS_CHOICES)
     if intervals is not None:
-        check_choice("intervals", intervals, INTERVALS)
+        check_choice("intervals", intervals, INTERVAL_CHOICES)
     if intervals == "profile" and reference is not None:
         raise ModelError(
             "intervals='profile' needs a cost that has its minimum at the estimate, and reference= has none; use "
@@ -271,7 +292,7 @@ def identify(
     given = [*(n for n, value in others.items() if value is not None), *words]
     estimator = "least-squares" if method in ("output-error", "genetic") else method
     settings = Settings.check(coefficients=estimator, threads=threads, **words)
-    check_used(method, given, free=bool(structure.order_names))
+    check_options_used(method, given, free=bool(structure.order_names))
     if executor is not None and threads is None:
         settings = replace(settings, threads=1)
     if structure.offset == "auto" and store is not None:
@@ -279,36 +300,36 @@ def identify(
             "offset='auto' may need two searches, and a store keeps those of one; use offset='none' or "
             "offset='constant' with store="
         )
-    if not (start is None or isinstance(start, (Identification, Solved, Mapping))):
+    if not (start is None or isinstance(start, (Identification, ModelData, Mapping))):
         raise ModelError(f"start is {type(start).__name__}; give an identification, a model, or values by name")
     begin = start.model if isinstance(start, Identification) else start
-    more = start.joint_values if isinstance(start, Identification) else {}
-    answers, weak = (None, []) if reference is None else driven_by(several, structure, reference)
+    more = start.parameter_values if isinstance(start, Identification) else {}
+    answers, weak = (None, []) if reference is None else instrument_runs(several, structure, reference)
 
     def estimate(asked: Structure) -> Fit:
         task = Task(tuple(several), asked, lattice)
         if method == "output-error":
-            return by_output_error(
+            return estimate_output_error(
                 task, m, settings.threads, progress, answers, loss or "squares", intervals or "auto", begin, more
             )
         if method == "genetic":
-            return by_genetic_algorithm(task, genetic or Genetic(), settings.norm, m, settings.threads, progress)
-        return by_lattice(task, settings, m, progress, store, executor)
+            return estimate_genetic(task, genetic or Genetic(), settings.norm, m, settings.threads, progress)
+        return estimate_order_search(task, settings, m, progress, store, executor)
 
-    LOG.info("identifying %s from %s by %s", structure.name, ", ".join(r.name for r in several), method)
-    fit = with_decided_offset(several, structure, estimate)
+    PACKAGE_LOGGER.info("identifying %s from %s by %s", structure.name, ", ".join(r.name for r in several), method)
+    fit = fit_with_offset_decision(several, structure, estimate)
     if reference is not None:
-        fit = by_reference(fit, reference, weak)
-    result = judged(fit)
-    LOG.info("identified: %s", result.verdict())
+        fit = mark_reference_fit(fit, reference, weak)
+    result = assess_fit(fit)
+    PACKAGE_LOGGER.info("identified: %s", result.verdict())
     for warning in result.warnings:
-        LOG.warning("%s", warning)
+        PACKAGE_LOGGER.warning("%s", warning)
     return result
 
 
 def _check_friction(structure: Structure, method: str, reference: str | None) -> None:
     """Raise ModelError for options that do not support friction."""
-    words = f"the equation of {structure.outputs[structure.sticks[0]]} has friction, which"
+    words = f"the equation of {structure.outputs[structure.friction_equations[0]]} has friction, which"
     if method != "output-error":
         raise ModelError(f"{words} method={method!r} does not know; use method='output-error'")
     if reference is not None:
@@ -320,20 +341,23 @@ def _check_friction(structure: Structure, method: str, reference: str | None) ->
         )
 
 
-def judged(fit: Fit) -> Identification:
+def assess_fit(fit: Fit) -> Identification:
     """Validate a fit: both errors, residual tests, information criteria and warnings."""
     runs, model = as_runs(fit.task.runs), fit.model
-    free = free_runs(model, runs)
-    comparison = compared_samples(model, runs, free, m=model.m or default_m(runs, power_of_two=False))
+    free = simulate_runs(model, runs)
+    comparison = compare_samples(model, runs, free, m=model.m or default_m(runs, power_of_two=False))
     warnings = [*comparison.warnings, *fit.warnings]
     warnings += [f"run {r.name}: {w}" for r in runs for w in r.warnings]
-    warnings += silent(runs, fit.task.structure) + unexcited(runs, fit.task.structure)
+    warnings += dead_channel_warnings(runs, fit.task.structure) + excitation_warnings(runs, fit.task.structure)
     warnings += (
-        discretisation(model, comparison) + growing(model) + one_sided(model, free) + unslowed(model, runs, free)
+        discretization_warnings(model, comparison)
+        + stability_warnings(model)
+        + friction_direction_warnings(model, free)
+        + stribeck_warnings(model, runs, free)
     )
     tests, criteria = None, None
     try:
-        tests = tested_residuals(model, runs, free, lags=LAGS)
+        tests = run_residual_tests(model, runs, free, lags=DEFAULT_LAGS)
         criteria = information_criteria(tests, fit.parameters)
     except DataError:
         # A run that is too short for correlations; everything else can be told.
@@ -354,8 +378,8 @@ def judged(fit: Fit) -> Identification:
         fit.task,
         fit.errors,
     )
-    against = tuple(against_result(result))
-    if not (against or against_saved(known)):
+    against = tuple(result_findings(result))
+    if not (against or saved_findings(known)):
         return result
     # Warnings alone do not say what weighs, so the file does.
     return replace(result, model=replace(model, estimate=msgspec.structs.replace(known, against=against)))
@@ -365,10 +389,12 @@ def _residual_warnings(fit: Fit, tests: Residuals) -> list[str]:
     """Return warnings of failed residual tests; a joint fit already reports colored residuals."""
     if "reference" in fit.settings:
         # The loop is known, and its noise is no part of what the model was estimated from.
-        tests = replace(tests, outputs={n: replace(o, loops={}) for n, o in tests.outputs.items()})
+        tests = replace(tests, outputs={n: replace(o, feedback_tests={}) for n, o in tests.outputs.items()})
     if fit.joint is None:
         return residual_warnings(tests)
-    return [w for w in residual_warnings(tests, floor=ROUNDING) if "residuals are not white (" not in w]
+    return [
+        w for w in residual_warnings(tests, floor=NEGLIGIBLE_RESIDUAL_SHARE) if "residuals are not white (" not in w
+    ]
 
 
 def _estimate(
@@ -390,12 +416,12 @@ def _estimate(
         information={} if criteria is None else {n: finite(getattr(criteria, n)) for n in ("aic", "aicc", "bic")},
         warnings=warnings,
         intervals=profiles or UNSET,
-        free=UNSET if joint is None else freedom(joint, fit.task.structure),
+        free=UNSET if joint is None else parameter_set(joint, fit.task.structure),
     )
 
 
 @dataclass(frozen=True)
-class Identified:
+class BatchResult:
     """Result of one item of a batch identification.
 
     Parameters
@@ -416,7 +442,7 @@ class Identified:
         return f"{self.name}\n{self.result}" if self.error is None else f"{self.name}: {self.error}"
 
 
-def one_of_many(
+def identify_one(
     runs: Run | Sequence[Run], structure: Structure, options: dict[str, Any]
 ) -> tuple[Identification | None, FtlmError | None]:
     """Identify one item and return its result or error."""
@@ -435,7 +461,7 @@ def identify_many(
     executor: Executor | None = None,
     progress: Callable[[int, int], None] | None = None,
     **options: Any,
-) -> list[Identified]:
+) -> list[BatchResult]:
     """Identify each of many runs separately.
 
     Parameters
@@ -478,7 +504,7 @@ def identify_many(
     if executor is None:
         every = []
         for name, item in zip(names, items, strict=True):
-            every.append(Identified(name, *one_of_many(item, structure, options)))
+            every.append(BatchResult(name, *identify_one(item, structure, options)))
             if progress is not None:
                 progress(len(every), len(items))
         return every
@@ -487,7 +513,7 @@ def identify_many(
     try:
         for item in items:
             try:
-                pending.append(executor.submit(one_of_many, item, structure, options))
+                pending.append(executor.submit(identify_one, item, structure, options))
             except (BrokenExecutor, RuntimeError) as error:
                 lost: Future[Any] = Future()
                 lost.set_exception(error)
@@ -495,13 +521,13 @@ def identify_many(
         if progress is not None:
             for done, _ in enumerate(as_completed(pending), 1):
                 progress(done, len(items))
-        return [Identified(name, *_pair(future)) for name, future in zip(names, pending, strict=True)]
+        return [BatchResult(name, *_future_result(future)) for name, future in zip(names, pending, strict=True)]
     finally:
         for future in pending:
             future.cancel()
 
 
-def _pair(future: Future[Any]) -> tuple[Identification | None, FtlmError | None]:
+def _future_result(future: Future[Any]) -> tuple[Identification | None, FtlmError | None]:
     """Return the result of a worker, or a ConvergenceError if the executor failed."""
     try:
         pair: tuple[Identification | None, FtlmError | None] = future.result()

@@ -10,23 +10,23 @@ import numpy as np
 from ftlm.utils.validation import Floats
 
 #: Largest cosine between the residuals and any feasible direction of their Jacobian at an optimum.
-FLAT = 1e-10
+COSINE_TOLERANCE = 1e-10
 #: Initial, smallest and largest damping factor.
-DAMPING, LEAST, MOST = 1e-2, 1e-12, 1e12
+INITIAL_DAMPING, MIN_DAMPING, MAX_DAMPING = 1e-2, 1e-12, 1e12
 
 
 @dataclass(frozen=True)
-class Fitted:
+class LeastSquaresResult:
     """Result of a constrained fit: parameters, cost, convergence, evaluations, active constraints."""
 
     values: Floats
     cost: float
     converged: bool
     evaluations: int
-    held: tuple[int, ...]
+    active_constraints: tuple[int, ...]
 
 
-def damped(
+def constrained_least_squares(
     residuals: Callable[[Floats], tuple[Floats, Floats]],
     cost_of: Callable[[Floats], float],
     start: Floats,
@@ -35,7 +35,7 @@ def damped(
     *,
     floor: float = 0.0,
     most: int = 120,
-) -> Fitted:
+) -> LeastSquaresResult:
     """Minimize a sum of squares under the constraints ``rows @ values <= limits``.
 
     Parameters
@@ -55,26 +55,26 @@ def damped(
     """
     values, held = start.copy(), list[int]()
     left, slopes = residuals(values)
-    cost, damping, spent = float(left @ left), DAMPING, 1
+    cost, damping, spent = float(left @ left), INITIAL_DAMPING, 1
     scale = np.zeros(values.size)
     while spent < most:
         if cost <= floor:
-            return Fitted(values, cost, True, spent, tuple(held))
+            return LeastSquaresResult(values, cost, True, spent, tuple(held))
         sizes = np.linalg.norm(slopes, axis=0)
         # The largest slopes so far, as in MINPACK: a number that stops acting must not run away.
         scale = np.maximum(scale, sizes)
         unit = np.where(scale > 0, scale, 1.0)
         before = set(held)
-        held, free = _released(left, slopes, unit, rows, held)
+        held, free = _release_constraints(left, slopes, unit, rows, held)
         if _is_flat(left, slopes, sizes, free, unit):
-            return Fitted(values, cost, True, spent, tuple(held))
+            return LeastSquaresResult(values, cost, True, spent, tuple(held))
         step = _step(left, slopes, unit, free, damping)
-        reach, wall = _reach(values, step, rows, limits, held)
+        reach, wall = _feasible_fraction(values, step, rows, limits, held)
         if reach <= 1e-12 and wall is not None:
             # The gradient leaves a wall that was let go, and a damped step follows it only where it is short.
             spent += 1
             if wall in before:
-                damping = min(damping * 4.0, MOST)
+                damping = min(damping * 4.0, MAX_DAMPING)
             else:
                 held.append(wall)
             continue
@@ -83,21 +83,21 @@ def damped(
         spent += 1
         if np.isfinite(new) and new < cost:
             gained, moved = cost - new, float(np.linalg.norm(reach * step * unit))
-            values, damping = tried, max(damping / 5.0, LEAST)
+            values, damping = tried, max(damping / 5.0, MIN_DAMPING)
             if wall is not None and reach < 1.0:
                 held.append(wall)
             left, slopes = residuals(values)
             cost = new
             if gained <= 1e-13 * cost and moved <= 1e-7 * (np.sqrt(cost) + 1e-300):
-                return Fitted(values, cost, True, spent, tuple(held))
-        elif damping >= MOST or cost == 0.0:
-            return Fitted(values, cost, cost == 0.0, spent, tuple(held))
+                return LeastSquaresResult(values, cost, True, spent, tuple(held))
+        elif damping >= MAX_DAMPING or cost == 0.0:
+            return LeastSquaresResult(values, cost, cost == 0.0, spent, tuple(held))
         else:
             # A wall is no reason to give up a direction: a shorter step may not reach it.
-            damping = min(damping * 4.0, MOST)
+            damping = min(damping * 4.0, MAX_DAMPING)
             if damping > 1e6 and _is_flat(left, slopes, sizes, free, unit, 1e-6):
-                return Fitted(values, cost, True, spent, tuple(held))
-    return Fitted(values, cost, False, spent, tuple(held))
+                return LeastSquaresResult(values, cost, True, spent, tuple(held))
+    return LeastSquaresResult(values, cost, False, spent, tuple(held))
 
 
 def _basis(rows: Floats, held: list[int], unit: Floats) -> Floats:
@@ -110,7 +110,9 @@ def _basis(rows: Floats, held: list[int], unit: Floats) -> Floats:
     return np.asarray(directions[rank:].T)
 
 
-def _released(left: Floats, slopes: Floats, unit: Floats, rows: Floats, held: list[int]) -> tuple[list[int], Floats]:
+def _release_constraints(
+    left: Floats, slopes: Floats, unit: Floats, rows: Floats, held: list[int]
+) -> tuple[list[int], Floats]:
     """Return the active constraints with a nonnegative multiplier, and a basis of the free directions."""
     while held:
         normals = (rows[held] / unit).T
@@ -122,7 +124,9 @@ def _released(left: Floats, slopes: Floats, unit: Floats, rows: Floats, held: li
     return held, _basis(rows, held, unit)
 
 
-def _is_flat(left: Floats, slopes: Floats, sizes: Floats, free: Floats, unit: Floats, least: float = FLAT) -> bool:
+def _is_flat(
+    left: Floats, slopes: Floats, sizes: Floats, free: Floats, unit: Floats, least: float = COSINE_TOLERANCE
+) -> bool:
     size = float(np.linalg.norm(left))
     if size == 0.0 or free.shape[1] == 0:
         return True
@@ -140,7 +144,9 @@ def _step(left: Floats, slopes: Floats, unit: Floats, free: Floats, damping: flo
     return step
 
 
-def _reach(values: Floats, step: Floats, rows: Floats, limits: Floats, held: list[int]) -> tuple[float, int | None]:
+def _feasible_fraction(
+    values: Floats, step: Floats, rows: Floats, limits: Floats, held: list[int]
+) -> tuple[float, int | None]:
     """Return the largest feasible fraction of a step, and the constraint that limits it."""
     towards, room = rows @ step, limits - rows @ values
     towards[held] = 0.0

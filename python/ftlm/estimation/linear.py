@@ -22,14 +22,14 @@ from ftlm.utils.validation import Floats, whole_number
 
 #: Maximum number of iterations of refined instrumental variables, and the relative change of a coefficient below which
 #: the iteration has converged.
-REFINEMENTS = 40
-STILL = 1e-8
+MAX_IV_ITERATIONS = 40
+IV_RELATIVE_TOLERANCE = 1e-8
 #: Largest relative change of a coefficient by the prior covariance that is not reported.
-PULLED = 0.05
+MAX_PRIOR_SHIFT = 0.05
 #: Fewest block pulses with which the effect of the step is estimated.
-LEAST_PULSES = 32
+MIN_STEP_TEST_PULSES = 32
 #: Largest discretization bias of a coefficient, in standard errors, that is not reported.
-STEP_BIAS = 0.5
+MAX_STEP_BIAS_ERRORS = 0.5
 
 
 @dataclass(frozen=True)
@@ -59,7 +59,7 @@ def estimate_coefficients(
             raw = _multi_innovation(item, records, settings, settings.prior_covariance)
             # A prior so weak that the data alone decide.
             weak = _multi_innovation(item, records, settings, min(settings.prior_covariance * 1e12, 1e300))
-            fit.warnings.extend(_pulled(item.output, raw, weak, settings))
+            fit.warnings.extend(_prior_warnings(item.output, raw, weak, settings))
         fit.values.update(named_coefficients(item, raw))
     return fit
 
@@ -96,8 +96,8 @@ def _instrumental(fit: CoefficientFit, structure: Structure, records: list[Recor
             inputs,
             [[t.fixed for t in e.terms] for e in group],
             initial,
-            REFINEMENTS,
-            STILL,
+            MAX_IV_ITERATIONS,
+            IV_RELATIVE_TOLERANCE,
         )
         if not converged:
             fit.warnings.append(
@@ -114,12 +114,12 @@ def _instrumental(fit: CoefficientFit, structure: Structure, records: list[Recor
             fit.errors.update({str(t.coefficient): s / abs(t.factor) for t, s in pairs})
 
 
-def step_bias(runs: Sequence[Run], structure: Structure, settings: Settings, fit: CoefficientFit) -> list[str]:
+def step_bias_warnings(runs: Sequence[Run], structure: Structure, settings: Settings, fit: CoefficientFit) -> list[str]:
     """Return a warning if the step changes a coefficient by more than its standard error allows.
 
     The scheme has order 2. One third of the change from twice the step therefore remains (Richardson).
     """
-    if not fit.errors or fit.m < 2 * LEAST_PULSES:
+    if not fit.errors or fit.m < 2 * MIN_STEP_TEST_PULSES:
         return []
     try:
         coarser = estimate_coefficients(runs, structure, settings, fit.m // 2).values
@@ -128,7 +128,7 @@ def step_bias(runs: Sequence[Run], structure: Structure, settings: Settings, fit
         return []
     moved = {n: abs(coarser[n] - fit.values[n]) / 3 / e for n, e in fit.errors.items() if e > 0}
     worst = max(moved, key=lambda n: moved[n], default="")
-    if not worst or moved[worst] <= STEP_BIAS:
+    if not worst or moved[worst] <= MAX_STEP_BIAS_ERRORS:
         return []
     carried = min(run.length - 1 for run in runs)
     finer = f"raise m, up to {carried}, or " if fit.m < carried else ""
@@ -140,11 +140,11 @@ def step_bias(runs: Sequence[Run], structure: Structure, settings: Settings, fit
     ]
 
 
-def _pulled(output: str, raw: list[float], weak: list[float], settings: Settings) -> list[str]:
+def _prior_warnings(output: str, raw: list[float], weak: list[float], settings: Settings) -> list[str]:
     """Return a warning if the prior covariance, not the data, determines the size of a coefficient."""
     shares = [abs(a - b) / abs(b) for a, b in zip(raw, weak, strict=True) if b]
     worst = max(shares, default=0.0)
-    if worst <= PULLED:
+    if worst <= MAX_PRIOR_SHIFT:
         return []
     return [
         f"{output}: the prior (K0 = {settings.prior_covariance:g}, coefficients near 0) moves a coefficient by "
@@ -154,7 +154,7 @@ def _pulled(output: str, raw: list[float], weak: list[float], settings: Settings
 
 
 @dataclass(frozen=True)
-class Trace:
+class MultiInnovationTrace:
     """Convergence of the multi-innovation recursion (44) on one equation.
 
     Parameters
@@ -184,7 +184,7 @@ def multi_innovation_trace(
     rows: Literal["haar", "time"] = "haar",
     m: int | None = None,
     every: int = 1,
-) -> Trace:
+) -> MultiInnovationTrace:
     """Run the multi-innovation recursion (44) and return coefficients and error (45) after every step.
 
     Parameters
@@ -242,10 +242,10 @@ def multi_innovation_trace(
     kept = np.ascontiguousarray(trace[step - 1])
     error = _core.trace_errors(rec.core(), core_structure, inputs, kept)
     names = {t.coefficient: kept[:, k] / t.factor for k, t in enumerate(item.terms) if isinstance(t.coefficient, str)}
-    return Trace(step, names, error, settings.innovation_length)
+    return MultiInnovationTrace(step, names, error, settings.innovation_length)
 
 
-def trace_chart(traces: Sequence[tuple[str, Trace]], *, title: str, log_x: bool = False) -> Figure:
+def trace_chart(traces: Sequence[tuple[str, MultiInnovationTrace]], *, title: str, log_x: bool = False) -> Figure:
     """Draw the simulation error (45) after every step of the recursion (44), as in Figure 4(b).
 
     Parameters

@@ -10,53 +10,53 @@ import numpy as np
 
 from ftlm import _core
 from ftlm.data.run import Run
-from ftlm.data.sampling import read
+from ftlm.data.sampling import drop_missing
 from ftlm.estimation.free_parameters import FreeProblem
-from ftlm.estimation.output_error import FAR, JointFit
-from ftlm.estimation.result import Judged
+from ftlm.estimation.output_error import OUTLIER_DEVIATIONS, JointFit
+from ftlm.estimation.result import IdentificationRecord
 from ftlm.model.model import Model
-from ftlm.simulation.discretization import compared_values, has_own_times
-from ftlm.simulation.output_samples import Sampled
+from ftlm.simulation.discretization import compared_values, has_nonuniform_samples
+from ftlm.simulation.output_samples import OutputSamples
 from ftlm.structure.structure import Structure
 from ftlm.utils.linalg import dot
-from ftlm.utils.statistics import ROUNDING, is_white, robust_deviation
+from ftlm.utils.statistics import NEGLIGIBLE_RESIDUAL_SHARE, is_white, robust_deviation
 from ftlm.utils.validation import Floats
 from ftlm.validation.comparison import Comparison, compare, validation_warnings
-from ftlm.validation.data_advice import dead, excitation_for
+from ftlm.validation.data_advice import check_excitation, find_dead_channel
 
 #: Largest correlation of two separately identifiable parameters, unless one of them is well determined.
-INSEPARABLE = 0.995
+MAX_PARAMETER_CORRELATION = 0.995
 #: Largest relative standard error of a well-determined coefficient or delay, and largest standard error of an order.
 #: Its 95 % interval then spans less than half its value, or less than the increment of 0.5 between common mechanisms.
-VAGUE = 0.1
+MAX_RELATIVE_STANDARD_ERROR = 0.1
 #: Outliers are reported from this number and this fraction of all residuals, or if they hold this fraction of the
 #: squares, which doubles the variance of every parameter.
-FEWEST_OUTLIERS = 3
-OUTLIERS = 2e-3
-DECISIVE = 0.5
+MIN_OUTLIERS = 3
+MIN_OUTLIER_FRACTION = 2e-3
+MIN_OUTLIER_POWER_FRACTION = 0.5
 #: Quantization step in noise standard deviations above which residuals are dominated by rounding.
-COARSE = 2.0
+QUANTIZATION_NOISE_RATIO = 2.0
 #: Largest deviation of a value from a multiple of the quantization step, as a fraction of the step.
-ROUNDED = 0.01
+QUANTIZATION_STEP_TOLERANCE = 0.01
 #: Smallest change within a sample that counts as motion, as a fraction of the range of the output.
-TURNED = 1e-6
+MIN_MOTION_RANGE_FRACTION = 1e-6
 #: Fewest intervals at less than SLOW_SPEED_RATIO times vs that determine the Stribeck term.
-FEWEST_SLOW, SLOW = 5, 2.0
+MIN_SLOW_INTERVALS, SLOW_SPEED_RATIO = 5, 2.0
 #: Largest relative deviation of two coefficients from the coefficient law.
-LAW_BROKEN = 0.05
+MAX_LAW_DEVIATION = 0.05
 
 
-def uncertain(joint: JointFit, problem: FreeProblem) -> list[str]:
+def identifiability_warnings(joint: JointFit, problem: FreeProblem) -> list[str]:
     """Return warnings about convergence and about parameters that the runs do not determine."""
     warnings = []
     if not joint.converged:
         warnings.append("the fit ended before it stood still; its figures are provisional")
-    if not joint.settled:
+    if not joint.step_converged:
         warnings.append(
             f"at {joint.refinement} pulses a sample the step still moves estimates by over a tenth of their standard "
             "errors: the model is stiffer than the sampling; sample faster or trust its fast poles less"
         )
-    warnings += _growth(joint)
+    warnings += _unstable_optimum_warnings(joint)
     errors = joint.standard_errors
     unseen = [n for n in joint.names if math.isinf(errors[n])]
     if unseen:
@@ -68,7 +68,7 @@ def uncertain(joint: JointFit, problem: FreeProblem) -> list[str]:
         # Negated so that a standard error that is not a number counts as too large.
         if name in unseen:
             continue
-        if not errors[name] <= high - low and not _bounded(joint, name):
+        if not errors[name] <= high - low and not _has_bounded_interval(joint, name):
             warnings.append(f"order {name} cannot be told from these runs: its standard error exceeds its bounds")
         elif min(value - low, high - value) < 1e-6 and high > low and value != 0:
             warnings.append(f"order {name} = {value:g} is on its bound; widen it")
@@ -76,7 +76,7 @@ def uncertain(joint: JointFit, problem: FreeProblem) -> list[str]:
         value, (low, high) = joint.inputs[item.name], item.bounds
         if item.name in unseen:
             continue
-        if not errors[item.name] <= high - low and not _bounded(joint, item.name):
+        if not errors[item.name] <= high - low and not _has_bounded_interval(joint, item.name):
             warnings.append(f"the {item.words} cannot be told from these runs: its standard error exceeds its bounds")
         elif high - value < 1e-6 * (high - low) or (low > 0 and value - low < 1e-6 * (high - low)):
             unit = " s" if item.law == "delay" else ""
@@ -89,7 +89,7 @@ def uncertain(joint: JointFit, problem: FreeProblem) -> list[str]:
                 f"coefficient {name} = {value:.4g} is not different from 0 in these runs "
                 f"(standard error {errors[name]:.3g})"
             )
-    warnings += inseparable(joint) + unbounded_ends(joint, unseen)
+    warnings += correlation_warnings(joint) + unbounded_interval_warnings(joint, unseen)
     coloured = sorted({o for run in joint.residuals for o, series in run.items() if not is_white(series)})
     if coloured:
         warnings.append(
@@ -99,15 +99,15 @@ def uncertain(joint: JointFit, problem: FreeProblem) -> list[str]:
     return warnings
 
 
-def _growth(joint: JointFit) -> list[str]:
+def _unstable_optimum_warnings(joint: JointFit) -> list[str]:
     """Return warnings about an unstable optimum and the choice made."""
-    if joint.growth is None or joint.growth.excess <= 0.0:
+    if joint.unstable_optimum is None or joint.unstable_optimum.residual_excess <= 0.0:
         # One that costs more than the stable one was none.
         return []
-    excess = 100.0 * joint.growth.excess
-    if not joint.growth.kept:
-        limit = joint.growth.at_limit
-        smaller = 100.0 * (1.0 - 1.0 / (1.0 + joint.growth.excess))
+    excess = 100.0 * joint.unstable_optimum.residual_excess
+    if not joint.unstable_optimum.is_accepted:
+        limit = joint.unstable_optimum.at_stability_limit
+        smaller = 100.0 * (1.0 - 1.0 / (1.0 + joint.unstable_optimum.residual_excess))
         return [
             f"an optimum that is not stable has residuals {smaller:.2g} % smaller, by no more than chance: what the "
             "run did before its start takes a growing mode away until its end; the stable one was kept"
@@ -121,12 +121,12 @@ def _growth(joint: JointFit) -> list[str]:
     ]
 
 
-def _bounded(joint: JointFit, name: str) -> bool:
+def _has_bounded_interval(joint: JointFit, name: str) -> bool:
     """Whether the profile-likelihood interval of a parameter is bounded on both sides."""
     return name in joint.profiles and not joint.profiles[name].is_open
 
 
-def unbounded_ends(joint: JointFit, unseen: Sequence[str]) -> list[str]:
+def unbounded_interval_warnings(joint: JointFit, unseen: Sequence[str]) -> list[str]:
     """Return a warning about parameters with an unbounded interval."""
     sides = {
         n: [s for s, end in (("below", p.low), ("above", p.high)) if math.isinf(end)]
@@ -143,18 +143,25 @@ def unbounded_ends(joint: JointFit, unseen: Sequence[str]) -> list[str]:
     ]
 
 
-def irregular(runs: Sequence[Run], joint: JointFit, problem: FreeProblem) -> list[str]:
+def sample_warnings(runs: Sequence[Run], joint: JointFit, problem: FreeProblem) -> list[str]:
     """Return warnings about outliers, quantization and interpolated nonuniform samples."""
     warnings = []
     for output in problem.structure.outputs:
         size = math.sqrt(float(np.mean([np.nanvar(run[output]) for run in runs])))
         noise = joint.noise[output]
-        if noise <= ROUNDING * size:
+        if noise <= NEGLIGIBLE_RESIDUAL_SHARE * size:
             continue
         warnings += [
-            w for w in (_outliers(runs, joint, output), _quantised(runs, problem.structure, output, noise)) if w
+            w
+            for w in (
+                _outlier_warning(runs, joint, output),
+                _quantization_warning(runs, problem.structure, output, noise),
+            )
+            if w
         ]
-    kept = [run.name for run in runs if run.readings is not None and not has_own_times(run, problem.structure)]
+    kept = [
+        run.name for run in runs if run.sample_times is not None and not has_nonuniform_samples(run, problem.structure)
+    ]
     if kept:
         warnings.append(
             f"{', '.join(kept)}: outputs were read at times of their own, but a free delay, or signals taken "
@@ -164,36 +171,37 @@ def irregular(runs: Sequence[Run], joint: JointFit, problem: FreeProblem) -> lis
     return warnings
 
 
-def _outliers(runs: Sequence[Run], joint: JointFit, output: str) -> str | None:
+def _outlier_warning(runs: Sequence[Run], joint: JointFit, output: str) -> str | None:
     """Return a warning about outliers, unless a robust loss was used."""
     if joint.robust is not None:
         return None
-    every = read(np.concatenate([part[output] for part in joint.residuals]))
+    every = drop_missing(np.concatenate([part[output] for part in joint.residuals]))
     usual = robust_deviation(every)
     far, first = 0, ""
     for run, part in zip(runs, joint.residuals, strict=True):
-        rows = np.flatnonzero(np.abs(part[output]) > FAR * usual)
+        rows = np.flatnonzero(np.abs(part[output]) > OUTLIER_DEVIATIONS * usual)
         if rows.size and not far:
             # Compared rows begin behind the first one.
             first = f"first at row {int(rows[0]) + 1} of {run.name}"
         far += rows.size
     count = every.size
-    share = float(np.sum(every[np.abs(every) > FAR * usual] ** 2) / max(dot(every, every), 1e-300))
-    if usual == 0.0 or (share < DECISIVE and far < max(FEWEST_OUTLIERS, OUTLIERS * count)):
+    share = float(np.sum(every[np.abs(every) > OUTLIER_DEVIATIONS * usual] ** 2) / max(dot(every, every), 1e-300))
+    if usual == 0.0 or (share < MIN_OUTLIER_POWER_FRACTION and far < max(MIN_OUTLIERS, MIN_OUTLIER_FRACTION * count)):
         return None
     verb, held = ("lies", "holds") if far == 1 else ("lie", "hold")
-    power = f" and {held} {100 * share:.0f} % of their squares" if share >= DECISIVE else ""
+    power = f" and {held} {100 * share:.0f} % of their squares" if share >= MIN_OUTLIER_POWER_FRACTION else ""
     return (
-        f"{far} of {count} residuals of {output} {verb} beyond {FAR:g} times the usual one{power}, {first}: "
+        f"{far} of {count} residuals of {output} {verb} beyond {OUTLIER_DEVIATIONS:g} times the usual one{power}, "
+        f"{first}: "
         f"{'an outlier' if far == 1 else 'outliers'}, or moments "
         "that the model does not explain; squares let them cost precision: loss='huber' weighs them down"
     )
 
 
-def _quantised(runs: Sequence[Run], structure: Structure, output: str, noise: float) -> str | None:
+def _quantization_warning(runs: Sequence[Run], structure: Structure, output: str, noise: float) -> str | None:
     """Return a warning about an output whose quantization step exceeds its noise."""
-    steps = [quantum(read(compared_values(run, structure, output))) for run in runs]
-    coarse = [(step, run) for step, run in zip(steps, runs, strict=True) if step > COARSE * noise]
+    steps = [quantization_step(drop_missing(compared_values(run, structure, output))) for run in runs]
+    coarse = [(step, run) for step, run in zip(steps, runs, strict=True) if step > QUANTIZATION_NOISE_RATIO * noise]
     if not coarse:
         return None
     step, run = max(coarse, key=lambda pair: pair[0])
@@ -204,7 +212,7 @@ def _quantised(runs: Sequence[Run], structure: Structure, output: str, noise: fl
     )
 
 
-def quantum(values: Floats) -> float:
+def quantization_step(values: Floats) -> float:
     """Return the step of which all values are multiples; 0 if there is none."""
     levels = np.unique(values)
     gaps = np.diff(levels)
@@ -214,18 +222,22 @@ def quantum(values: Floats) -> float:
     # Rounding apart, the least gap is the step; the mean of those close to it tells it better.
     step = float(np.mean(gaps[gaps < 1.5 * gaps.min()]))
     multiples = gaps / step
-    return step if float(np.abs(multiples - np.rint(multiples)).max()) < ROUNDED else 0.0
+    return step if float(np.abs(multiples - np.rint(multiples)).max()) < QUANTIZATION_STEP_TOLERANCE else 0.0
 
 
-def inseparable(joint: JointFit) -> list[str]:
+def correlation_warnings(joint: JointFit) -> list[str]:
     """Return warnings about groups of parameters that are not separately identifiable, one line a group."""
     errors, correlation = joint.standard_errors, np.abs(joint.correlation)
     sizes = {n: abs(v) for n, v in zip(joint.names, joint.values.tolist(), strict=True)}
     # Negated so that a standard error that is not a number counts as too large.
-    vague = [i for i, n in enumerate(joint.names) if not errors[n] <= VAGUE * (1.0 if n in joint.orders else sizes[n])]
+    vague = [
+        i
+        for i, n in enumerate(joint.names)
+        if not errors[n] <= MAX_RELATIVE_STANDARD_ERROR * (1.0 if n in joint.orders else sizes[n])
+    ]
     groups: list[list[int]] = []
     for i in vague:
-        tied = [g for g in groups if any(_trade(joint, correlation, i, j) for j in g)]
+        tied = [g for g in groups if any(_are_inseparable(joint, correlation, i, j) for j in g)]
         groups = [g for g in groups if g not in tied] + [sorted([*(j for g in tied for j in g), i])]
     said = []
     for group in (g for g in groups if len(g) > 1):
@@ -237,27 +249,27 @@ def inseparable(joint: JointFit) -> list[str]:
     return said
 
 
-def _trade(joint: JointFit, correlation: Floats, i: int, j: int) -> bool:
+def _are_inseparable(joint: JointFit, correlation: Floats, i: int, j: int) -> bool:
     """Whether two uncertain parameters are correlated, or both have an infinite standard error."""
     errors = joint.standard_errors
     if not any(math.isfinite(errors[joint.names[k]]) for k in (i, j)):
         return True
-    return bool(correlation[i, j] > INSEPARABLE)
+    return bool(correlation[i, j] > MAX_PARAMETER_CORRELATION)
 
 
-def unexcited(runs: Sequence[Run], structure: Structure) -> list[str]:
+def excitation_warnings(runs: Sequence[Run], structure: Structure) -> list[str]:
     """Return warnings about equations whose free parameters no run excites."""
-    lacking = [{f.signal: f.sentence for f in excitation_for(run, structure)} for run in runs]
+    lacking = [{f.signal: f.sentence for f in check_excitation(run, structure)} for run in runs]
     return [sentence for output, sentence in lacking[0].items() if all(output in other for other in lacking)]
 
 
-def silent(runs: Sequence[Run], structure: Structure) -> list[str]:
+def dead_channel_warnings(runs: Sequence[Run], structure: Structure) -> list[str]:
     """Return warnings about measured channels that are dead, which a fit would take for motion."""
-    channels = [(r.bridged(), n) for r in runs for n in r.outputs if n in structure.signals]
-    return [f"run {run.name}: {found.sentence}" for run, name in channels for found in dead(run, name)]
+    channels = [(r.with_interpolated_gaps(), n) for r in runs for n in r.outputs if n in structure.signals]
+    return [f"run {run.name}: {found.sentence}" for run, name in channels for found in find_dead_channel(run, name)]
 
 
-def broken_law(model: Model) -> list[str]:
+def coefficient_law_warnings(model: Model) -> list[str]:
     """Return warnings about freely estimated coefficients that violate the coefficient law."""
     law, values = model.structure.coefficient_law, model.coefficients
     warnings = []
@@ -266,7 +278,7 @@ def broken_law(model: Model) -> list[str]:
         if name not in values or len(known) != len(factors):
             continue
         wanted = sign * math.prod(known)
-        if abs(values[name] - wanted) > LAW_BROKEN * max(abs(wanted), abs(values[name])):
+        if abs(values[name] - wanted) > MAX_LAW_DEVIATION * max(abs(wanted), abs(values[name])):
             warnings.append(
                 f"coefficient law: {name} = {values[name]:.4g}, but the other equation gives {wanted:.4g}; "
                 "the equation-error estimators do not impose the law"
@@ -286,7 +298,7 @@ def broken_law(model: Model) -> list[str]:
     return warnings
 
 
-def discretisation(model: Model, comparison: Comparison) -> list[str]:
+def discretization_warnings(model: Model, comparison: Comparison) -> list[str]:
     """Return warnings if the block-pulse scheme itself is unstable with this number of pulses.
 
     A stiff equation with alpha - nu > 1 for an own term gives the scheme a mode at its Nyquist frequency that the model
@@ -308,24 +320,24 @@ def discretisation(model: Model, comparison: Comparison) -> list[str]:
     return warnings
 
 
-def one_sided(model: Model, free: Sequence[Sampled]) -> list[str]:
+def friction_direction_warnings(model: Model, free: Sequence[OutputSamples]) -> list[str]:
     """Return warnings if friction and an offset are collinear (sliding in one direction only)."""
     if not model.structure.has_friction or model.structure.offset == "none":
         return []
 
     def turns(samples: Floats) -> bool:
-        moved, least = np.diff(samples), TURNED * float(np.ptp(samples))
+        moved, least = np.diff(samples), MIN_MOTION_RANGE_FRACTION * float(np.ptp(samples))
         return bool(np.any(moved > least) and np.any(moved < -least))
 
     return [
         f"the velocity of {model.outputs[i]} never changes its sign in a run: while it slides, friction is a constant "
         "like the offset, and only the rests tell them apart; add a run that moves both ways, or use offset='none'"
-        for i in model.structure.sticks
+        for i in model.structure.friction_equations
         if not any(turns(run.outputs[i]) for run in free)
     ]
 
 
-def unslowed(model: Model, runs: Sequence[Run], free: Sequence[Sampled]) -> list[str]:
+def stribeck_warnings(model: Model, runs: Sequence[Run], free: Sequence[OutputSamples]) -> list[str]:
     """Return warnings if no run distinguishes the friction near rest from that at speed."""
     said = []
     for item in model.equations:
@@ -334,11 +346,12 @@ def unslowed(model: Model, runs: Sequence[Run], free: Sequence[Sampled]) -> list
             continue
         vs, column = float(near.speed), model.outputs.index(item.output)
         paces = [np.abs(np.diff(there.outputs[column])) / run.step for run, there in zip(runs, free, strict=True)]
-        pace = np.concatenate([p[p > TURNED * p.max(initial=0.0)] for p in paces])
-        slow = int(np.sum(pace < SLOW * vs))
-        if slow < FEWEST_SLOW:
+        pace = np.concatenate([p[p > MIN_MOTION_RANGE_FRACTION * p.max(initial=0.0)] for p in paces])
+        slow = int(np.sum(pace < SLOW_SPEED_RATIO * vs))
+        if slow < MIN_SLOW_INTERVALS:
             said.append(
-                f"{item.output} moves at less than {SLOW:g} vs = {SLOW * vs:.3g} per s in {slow} of {pace.size} "
+                f"{item.output} moves at less than {SLOW_SPEED_RATIO:g} vs = {SLOW_SPEED_RATIO * vs:.3g} per s in "
+                f"{slow} of {pace.size} "
                 "intervals: nothing tells fs and vs, what is seen of friction is fc alone; add a run that creeps, or "
                 "leave the Stribeck term out"
             )
@@ -350,7 +363,7 @@ def unslowed(model: Model, runs: Sequence[Run], free: Sequence[Sampled]) -> list
     return said
 
 
-def growing(model: Model) -> list[str]:
+def stability_warnings(model: Model) -> list[str]:
     """Return a warning about poles with a positive real part, which a short run may hide."""
     if model.structure.has_friction:
         # Friction holds what would grow slowly; no poles say so.
@@ -361,8 +374,12 @@ def growing(model: Model) -> list[str]:
     return [f"the model is {verdict}: its free run grows without bound, however well it fits a run of this length"]
 
 
-def validate(result: Judged, runs: Run | Sequence[Run]) -> Comparison:
+def validate(result: IdentificationRecord, runs: Run | Sequence[Run]) -> Comparison:
     """Compare a result with other runs and add warnings; see :meth:`ftlm.Identification.validate`."""
     there = compare(result.model, runs)
-    words = [*there.warnings, *validation_warnings(result.comparison, there), *discretisation(result.model, there)]
+    words = [
+        *there.warnings,
+        *validation_warnings(result.comparison, there),
+        *discretization_warnings(result.model, there),
+    ]
     return replace(there, warnings=tuple(dict.fromkeys(words)))

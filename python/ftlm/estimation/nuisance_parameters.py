@@ -13,30 +13,43 @@ from ftlm import _core
 from ftlm.data.run import Run
 from ftlm.errors import FtlmError
 from ftlm.estimation.free_parameters import FreeProblem
-from ftlm.estimation.objective import Attempt, Grid, covariance
-from ftlm.estimation.output_error import RACED, SWEEP, JointFit, Outset, fit_output_error
+from ftlm.estimation.objective import Iterate, Objective, covariance
+from ftlm.estimation.output_error import (
+    MULTISTART_END_FRACTION,
+    SWEEP_FRACTION,
+    Initialization,
+    JointFit,
+    fit_output_error,
+)
 from ftlm.order_search.options import Loss
-from ftlm.progress import Course
-from ftlm.simulation.initial_conditions import decided_together, has_memory, history, misfit_of_fits, needed, together
-from ftlm.simulation.output_samples import in_motion, initial_exponents
+from ftlm.progress import ShareTracker
+from ftlm.simulation.initial_conditions import (
+    common_initial_conditions,
+    has_memory,
+    history,
+    misfit_of_fits,
+    needs_history,
+    resolve_common_initial_conditions,
+)
+from ftlm.simulation.output_samples import initial_exponents, is_in_motion
 from ftlm.structure.equation import Term
 from ftlm.structure.order import Order
 from ftlm.structure.structure import History, Initial, Structure, offset_exponents
-from ftlm.utils.linalg import dot, orthonormal, projections, singular
-from ftlm.utils.statistics import LEVEL, ROUNDING, autoregression, chi_squared
+from ftlm.utils.linalg import dot, orthonormal, projections, thin_svd
+from ftlm.utils.statistics import NEGLIGIBLE_RESIDUAL_SHARE, SIGNIFICANCE_LEVEL, autoregression, chi_squared
 from ftlm.utils.validation import Floats
-from ftlm.validation.residual_tests import LAGS
+from ftlm.validation.residual_tests import DEFAULT_LAGS
 
 #: Block pulses a sample interval if the fit does not state its refinement.
-EVERY = 2
+DEFAULT_PULSES_PER_SAMPLE = 2
 #: Relative size of the offset sensitivity below which it is collinear with the other parameters.
-TOLD_APART = 1e-6
+OFFSET_COLLINEARITY_TOLERANCE = 1e-6
 #: Smallest reported effect of an offset, as a fraction of the standard deviation of the output.
-VISIBLE = 1e-3
+MIN_OFFSET_SIZE_RATIO = 1e-3
 #: Significance level of the warning about an offset that was not requested.
-UNASKED = 1e-4
+UNREQUESTED_OFFSET_LEVEL = 1e-4
 #: Maximum number of evaluations from the grid point to the nearby optimum.
-EVALUATIONS = 40
+MAX_REFINEMENT_EVALUATIONS = 40
 
 
 @dataclass(frozen=True)
@@ -60,14 +73,15 @@ class OffsetTest:
     share: float
     size: float
 
-    def exceeds(self, level: float = LEVEL, *, size: float = ROUNDING) -> bool:
+    def exceeds(self, level: float = SIGNIFICANCE_LEVEL, *, size: float = NEGLIGIBLE_RESIDUAL_SHARE) -> bool:
         """Whether the statistic is significant at `level` and the effect is larger than `size`."""
         return self.degrees > 0 and self.size > size and self.statistic > chi_squared(self.degrees, level)
 
     @property
-    def figures(self) -> str:
+    def statistic_text(self) -> str:
         """Statistic and 99 % limit as text."""
-        return f"chi-squared {self.statistic:.4g} of {self.degrees}, 99 % limit {chi_squared(self.degrees, LEVEL):.4g}"
+        limit = chi_squared(self.degrees, SIGNIFICANCE_LEVEL)
+        return f"chi-squared {self.statistic:.4g} of {self.degrees}, 99 % limit {limit:.4g}"
 
     @property
     def decision(self) -> str:
@@ -75,31 +89,31 @@ class OffsetTest:
         if not self.degrees:
             return "none: these runs do not tell one from the other unknowns"
         if self.exceeds():
-            return f"constant, since the runs ask for one ({self.figures})"
-        return f"none, since the runs ask for none ({self.figures})"
+            return f"constant, since the runs ask for one ({self.statistic_text})"
+        return f"none, since the runs ask for none ({self.statistic_text})"
 
 
-def at_point(
+def evaluate_at_point(
     runs: Sequence[Run], structure: Structure, values: Mapping[str, float], every: int
-) -> tuple[Grid, Attempt]:
+) -> tuple[Objective, Iterate]:
     """Evaluate the output error at given parameters, with output weights from the residuals."""
-    problem = FreeProblem.of(replace(structure, initial=decided_together(runs, structure)))
+    problem = FreeProblem.of(replace(structure, initial=resolve_common_initial_conditions(runs, structure)))
     orders, coefficients, inputs = problem.split([values[n] for n in problem.names])
-    start = Attempt(orders, coefficients, "given", {}, inputs)
-    grid = Grid(problem, runs, [1.0] * len(structure.outputs), every=every)
-    here = grid.descend(start, 1, plain=True)
-    weights = [1.0 / max(level, 1e-300) for level in grid.levels(here).values()]
+    start = Iterate(orders, coefficients, "given", {}, inputs)
+    grid = Objective(problem, runs, [1.0] * len(structure.outputs), every=every)
+    here = grid.minimize(start, 1, plain=True)
+    weights = [1.0 / max(level, 1e-300) for level in grid.rms_residuals(here).values()]
     grid = replace(grid, weights=weights)
     if len(weights) > 1:
         # Initial terms bring all outputs closest together, so that they follow the weights.
-        return grid, grid.descend(here, 1, plain=True)
+        return grid, grid.minimize(here, 1, plain=True)
     scaled = {n: weights[0] * np.asarray(here.outcome[n]) for n in ("residuals", "jacobian")}
     cost = weights[0] ** 2 * float(here.outcome["cost"])
     return grid, replace(here, outcome={**here.outcome, **scaled, "cost": cost})
 
 
 def offset_test(
-    runs: Sequence[Run], structure: Structure, values: Mapping[str, float], *, every: int = EVERY
+    runs: Sequence[Run], structure: Structure, values: Mapping[str, float], *, every: int = DEFAULT_PULSES_PER_SAMPLE
 ) -> OffsetTest | None:
     """Test for an unknown constant in each equation and run, at given parameters; None if not computable.
 
@@ -113,11 +127,11 @@ def offset_test(
     equations = tuple(
         replace(e, terms=(*e.terms, Term(one, Order(), n))) for e, n in zip(structure.equations, names, strict=True)
     )
-    initial = without_stand_ins(decided_together(runs, structure), structure, values)
+    initial = without_offset_equivalents(resolve_common_initial_conditions(runs, structure), structure, values)
     extended = replace(structure, equations=equations, offset="none", initial=initial)
     try:
         whole = [run.with_outputs({one: np.ones(run.length)}) for run in runs]
-        grid, here = at_point(whole, extended, {**values, **dict.fromkeys(names, 0.0)}, every)
+        grid, here = evaluate_at_point(whole, extended, {**values, **dict.fromkeys(names, 0.0)}, every)
     except FtlmError:
         # No finite free run on this grid: the result says so elsewhere.
         return None
@@ -125,7 +139,7 @@ def offset_test(
     rows = np.asarray(here.outcome["jacobian"])
     others = np.delete(rows, range(first, first + len(names)), axis=0)
     residuals = np.asarray(here.outcome["residuals"])
-    blocks = _blocks(grid)
+    blocks = _residual_blocks(grid)
     columns = []
     for row in rows[first : first + len(names)]:
         for start, stop in ((own[0][0], own[-1][1]) for own in blocks):
@@ -138,8 +152,8 @@ def offset_test(
     basis = orthonormal(others.T, 1e-12) if others.size else np.zeros((residuals.size, 0))
     for _ in range(2):
         left = left - basis @ (basis.T @ left)
-    directions, spread, _ = singular(left)
-    told = directions[:, spread > TOLD_APART]
+    directions, spread, _ = thin_svd(left)
+    told = directions[:, spread > OFFSET_COLLINEARITY_TOLERANCE]
     count = told.shape[1]
     total = dot(residuals, residuals)
     if count == 0 or not total > 0:
@@ -147,7 +161,7 @@ def offset_test(
     along = projections(told, residuals)
     # Where the numbers come from a fit with an offset, part of what it does lies along their sensitivities.
     noise = residuals - told @ along - basis @ projections(basis, residuals)
-    spread = _coloured(told, noise, blocks, residuals.size - basis.shape[1] - count)
+    spread = _colored_covariance(told, noise, blocks, residuals.size - basis.shape[1] - count)
     statistic = float(along @ np.linalg.pinv(spread) @ along)
     explained = told @ along
     sizes = [float(np.nanstd(run[o])) for run in runs for o in structure.outputs]
@@ -160,7 +174,7 @@ def offset_test(
     return OffsetTest(statistic, count, float(along @ along) / total, size)
 
 
-def without_stand_ins(initial: Initial, structure: Structure, values: Mapping[str, float]) -> Initial:
+def without_offset_equivalents(initial: Initial, structure: Structure, values: Mapping[str, float]) -> Initial:
     """Return Caputo's initial terms without powers of t that act like an offset; others unchanged."""
     if initial != "caputo":
         return initial
@@ -171,7 +185,7 @@ def without_stand_ins(initial: Initial, structure: Structure, values: Mapping[st
     return History(sorted(kept))
 
 
-def _blocks(grid: Grid) -> list[list[tuple[int, int]]]:
+def _residual_blocks(grid: Objective) -> list[list[tuple[int, int]]]:
     """Return first and last index of the residuals of every output, by run."""
     blocks, at = [], 0
     for _, count in grid.counts:
@@ -183,14 +197,14 @@ def _blocks(grid: Grid) -> list[list[tuple[int, int]]]:
     return blocks
 
 
-def _coloured(directions: Floats, noise: Floats, blocks: list[list[tuple[int, int]]], degrees: int) -> Floats:
+def _colored_covariance(directions: Floats, noise: Floats, blocks: list[list[tuple[int, int]]], degrees: int) -> Floats:
     """Return the covariance of projections onto directions under autoregressive noise of each output."""
     total: Floats = np.zeros((directions.shape[1], directions.shape[1]))
     scale = noise.size / max(degrees, 1)
     for output in range(len(blocks[0])):
         places = [slice(*own[output]) for own in blocks]
         series = [noise[p] for p in places]
-        filtered = autoregression(series, LAGS)
+        filtered = autoregression(series, DEFAULT_LAGS)
         errors = np.concatenate([np.convolve(e, filtered, "valid") for e in series])
         power = float(np.mean(errors**2)) * scale
         for place in places:
@@ -204,19 +218,20 @@ def _coloured(directions: Floats, noise: Floats, blocks: list[list[tuple[int, in
     return total
 
 
-def unasked_offset(test: OffsetTest | None, outputs: Sequence[str]) -> list[str]:
+def unrequested_offset_warnings(test: OffsetTest | None, outputs: Sequence[str]) -> list[str]:
     """Return a warning if an offset that was not requested would explain the residuals."""
-    if test is None or not test.exceeds(UNASKED, size=VISIBLE):
+    if test is None or not test.exceeds(UNREQUESTED_OFFSET_LEVEL, size=MIN_OFFSET_SIZE_RATIO):
         return []
     return [
         f"an unknown constant in the equation of {', '.join(outputs)} explains {100 * min(test.share, 1):.2g} % of "
-        f"what the model misses ({test.figures}): a sensor's zero, a load, a voltage at rest; use offset='constant' "
+        f"what the model misses ({test.statistic_text}): a sensor's zero, a load, a voltage at rest; use "
+        "offset='constant' "
         "or offset='auto'"
     ]
 
 
 def errors_with_orders(
-    runs: Sequence[Run], structure: Structure, values: Mapping[str, float], *, every: int = EVERY
+    runs: Sequence[Run], structure: Structure, values: Mapping[str, float], *, every: int = DEFAULT_PULSES_PER_SAMPLE
 ) -> dict[str, float] | None:
     """Return standard errors of orders and coefficients from an order search; None if not computable.
 
@@ -225,8 +240,8 @@ def errors_with_orders(
     is added as an error.
     """
     try:
-        grid, here = at_point(runs, replace(structure, coefficient_law=()), values, every)
-        there = grid.descend(here, EVALUATIONS, plain=True)
+        grid, here = evaluate_at_point(runs, replace(structure, coefficient_law=()), values, every)
+        there = grid.minimize(here, MAX_REFINEMENT_EVALUATIONS, plain=True)
         spread = np.diag(covariance(there, grid))
     except FtlmError:
         return None
@@ -236,7 +251,7 @@ def errors_with_orders(
     return {n: e if math.isfinite(e) else math.inf for n, e in zip(grid.problem.names, errors.tolist(), strict=True)}
 
 
-def fit_any_start(
+def fit_with_initial_conditions(
     runs: Sequence[Run],
     structure: Structure,
     start: Initial,
@@ -254,7 +269,7 @@ def fit_any_start(
     The result states which terms were fitted.
     """
 
-    def fitted(initial: Initial, *, refine: bool = True, raced: _core.JointRace | None = None) -> JointFit:
+    def fit_initial_terms(initial: Initial, *, refine: bool = True, raced: _core.JointRace | None = None) -> JointFit:
         asked = replace(structure, initial=initial)
         begun = partial(fit_output_error, start=known[0]) if alone else partial(fit_output_error, known=known)
         return begun(runs, asked, threads=threads, refine=refine, progress=progress, loss=loss, raced=raced)
@@ -263,65 +278,75 @@ def fit_any_start(
     if not decided and isinstance(start, History):
         # Where few terms are enough on the first grid, finer ones are for them alone: what a coarse grid leaves asks
         # for more terms, not for fewer.
-        outset = Outset.of(runs, replace(structure, initial=start))
-        raced = None if alone else outset.race(threads, Course(progress).until(RACED, SWEEP))
-        many = fitted(start, refine=False, raced=raced)
-        kept = _shorter(many, runs, structure, loss, refine=False)
-        if kept.growth is None and many.growth is None:
+        outset = Initialization.of(runs, replace(structure, initial=start))
+        raced = (
+            None
+            if alone
+            else outset.run_multistart(threads, ShareTracker(progress).subtask(MULTISTART_END_FRACTION, SWEEP_FRACTION))
+        )
+        many = fit_initial_terms(start, refine=False, raced=raced)
+        kept = _simplify_initial_terms(many, runs, structure, loss, refine=False)
+        if kept.unstable_optimum is None and many.unstable_optimum is None:
             asked = replace(structure, initial=kept.initial)
             fine = fit_output_error(runs, asked, near=kept, loss=loss, raced=raced)
             fine = replace(fine, starts=many.starts, origin=many.origin)
-            return fine if kept is not many else _shorter(fine, runs, structure, loss, refine=True)
+            return fine if kept is not many else _simplify_initial_terms(fine, runs, structure, loss, refine=True)
         # Where a free run may grow, the starts of the race are asked on every grid.
-        return _shorter(fitted(start, raced=raced), runs, structure, loss, refine=True)
-    joint = fitted(start)
-    if decided or start != "rest" or not _moved(joint, runs, structure):
+        return _simplify_initial_terms(fit_initial_terms(start, raced=raced), runs, structure, loss, refine=True)
+    joint = fit_initial_terms(start)
+    if decided or start != "rest" or not _has_nonzero_start(joint, runs, structure):
         return joint
-    return fitted(together([history(run, structure) for run in runs]) or history(runs[0], structure))
+    return fit_initial_terms(
+        common_initial_conditions([history(run, structure) for run in runs]) or history(runs[0], structure)
+    )
 
 
-def _shorter(joint: JointFit, runs: Sequence[Run], structure: Structure, loss: Loss, *, refine: bool) -> JointFit:
+def _simplify_initial_terms(
+    joint: JointFit, runs: Sequence[Run], structure: Structure, loss: Loss, *, refine: bool
+) -> JointFit:
     """Return the fit with Caputo initial terms if they suffice, otherwise the fit with a history."""
     try:
-        few = _from(joint, runs, replace(structure, initial="caputo"), loss, refine=refine)
+        few = _refit_from(joint, runs, replace(structure, initial="caputo"), loss, refine=refine)
     except FtlmError:
         # From here it has no finite free run, so it is not enough.
         return joint
-    return joint if asks_for_history(few, joint, runs, structure) else few
+    return joint if _fit_needs_history(few, joint, runs, structure) else few
 
 
-def _from(joint: JointFit, runs: Sequence[Run], structure: Structure, loss: Loss, *, refine: bool = False) -> JointFit:
+def _refit_from(
+    joint: JointFit, runs: Sequence[Run], structure: Structure, loss: Loss, *, refine: bool = False
+) -> JointFit:
     """Fit another structure from an earlier optimum; without `refine` on the coarsest grid that it allows."""
     values = dict(zip(joint.names, joint.values.tolist(), strict=True))
     return fit_output_error(runs, structure, start=values, loss=loss, refine=refine)
 
 
-def instead_of_history(joint: JointFit, runs: Sequence[Run], structure: Structure) -> JointFit | None:
+def fit_without_history(joint: JointFit, runs: Sequence[Run], structure: Structure) -> JointFit | None:
     """Return a fit with Caputo terms and a constant if it replaces a history, otherwise None."""
     asked = replace(structure, offset="constant")
     loss: Loss = "squares" if joint.robust is None else "huber"
     try:
-        few = _from(joint, runs, replace(asked, initial="caputo"), loss)
+        few = _refit_from(joint, runs, replace(asked, initial="caputo"), loss)
         # On the same kind of grid: what a coarse one leaves is no history.
-        many = _from(joint, runs, replace(structure, initial=joint.initial), loss)
+        many = _refit_from(joint, runs, replace(structure, initial=joint.initial), loss)
     except FtlmError:
         return None
     fewer = few.initial_terms < many.initial_terms
-    return few if fewer and not asks_for_history(few, many, runs, asked) else None
+    return few if fewer and not _fit_needs_history(few, many, runs, asked) else None
 
 
-def asks_for_history(few: JointFit, many: JointFit, runs: Sequence[Run], structure: Structure) -> bool:
+def _fit_needs_history(few: JointFit, many: JointFit, runs: Sequence[Run], structure: Structure) -> bool:
     """Whether a fit with few initial terms has significantly larger residuals than one with a history."""
     outputs = structure.outputs
     ours, theirs = (
         [fit.noise[o] * np.concatenate([part[o] for part in fit.residuals]) for o in outputs] for fit in (few, many)
     )
     sizes = [float(np.nanstd(np.concatenate([run[o] for run in runs]))) for o in outputs]
-    return needed(structure, misfit_of_fits(ours, theirs, sizes), many.initial_terms - few.initial_terms)
+    return needs_history(structure, misfit_of_fits(ours, theirs, sizes), many.initial_terms - few.initial_terms)
 
 
-def _moved(joint: JointFit, runs: Sequence[Run], structure: Structure) -> bool:
+def _has_nonzero_start(joint: JointFit, runs: Sequence[Run], structure: Structure) -> bool:
     """Whether the residuals of a fit from rest require nonzero initial conditions."""
     problem = FreeProblem.of(structure)
-    numbers = problem.named(list(joint.coefficients.values()))
-    return in_motion(structure.with_orders(joint.orders).with_coefficients(numbers).with_inputs(joint.inputs), runs)
+    numbers = problem.coefficients_by_name(list(joint.coefficients.values()))
+    return is_in_motion(structure.with_orders(joint.orders).with_coefficients(numbers).with_inputs(joint.inputs), runs)

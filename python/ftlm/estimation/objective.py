@@ -11,27 +11,27 @@ import numpy as np
 
 from ftlm import _core
 from ftlm.data.run import Run
-from ftlm.data.sampling import read
-from ftlm.estimation.free_parameters import FreeProblem, spans
+from ftlm.data.sampling import drop_missing
+from ftlm.estimation.free_parameters import FreeProblem, sampling_spans
 from ftlm.simulation.discretization import (
-    Instants,
     Record,
+    SampleTimes,
     compared_times,
     compared_values,
-    driving,
-    has_own_times,
+    has_nonuniform_samples,
     record,
     sensor_series,
+    with_effective_inputs,
 )
 from ftlm.structure.structure import Structure
-from ftlm.utils.resources import stop
+from ftlm.utils.resources import stop_flag
 from ftlm.utils.validation import Floats
 
 #: Relative cost reduction of a full step below which the minimization has converged.
-TOLERANCE = 1e-9
+COST_REDUCTION_TOLERANCE = 1e-9
 
 
-def experiment(
+def sample_run(
     run: Run,
     problem: FreeProblem,
     weights: Sequence[float],
@@ -45,53 +45,53 @@ def experiment(
     `shares` are the robust weights of the compared samples, one row an output. Missing samples have weight 0.
     """
     # What is free of inputs is the core's to apply, to inputs as they were given.
-    structure = problem.structure.as_given()
+    structure = problem.structure.without_input_nonlinearities()
     rows = (run.length - 1) // decimation * decimation + 1
     if rows != run.length:
-        run = run.slice(None, rows * run.step - run.step / 2)
+        run = run.window(None, rows * run.step - run.step / 2)
     intervals = (rows - 1) // decimation
-    rec = record(run, structure, intervals * every, filtered=structure.behind_filter)
-    if has_own_times(run, problem.structure):
-        return _at_own_times(run, structure, rec, weights, decimation, shares)
+    rec = record(run, structure, intervals * every, filtered=structure.all_filtered)
+    if has_nonuniform_samples(run, problem.structure):
+        return _sample_nonuniform_run(run, structure, rec, weights, decimation, shares)
     samples = []
     for output in structure.outputs:
-        if rec.sensor is None or structure.measured_through(output):
+        if rec.sensor is None or structure.is_filtered(output):
             samples.append(run[output][::decimation])
         else:
             # The equation is compared in filtered signals, so this output passes the filter too.
             samples.append(_core.point_samples(rec.of(output))[::every])
     filtered = _output_filter(structure, rec)
-    instants = [_instant(run, structure, rec, name, every, decimation) for name in structure.signals]
-    measured, counted = _counted(np.stack(samples), slice(1, -1), shares)
-    return rec.begun(), every, measured, filtered, list(weights), instants, counted, None
+    instants = [_signal_at_samples(run, structure, rec, name, every, decimation) for name in structure.signals]
+    measured, counted = _weighted_samples(np.stack(samples), slice(1, -1), shares)
+    return rec.core_with_transients(), every, measured, filtered, list(weights), instants, counted, None
 
 
-def _at_own_times(
+def _sample_nonuniform_run(
     run: Run, structure: Structure, rec: Record, weights: Sequence[float], decimation: int, shares: Floats | None
 ) -> tuple[Any, ...]:
     """Convert a run with nonuniform sample times. The first sample only gives the initial value."""
     times = compared_times(run, structure)
     kept = np.flatnonzero(times > 0.0)[::decimation]
-    at = Instants.of(run, rec, structure, times[kept])
-    measured, counted = _counted(
+    at = SampleTimes.of(run, rec, structure, times[kept])
+    measured, counted = _weighted_samples(
         np.stack([compared_values(run, structure, o)[kept] for o in structure.outputs]), slice(None), shares
     )
     filtered = _output_filter(structure, rec)
     signals = [at.values(name) for name in structure.signals]
     # What was not read everywhere drives nothing.
     instants = [(None if v is None or np.isnan(v).any() else v, False) for v in signals]
-    own = (at.places, [at.jumps(name) for name in structure.signals])
-    return rec.begun(), 1, measured, filtered, list(weights), instants, counted, own
+    own = (at.pulse_positions, [at.jumps(name) for name in structure.signals])
+    return rec.core_with_transients(), 1, measured, filtered, list(weights), instants, counted, own
 
 
 def _output_filter(structure: Structure, rec: Record) -> tuple[Floats | None, list[bool]] | None:
     """Return the sensor filter of the simulated outputs, or None if all signals are filtered already."""
     if structure.sensor_filter is None or rec.sensor is not None:
         return None
-    return sensor_series(structure, rec.m, rec.step), [structure.measured_through(o) for o in structure.outputs]
+    return sensor_series(structure, rec.m, rec.step), [structure.is_filtered(o) for o in structure.outputs]
 
 
-def _counted(samples: Floats, compared: slice, shares: Floats | None) -> tuple[Floats, Floats | None]:
+def _weighted_samples(samples: Floats, compared: slice, shares: Floats | None) -> tuple[Floats, Floats | None]:
     """Return samples without gaps, and the weights of the compared samples; None if all weights are 1."""
     unread = np.isnan(samples)
     counted = shares
@@ -101,7 +101,7 @@ def _counted(samples: Floats, compared: slice, shares: Floats | None) -> tuple[F
     return np.ascontiguousarray(np.where(unread, 0.0, samples)), counted
 
 
-def _instant(
+def _signal_at_samples(
     run: Run, structure: Structure, rec: Record, name: str, every: int, decimation: int
 ) -> tuple[Floats | None, bool]:
     """Return a signal at the sample times, after any jump there, and whether it is held between samples.
@@ -109,10 +109,10 @@ def _instant(
     None if the signal has no jump or slope discontinuity at the samples (behind a sensor filter, or computed from other
     signals), and if it has missing samples.
     """
-    if name not in run or name in run.missing or (rec.sensor is not None and not structure.measured_through(name)):
+    if name not in run or name in run.missing_samples or (rec.sensor is not None and not structure.is_filtered(name)):
         return None, False
     held = name in run.inputs and run.intersample[name] == "zoh"
-    values, delay = driving(run, structure, name)[name], structure.delay.get(name, 0.0)
+    values, delay = with_effective_inputs(run, structure, name)[name], structure.delay.get(name, 0.0)
     if delay and held:
         # A command switches between samples after a delay: what it is then is the pulse that follows.
         means = rec.of(name)[::every]
@@ -123,7 +123,7 @@ def _instant(
 
 
 @dataclass
-class Attempt:
+class Iterate:
     """Point in parameter space with its origin and the result of its evaluation by the core."""
 
     orders: list[float]
@@ -138,27 +138,27 @@ class Attempt:
         return np.array(self.orders + self.coefficients + self.inputs)
 
     @property
-    def level(self) -> float:
+    def cost_per_residual(self) -> float:
         """Cost per residual: 1 at the noise level if the weights are right."""
         return 2.0 * float(self.outcome["cost"]) / len(self.outcome["residuals"])
 
     @property
-    def converged(self) -> bool:
+    def has_converged(self) -> bool:
         """Whether the gradient vanishes, apart from active bounds; False at another constraint."""
         return bool(self.outcome["status"] == "converged")
 
 
-def descend(
+def minimize_cost(
     problem: FreeProblem,
     experiments: list[Any],
-    attempt: Attempt,
+    attempt: Iterate,
     *,
     evaluations: int,
     plain: bool = False,
     held: int | Sequence[int] = (),
-    tolerance: float = TOLERANCE,
+    tolerance: float = COST_REDUCTION_TOLERANCE,
     steady: bool = False,
-) -> Attempt:
+) -> Iterate:
     """Minimize the cost by Levenberg-Marquardt; parameters with an index in `held` stay fixed.
 
     With `steady`, no step leads from a stable model to an unstable one. Initial states of bodies with friction are not
@@ -173,14 +173,14 @@ def descend(
         evaluations,
         tolerance,
         steady,
-        stop(),
+        stop_flag(),
     )
     orders, coefficients, inputs = problem.split(outcome["values"])
     return replace(attempt, orders=orders, coefficients=coefficients, inputs=inputs, outcome=outcome)
 
 
 @dataclass(frozen=True)
-class Grid:
+class Objective:
     """Output-error objective on sampled runs: problem, output weights, pulses a sample, decimation.
 
     `robust_weights` holds the weights of a robust loss by run, one row an output. With `prefer_stable`, no step leads
@@ -192,40 +192,40 @@ class Grid:
     weights: Sequence[float]
     every: int = 1
     decimation: int = 1
-    shares: Sequence[Floats] | None = None
-    steady: bool = False
+    robust_weights: Sequence[Floats] | None = None
+    prefer_stable: bool = False
 
     @cached_property
     def experiments(self) -> list[Any]:
         """Runs in the form that the core compares with."""
         return [
-            experiment(
+            sample_run(
                 run,
                 self.problem,
                 self.weights,
                 every=self.every,
                 decimation=self.decimation,
-                shares=None if self.shares is None else self.shares[k],
+                shares=None if self.robust_weights is None else self.robust_weights[k],
             )
             for k, run in enumerate(self.runs)
         ]
 
     @cached_property
-    def finer(self) -> Grid:
+    def finer(self) -> Objective:
         """The same objective with half the step."""
         return replace(self, every=2 * self.every)
 
-    def descend(
+    def minimize(
         self,
-        attempt: Attempt,
+        attempt: Iterate,
         evaluations: int,
         *,
         plain: bool = False,
         held: int | Sequence[int] = (),
-        tolerance: float = TOLERANCE,
-    ) -> Attempt:
+        tolerance: float = COST_REDUCTION_TOLERANCE,
+    ) -> Iterate:
         """Minimize the cost by Levenberg-Marquardt; see :func:`minimize_cost`."""
-        return descend(
+        return minimize_cost(
             self.problem,
             self.experiments,
             attempt,
@@ -233,14 +233,14 @@ class Grid:
             plain=plain,
             held=held,
             tolerance=tolerance,
-            steady=self.steady,
+            steady=self.prefer_stable,
         )
 
-    def evaluated(self, attempt: Attempt) -> Attempt:
+    def evaluate(self, attempt: Iterate) -> Iterate:
         """Evaluate residuals and cost at a point, without derivatives."""
-        return self.descend(attempt, 0)
+        return self.minimize(attempt, 0)
 
-    def residuals(self, attempt: Attempt) -> list[dict[str, Floats]]:
+    def residuals(self, attempt: Iterate) -> list[dict[str, Floats]]:
         """Return unweighted residuals in noise deviations by run and output; NaN for missing samples."""
         residuals = np.asarray(attempt.outcome["residuals"])
         parts, at = [], 0
@@ -260,29 +260,29 @@ class Grid:
         return [(e[6], e[2].shape[1] - (2 if e[7] is None else 0)) for e in self.experiments]
 
     @property
-    def every_share(self) -> Floats:
+    def residual_weights(self) -> Floats:
         """Robust weight of every residual, in the order of the core."""
         outputs = len(self.problem.structure.outputs)
         return np.concatenate(
             [np.ones(outputs * count) if shares is None else shares.ravel() for shares, count in self.counts]
         )
 
-    def levels(self, attempt: Attempt) -> dict[str, float]:
+    def rms_residuals(self, attempt: Iterate) -> dict[str, float]:
         """Return the root mean square of the weighted residuals by output, over all runs.
 
         Infinite on overflow.
         """
         with np.errstate(over="ignore"):
-            return {o: float(np.sqrt(np.mean(e**2))) for o, e in self.pooled(attempt).items()}
+            return {o: float(np.sqrt(np.mean(e**2))) for o, e in self.pooled_residuals(attempt).items()}
 
-    def pooled(self, attempt: Attempt) -> dict[str, Floats]:
+    def pooled_residuals(self, attempt: Iterate) -> dict[str, Floats]:
         """Return the weighted residuals by output, all runs concatenated, missing samples left out."""
         parts = self.residuals(attempt)
-        return {o: read(np.concatenate([p[o] for p in parts])) for o in self.problem.structure.outputs}
+        return {o: drop_missing(np.concatenate([p[o] for p in parts])) for o in self.problem.structure.outputs}
 
 
 @dataclass(frozen=True)
-class Asked:
+class RunSampler:
     """Converter of the runs of a joint fit to the forms that the core requests.
 
     The core calls these methods on the thread that called it.
@@ -291,14 +291,14 @@ class Asked:
     problem: FreeProblem
     runs: Sequence[Run]
 
-    def sampled(self, every: int, decimation: int, first: int | None) -> list[Any]:
+    def sample(self, every: int, decimation: int, first: int | None) -> list[Any]:
         """Return the runs with `every` block pulses a sample interval, decimated by `decimation`.
 
         With `first`, only the first `first` sample intervals of each run are used.
         """
         weights = [1.0] * len(self.problem.structure.outputs)
-        runs = self.runs if first is None else [run.slice(None, (first + 0.5) * run.step) for run in self.runs]
-        return [experiment(run, self.problem, weights, every=every, decimation=decimation) for run in runs]
+        runs = self.runs if first is None else [run.window(None, (first + 0.5) * run.step) for run in self.runs]
+        return [sample_run(run, self.problem, weights, every=every, decimation=decimation) for run in runs]
 
     def records(self, m: int, inputs: Sequence[float]) -> list[Any]:
         """Return block-pulse records with `m` pulses, measured inputs and given input parameters."""
@@ -312,25 +312,30 @@ class Asked:
         name = self.problem.structure.signals[signal]
         return [np.ascontiguousarray(run[name]) for run in self.runs]
 
-    def core(self, told: Callable[[int, int], None] | None = None) -> tuple[Any, ...]:
+    def core_arguments(self, told: Callable[[int, int], None] | None = None) -> tuple[Any, ...]:
         """Return this object, sampling spans, intersample behavior of each signal, progress callback."""
 
-        def between(name: str) -> str | None:
+        def intersample_kind(name: str) -> str | None:
             if name not in self.runs[0].inputs:
                 return None
             return "zoh" if any(run.intersample.get(name) == "zoh" for run in self.runs) else "foh"
 
-        return self, spans(self.runs), [between(name) for name in self.problem.structure.signals], told
+        return (
+            self,
+            sampling_spans(self.runs),
+            [intersample_kind(name) for name in self.problem.structure.signals],
+            told,
+        )
 
 
-def covariance(attempt: Attempt, grid: Grid) -> Floats:
+def covariance(attempt: Iterate, grid: Objective) -> Floats:
     """Return the covariance of the parameters, robust to autocorrelation if residuals are not white.
 
     Nothing is truncated: a parameter in a direction that the data do not determine has infinite variance. Under a
     robust loss the covariance is that of an M-estimator.
     """
     series = [residuals for part in grid.residuals(attempt) for residuals in part.values()]
-    shares = None if grid.shares is None else grid.every_share
+    shares = None if grid.robust_weights is None else grid.residual_weights
     return _core.fit_covariance(np.asarray(attempt.outcome["jacobian"]), series, shares)
 
 
@@ -342,12 +347,12 @@ def covariance_of(jacobian: Floats, series: Sequence[Floats], squares: float) ->
     return _core.covariance_of(jacobian, series, squares)
 
 
-def long_run(jacobian: Floats, series: Sequence[Floats]) -> Floats:
+def long_run_covariance(jacobian: Floats, series: Sequence[Floats]) -> Floats:
     """Return the long-run covariance of scores with Bartlett weights (doi:10.2307/1913610)."""
     return _core.long_run(jacobian, series)
 
 
-def deviation(slopes: Floats, spread: Floats) -> Floats:
+def propagated_errors(slopes: Floats, spread: Floats) -> Floats:
     """Return standard errors by first-order propagation, infinite if a variance involved is infinite."""
     unseen = np.isinf(np.diag(spread))
     known = slopes[:, ~unseen]

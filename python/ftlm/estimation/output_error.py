@@ -12,26 +12,26 @@ from msgspec import UnsetType
 
 from ftlm import _core
 from ftlm.data.run import Run
-from ftlm.data.sampling import read
+from ftlm.data.sampling import drop_missing
 from ftlm.errors import ConvergenceError, DataError, ModelError
-from ftlm.estimation.free_parameters import FreeProblem, twin_words
-from ftlm.estimation.friction import race_with_friction
-from ftlm.estimation.objective import Asked, Attempt, Grid, deviation
-from ftlm.model.model import Freedom, Solved
+from ftlm.estimation.free_parameters import FreeProblem, describe_collinear_inputs
+from ftlm.estimation.friction import run_friction_multistart
+from ftlm.estimation.objective import Iterate, Objective, RunSampler, propagated_errors
+from ftlm.model.model import FitParameters, ModelData
 from ftlm.order_search.options import Loss
-from ftlm.progress import PARTS, Course
+from ftlm.progress import TOTAL_PARTS, ShareTracker
 from ftlm.simulation.discretization import compared_values
 from ftlm.structure.input_nonlinearity import input_name
 from ftlm.structure.order import Order
 from ftlm.structure.structure import Initial, Structure
-from ftlm.utils.formatting import unbounded
-from ftlm.utils.resources import memory_limit, stop
-from ftlm.utils.statistics import NORMAL_95, noise_of
+from ftlm.utils.formatting import format_bound
+from ftlm.utils.resources import memory_limit, stop_flag
+from ftlm.utils.statistics import NORMAL_95, estimate_noise
 from ftlm.utils.validation import Floats
 
 
 @dataclass(frozen=True)
-class Growth:
+class UnstableOptimum:
     """Unstable optimum compared with the best stable optimum.
 
     Parameters
@@ -45,9 +45,9 @@ class Growth:
         Whether the stable point lies on the stability limit and is no optimum of its own.
     """
 
-    kept: bool
-    excess: float
-    at_limit: bool = False
+    is_accepted: bool
+    residual_excess: float
+    at_stability_limit: bool = False
 
 
 @dataclass(frozen=True)
@@ -85,15 +85,15 @@ class ProfileInterval:
         return self.low <= value <= self.high
 
     def __str__(self) -> str:
-        return f"{unbounded(self.low, '.6g')} to {unbounded(self.high, '.6g')}"
+        return f"{format_bound(self.low, '.6g')} to {format_bound(self.high, '.6g')}"
 
 
 #: Outlier threshold in standard deviations: exceeded by one of two million samples of normal noise.
-FAR = 5.0
+OUTLIER_DEVIATIONS = 5.0
 
 
 @dataclass(frozen=True)
-class Robust:
+class RobustLossSummary:
     """Number of residuals that a robust loss downweighted, and number of outliers.
 
     Parameters
@@ -112,7 +112,7 @@ class Robust:
 
 
 #: Fraction of the progress at which the multistart ends, and fraction of the remainder that each of its passes takes.
-RACED, SWEEP = 0.5, 0.3
+MULTISTART_END_FRACTION, SWEEP_FRACTION = 0.5, 0.3
 #: Residual of cost 1 in a coarse fit, as a fraction of the standard deviation of the output.
 COARSE_SHARE = 0.01
 #: Largest relative difference of the costs of one and the same optimum.
@@ -176,7 +176,7 @@ class JointFit:
     cost: float
     samples: int
     refinement: int
-    settled: bool
+    step_converged: bool
     converged: bool
     starts: list[tuple[float, str]]
     residuals: list[dict[str, Floats]]
@@ -184,12 +184,12 @@ class JointFit:
     inputs: dict[str, float] = field(default_factory=dict)
     initial: Initial = "rest"
     initial_terms: int = 0
-    robust: Robust | None = None
-    shares: Sequence[Floats] | None = field(default=None, repr=False)
-    on_grid: Floats = field(default_factory=lambda: np.zeros(0), repr=False)
+    robust: RobustLossSummary | None = None
+    robust_weights: Sequence[Floats] | None = field(default=None, repr=False)
+    finest_grid_values: Floats = field(default_factory=lambda: np.zeros(0), repr=False)
     origin: str = "the start that was given"
     profiles: Mapping[str, ProfileInterval] = field(default_factory=dict)
-    growth: Growth | None = None
+    unstable_optimum: UnstableOptimum | None = None
 
     @property
     def choice(self) -> str:
@@ -210,7 +210,7 @@ class JointFit:
         for name, (sign, factors) in self.products.items():
             value = sign * math.prod(self.coefficients[f] for f in factors)
             slope = np.array([factors.count(n) * value / v if v else 0.0 for n, v in self.coefficients.items()])
-            out[name] = float(deviation(slope[None], spread)[0])
+            out[name] = float(propagated_errors(slope[None], spread)[0])
         return out
 
     @property
@@ -247,44 +247,46 @@ class JointFit:
 
 
 @dataclass(frozen=True)
-class Outset:
+class Initialization:
     """Initialization of a joint fit: problem, runs and standard deviation of each output."""
 
     problem: FreeProblem
     runs: Sequence[Run]
-    sizes: Sequence[float]
+    deviations: Sequence[float]
 
     @classmethod
-    def of(cls, runs: Sequence[Run], structure: Structure) -> Outset:
+    def of(cls, runs: Sequence[Run], structure: Structure) -> Initialization:
         """Return the initialization; raises as :func:`fit_output_error` if the runs are too short."""
         problem, outputs = FreeProblem.of(structure), structure.outputs
-        samples = sum(max(read(compared_values(run, structure, o)).size - 2, 0) for run in runs for o in outputs)
+        samples = sum(
+            max(drop_missing(compared_values(run, structure, o)).size - 2, 0) for run in runs for o in outputs
+        )
         if samples <= len(problem.names):
             raise DataError(
                 f"{samples} samples between the first and the last do not tell {len(problem.names)} free numbers; use "
                 "longer runs, or fix orders or coefficients"
             )
-        return cls(problem, runs, output_sizes(runs, structure))
+        return cls(problem, runs, output_deviations(runs, structure))
 
     @cached_property
     def noise(self) -> list[float]:
         """Initial guess of the noise standard deviation of each output."""
         structure = self.problem.structure
-        outputs = zip(structure.outputs, self.sizes, strict=True)
+        outputs = zip(structure.outputs, self.deviations, strict=True)
         return [first_noise(self.runs, structure, output, size) for output, size in outputs]
 
-    def race(self, threads: int, progress: Callable[[int, int], None] | None) -> _core.JointRace:
+    def run_multistart(self, threads: int, progress: Callable[[int, int], None] | None) -> _core.JointRace:
         """Run the multistart of this problem. Later fits of the same structure to the same runs may reuse it."""
-        shares = [noise / (COARSE_SHARE * size) for noise, size in zip(self.noise, self.sizes, strict=True)]
+        shares = [noise / (COARSE_SHARE * size) for noise, size in zip(self.noise, self.deviations, strict=True)]
         floor = float(np.mean([share**2 for share in shares]))
-        weights = [1.0 / (COARSE_SHARE * size) for size in self.sizes]
+        weights = [1.0 / (COARSE_SHARE * size) for size in self.deviations]
         if self.problem.structure.has_friction:
-            return race_with_friction(Grid(self.problem, self.runs, weights), floor, threads, progress)
-        runs = Asked(self.problem, self.runs).core(progress)
-        return _core.joint_race(self.problem.core, runs, weights, floor, (threads, memory_limit()), stop())
+            return run_friction_multistart(Objective(self.problem, self.runs, weights), floor, threads, progress)
+        runs = RunSampler(self.problem, self.runs).core_arguments(progress)
+        return _core.joint_race(self.problem.core, runs, weights, floor, (threads, memory_limit()), stop_flag())
 
 
-def output_sizes(runs: Sequence[Run], structure: Structure) -> list[float]:
+def output_deviations(runs: Sequence[Run], structure: Structure) -> list[float]:
     """Return the standard deviation of each output, as the root of the mean variance over all runs."""
     return [math.sqrt(float(np.mean([np.nanvar(run[o]) for run in runs]))) for o in structure.outputs]
 
@@ -317,18 +319,18 @@ def fit_output_error(
     ConvergenceError
         No initial guess has a finite simulation or a finite sum of squares.
     """
-    outset = Outset.of(runs, structure)
+    outset = Initialization.of(runs, structure)
     problem, outputs = outset.problem, structure.outputs
-    course = Course(progress)
+    course = ShareTracker(progress)
     if problem.structure.has_friction and raced is None and start is None and near is None:
-        raced = outset.race(threads, course.until(RACED, SWEEP))
+        raced = outset.run_multistart(threads, course.subtask(MULTISTART_END_FRACTION, SWEEP_FRACTION))
     given_near = None
     if near is not None:
         given_near = near.values.tolist(), [near.noise[o] for o in outputs], near.refinement
     found = _core.joint_fit(
         problem.core,
-        Asked(problem, runs).core(lambda done, _: course.at(done / PARTS)),
-        list(zip(outset.sizes, outset.noise, strict=True)),
+        RunSampler(problem, runs).core_arguments(lambda done, _: course.advance_to(done / TOTAL_PARTS)),
+        list(zip(outset.deviations, outset.noise, strict=True)),
         [[v[n] for n in problem.names] for v in known],
         None if start is None else [start[n] for n in problem.names],
         given_near,
@@ -336,10 +338,10 @@ def fit_output_error(
         loss == "huber",
         refine,
         (threads, memory_limit()),
-        stop(),
+        stop_flag(),
     )
     if found is None:
-        why = twin_words(runs, structure) or "check the signs of the data and the bounds"
+        why = describe_collinear_inputs(runs, structure) or "check the signs of the data and the bounds"
         raise ConvergenceError(f"no start of {', '.join(outputs)} has a finite free run; {why}")
     orders, coefficients, inputs = problem.split(found["estimate"])
     residuals = [dict(zip(outputs, part, strict=True)) for part in found["left"]]
@@ -351,41 +353,41 @@ def fit_output_error(
         covariance=found["covariance"],
         residuals=residuals,
         noise=dict(zip(outputs, found["noise"], strict=True)),
-        robust=None if found["robust"] is None else Robust(*found["robust"]),
-        shares=found["shares"],
-        on_grid=found["on_grid"],
+        robust=None if found["robust"] is None else RobustLossSummary(*found["robust"]),
+        robust_weights=found["shares"],
+        finest_grid_values=found["on_grid"],
         cost=found["cost"],
-        samples=sum(read(e).size for part in residuals for e in part.values()),
+        samples=sum(drop_missing(e).size for part in residuals for e in part.values()),
         refinement=found["every"],
-        settled=found["settled"],
+        step_converged=found["settled"],
         converged=found["status"] == "converged",
         starts=found["starts"],
         initial=structure.initial,
         initial_terms=found["initial_terms"],
-        growth=None if found["growth"] is None else Growth(*found["growth"]),
+        unstable_optimum=None if found["growth"] is None else UnstableOptimum(*found["growth"]),
     )
 
 
-def given(problem: FreeProblem, values: Mapping[str, float]) -> Attempt:
+def start_from_values(problem: FreeProblem, values: Mapping[str, float]) -> Iterate:
     """Return an initial guess from values by name."""
     orders, coefficients, inputs = problem.split([values[n] for n in problem.names])
-    return Attempt(orders, coefficients, "given start", {}, inputs)
+    return Iterate(orders, coefficients, "given start", {}, inputs)
 
 
 def first_noise(runs: Sequence[Run], structure: Structure, output: str, size: float) -> float:
     """Return an initial noise level of an output from second differences, bounded below."""
-    return max(float(np.median([noise_of(compared_values(run, structure, output)) for run in runs])), 1e-3 * size)
+    return max(float(np.median([estimate_noise(compared_values(run, structure, output)) for run in runs])), 1e-3 * size)
 
 
 #: Distance of an order from its own bounds, so that derivatives exist there. Nothing is fitted.
-ROOM = 0.5
+ORDER_BOUND_MARGIN = 0.5
 
 
-def freedom(joint: JointFit, structure: Structure) -> Freedom:
+def parameter_set(joint: JointFit, structure: Structure) -> FitParameters:
     """Return the free parameters of a joint fit, with their covariance and noise."""
     orders = [order for e in structure.equations for order in (e.order, *(t.order for t in e.terms))]
     spread = joint.covariance
-    return Freedom(
+    return FitParameters(
         names=tuple(joint.names),
         orders=tuple(map(str, orders)),
         noise={o: float(v) for o, v in joint.noise.items()},
@@ -395,7 +397,7 @@ def freedom(joint: JointFit, structure: Structure) -> Freedom:
     )
 
 
-def freedom_of(model: Solved) -> Freedom:
+def parameter_set_of(model: ModelData) -> FitParameters:
     """Return the set of free parameters that a model file stores.
 
     Raises
@@ -413,7 +415,7 @@ def freedom_of(model: Solved) -> Freedom:
     return known
 
 
-def problem_of(model: Solved) -> tuple[FreeProblem, list[float]]:
+def problem_of(model: ModelData) -> tuple[FreeProblem, list[float]]:
     """Return the estimation problem of a model for a run that starts at rest, and its parameter values.
 
     Raises
@@ -421,7 +423,7 @@ def problem_of(model: Solved) -> tuple[FreeProblem, list[float]]:
     ModelError
         The model does not list its free parameters, or its orders do not fit its equations.
     """
-    known, estimate = freedom_of(model), model.estimate
+    known, estimate = parameter_set_of(model), model.estimate
     values = {} if estimate is None else estimate.values
     lacking = [n for n in known.names if n not in values]
     count = sum(1 + len(e.terms) for e in model.equations)
@@ -446,7 +448,7 @@ def problem_of(model: Solved) -> tuple[FreeProblem, list[float]]:
     structure = replace(
         model.structure,
         equations=tuple(equations),
-        order_values={n: (values[n] - ROOM, values[n] + ROOM) for n in names},
+        order_values={n: (values[n] - ORDER_BOUND_MARGIN, values[n] + ORDER_BOUND_MARGIN) for n in names},
         coefficient_law=tuple((n, sign, factors) for n, (sign, factors) in known.products.items()),
         delay={s: d for s, d in model.structure.delay.items() if s not in delays},
         free_delays={s: (0.0, 2.0 * d + 1.0) for s, d in delays.items()},

@@ -10,9 +10,9 @@ import numpy as np
 from numpy.typing import NDArray
 
 from ftlm.errors import ModelError
-from ftlm.estimation.objective import deviation
+from ftlm.estimation.objective import propagated_errors
 from ftlm.estimation.output_error import JointFit
-from ftlm.utils.formatting import unbounded
+from ftlm.utils.formatting import format_bound
 from ftlm.utils.statistics import NORMAL_95
 from ftlm.utils.validation import real_number
 
@@ -51,7 +51,7 @@ class PhysicalParameter:
         return self.value - NORMAL_95 * self.standard_error, self.value + NORMAL_95 * self.standard_error
 
     def __str__(self) -> str:
-        return f"{self.value:.6g} ± {unbounded(self.standard_error)} {self.unit}"
+        return f"{self.value:.6g} ± {format_bound(self.standard_error)} {self.unit}"
 
 
 def physical_parameters(joint: JointFit, known: Mapping[str, float]) -> dict[str, PhysicalParameter]:
@@ -114,7 +114,7 @@ def physical_parameters(joint: JointFit, known: Mapping[str, float]) -> dict[str
             above, below = (_physical(centre + side, name, amount, stage) for side in (shift, -shift))
             slopes.append((above - below) / (2 * step))
         gradient = np.array(slopes).T
-        errors = deviation(gradient, spread)
+        errors = propagated_errors(gradient, spread)
         units = list(PHYSICAL_UNITS.items())
         for (pattern, unit), v, e in zip(units, values.tolist(), errors.tolist(), strict=True):
             out[pattern.format(j=stage)] = PhysicalParameter(v, e, unit)

@@ -15,10 +15,10 @@ from ftlm.estimation.output_error import JointFit, ProfileInterval
 from ftlm.estimation.physical_parameters import PhysicalParameter, physical_parameters
 from ftlm.model.model import Model
 from ftlm.order_search.result import SearchResult
-from ftlm.structure.order_grid import Lattice, lattice_of
+from ftlm.structure.order_grid import OrderGrid, restrict_order_grid
 from ftlm.structure.structure import Structure
 from ftlm.utils.files import to_frame
-from ftlm.utils.formatting import unbounded
+from ftlm.utils.formatting import format_bound
 from ftlm.utils.statistics import NORMAL_95
 from ftlm.utils.validation import check_threads
 from ftlm.validation.comparison import Comparison, Metrics, filter_state, finite
@@ -45,15 +45,15 @@ class Task:
 
     runs: tuple[Run, ...]
     structure: Structure
-    lattice: Lattice | None = None
+    order_grid: OrderGrid | None = None
 
-    def lattice_of(self, part: Structure) -> Lattice:
+    def part_order_grid(self, part: Structure) -> OrderGrid:
         """Return the order grid of one independently searched part of the structure."""
-        return lattice_of(self.lattice, part) or Lattice()
+        return restrict_order_grid(self.order_grid, part) or OrderGrid()
 
 
 @dataclass(frozen=True)
-class Judged:
+class IdentificationRecord:
     """Data of an identification; the fields are those of :class:`ftlm.Identification`."""
 
     model: Model
@@ -62,7 +62,7 @@ class Judged:
     searches: dict[str, SearchResult]
     settings: dict[str, Any]
     warnings: tuple[str, ...] = field(default=())
-    joint: JointFit | None = None
+    fit: JointFit | None = None
     residuals: Residuals | None = None
     information: InformationCriteria | None = None
     task: Task | None = field(default=None, repr=False)
@@ -80,9 +80,9 @@ class Judged:
         Available for output error and instrumental variables, robust to colored residuals; with all orders given, of
         the coefficients. Empty for the other equation-error methods.
         """
-        if self.joint is None:
+        if self.fit is None:
             return dict(self.coefficient_errors)
-        return {**self.joint.standard_errors, **self.joint.derived_errors}
+        return {**self.fit.standard_errors, **self.fit.derived_errors}
 
     @property
     def intervals(self) -> dict[str, tuple[float, float]]:
@@ -91,7 +91,7 @@ class Judged:
         Value ± 1.96 standard errors. Parameters of a joint fit with a nonquadratic cost have profile-likelihood
         intervals, which may be asymmetric or unbounded.
         """
-        values = {**self.orders, **self.coefficients, **({} if self.joint is None else self.joint_values)}
+        values = {**self.orders, **self.coefficients, **({} if self.fit is None else self.parameter_values)}
         errors = self.standard_errors
         quadratic = {n: (values[n] - NORMAL_95 * e, values[n] + NORMAL_95 * e) for n, e in errors.items()}
         return {**quadratic, **{n: (p.low, p.high) for n, p in self.profiles.items()}}
@@ -99,7 +99,7 @@ class Judged:
     @property
     def profiles(self) -> dict[str, ProfileInterval]:
         """95 % profile-likelihood intervals in use; see :meth:`ftlm.Identification.profile`."""
-        return {} if self.joint is None else dict(self.joint.profiles)
+        return {} if self.fit is None else dict(self.fit.profiles)
 
     @property
     def delays(self) -> dict[str, float]:
@@ -113,9 +113,9 @@ class Judged:
         return {n: float(v) for n, v in known if not isinstance(v, tuple)}
 
     @property
-    def joint_values(self) -> dict[str, float]:
+    def parameter_values(self) -> dict[str, float]:
         """Parameters of the joint fit by name: orders, coefficients and input parameters; empty without one."""
-        return {} if self.joint is None else dict(zip(self.joint.names, self.joint.values.tolist(), strict=True))
+        return {} if self.fit is None else dict(zip(self.fit.names, self.fit.values.tolist(), strict=True))
 
     @property
     def coefficients(self) -> dict[str, float]:
@@ -138,7 +138,7 @@ class Judged:
         return self.comparison.fit_percent
 
 
-class Identification(Judged):
+class Identification(IdentificationRecord):
     """Result of an identification: model, fit, residuals, settings and verdict.
 
     Parameters
@@ -186,9 +186,9 @@ class Identification(Judged):
         ModelError
             A model without coefficient law or intervals, or a name that is no parameter of it.
         """
-        if self.joint is None:
+        if self.fit is None:
             raise ModelError(f"method {self.method!r} gives no joint covariance; identify by method='output-error'")
-        return physical_parameters(self.joint, known)
+        return physical_parameters(self.fit, known)
 
     def profile(
         self,
@@ -233,9 +233,9 @@ class Identification(Judged):
         ConvergenceError
             The profile leads to an optimum below the fit's.
         """
-        from ftlm.estimation.confidence_intervals import profile
+        from ftlm.estimation.confidence_intervals import result_profiles
 
-        return profile(self, names, level, check_threads(threads), progress)
+        return result_profiles(self, names, level, check_threads(threads), progress)
 
     def resid(self, runs: Run | Sequence[Run], *, lags: int = 25) -> Residuals:
         """Run residual tests on other runs; see :func:`ftlm.resid`."""
@@ -261,9 +261,9 @@ class Identification(Judged):
             Runs that do not fit the model.
         """
         from ftlm.estimation.model_checks import validate
-        from ftlm.estimation.verdict import validated
+        from ftlm.estimation.verdict import validation_with_verdict
 
-        return validated(self, validate(self, runs))
+        return validation_with_verdict(self, validate(self, runs))
 
     def report(
         self, path: str | os.PathLike[str], *, validation: Run | Sequence[Run] | None = None, force: bool = False
@@ -296,7 +296,7 @@ class Identification(Judged):
 
     def to_frame(self) -> Any:
         """Return the parameters as a pandas frame: value, standard error, 95 % interval, nominal value."""
-        values = {**self.orders, **self.joint_values, **self.coefficients}
+        values = {**self.orders, **self.parameter_values, **self.coefficients}
         errors, intervals = self.standard_errors, self.intervals
         none = (math.nan, math.nan)
         rows = [
@@ -317,7 +317,7 @@ class Identification(Judged):
         return {
             "method": self.method,
             "settings": self.settings,
-            "equations": {e.output: self.model.structure.written(e) for e in self.model.equations},
+            "equations": {e.output: self.model.structure.equation_text(e) for e in self.model.equations},
             "orders": self.orders,
             "coefficients": self.coefficients,
             "delays": self.delays,
@@ -329,7 +329,7 @@ class Identification(Judged):
             "residuals": None if self.residuals is None else self.residuals.to_dict(),
             "information": None if self.information is None else self.information.to_dict(),
             "searches": {name: s.to_dict() for name, s in self.searches.items()},
-            "choice": None if self.joint is None else self.joint.choice,
+            "choice": None if self.fit is None else self.fit.choice,
             "warnings": list(self.warnings),
         }
 
@@ -393,20 +393,20 @@ class Identification(Judged):
 
     def details(self) -> str:
         """Return all results as text: settings, errors, criteria, searches, initial terms and warnings."""
-        from ftlm.report.text_summary import settings_in_words
+        from ftlm.report.text_summary import settings_text
 
-        lines = [f"{self.model.structure.name}: {self.method}, {settings_in_words(self.settings)}"]
-        lines += [f"  {self.model.structure.written(e)}" for e in self.model.equations]
+        lines = [f"{self.model.structure.name}: {self.method}, {settings_text(self.settings)}"]
+        lines += [f"  {self.model.structure.equation_text(e)}" for e in self.model.equations]
         reference = self.model.structure.reference
         errors = self.standard_errors
-        for name, value in {**self.orders, **self.joint_values, **self.coefficients}.items():
-            spread = f" ± {unbounded(errors[name]):<10}" if name in errors else ""
+        for name, value in {**self.orders, **self.parameter_values, **self.coefficients}.items():
+            spread = f" ± {format_bound(errors[name]):<10}" if name in errors else ""
             if name in self.profiles:
                 spread += f"   {self.profiles[name]}"
             stated = f"   (stated {reference[name]:.6g})" if name in reference else ""
             lines.append(f"  {name:<12}{value:>14.6g}{spread}{stated}")
-        if self.joint is not None:
-            lines.append(f"  {self.joint.choice}")
+        if self.fit is not None:
+            lines.append(f"  {self.fit.choice}")
         if errors:
             others = ", but those written out: by profile likelihood" if self.profiles else ""
             lines.append(f"  (value ± standard error; 95 % intervals are ± 1.96 of these{others})")
@@ -421,7 +421,8 @@ class Identification(Judged):
             lines.append(str(self.information))
         for name, search in self.searches.items():
             lines.append(
-                f"order search ({name}): {search.candidates} candidates, {len(search.table)} kept{search.left_out}"
+                f"order search ({name}): {search.candidates} candidates, {len(search.table)} "
+                f"kept{search.excluded_summary}"
             )
         lines += _initial_in_words(self.comparison)
         lines += [f"warning: {w}" for w in self.warnings]

@@ -8,45 +8,45 @@ from dataclasses import dataclass, replace
 
 import numpy as np
 
-from ftlm.analysis.frequency_response import check_unlimited
+from ftlm.analysis.frequency_response import check_no_input_nonlinearity
 from ftlm.analysis.poles import modes, stability
 from ftlm.data.run import Run
 from ftlm.errors import DataError, FtlmError, ModelError
-from ftlm.estimation.output_error import freedom_of
+from ftlm.estimation.output_error import parameter_set_of
 from ftlm.estimation.result import Identification
-from ftlm.estimation.verdict import VAGUE_ORDER
-from ftlm.experiment_design.exchange import Design, exchanged, judged
-from ftlm.experiment_design.problem import Bounds, Criterion, Kind, by_name
-from ftlm.experiment_design.result import DesignedInput, Reached
-from ftlm.experiment_design.sensitivity import Laid, Sensitivities
-from ftlm.experiment_design.spectrum import Spectrum, best_spectrum, lines_of
-from ftlm.model.model import Solved, check_solved
-from ftlm.progress import Course, Progress
+from ftlm.estimation.verdict import MAX_ORDER_ERROR
+from ftlm.experiment_design.exchange import Design, exchange_holds, scaled_design
+from ftlm.experiment_design.problem import Bounds, Criterion, Kind, per_signal_values
+from ftlm.experiment_design.result import DesignedInput, PredictedExtreme
+from ftlm.experiment_design.sensitivity import ModelFit, Sensitivities
+from ftlm.experiment_design.spectrum import Spectrum, best_spectrum, spectral_lines
+from ftlm.model.model import ModelData, check_model
+from ftlm.progress import Progress, ShareTracker
 from ftlm.simulation.discretization import check_linear
-from ftlm.utils.resources import between, expected, stop
+from ftlm.utils.resources import duration_bounds, estimate_duration, stop_flag
 from ftlm.utils.statistics import NORMAL_95
-from ftlm.utils.validation import Floats, check_seed, nearest, real_number, shown
+from ftlm.utils.validation import Floats, check_seed, nearest, real_number, short_repr
 
 #: Iterations that clip the crest of a multisine and restore its spectrum.
-CREST_ROUNDS = 200
+CREST_ITERATIONS = 200
 #: Clipping level as a fraction of the peak.
-CUT = 0.85
+CREST_CLIP_RATIO = 0.85
 #: Quantiles of the power of the best spectrum that define its low, middle and high frequency.
-LOW, MIDDLE, HIGH = 0.05, 0.5, 0.95
+LOW_POWER_QUANTILE, MEDIAN_POWER_QUANTILE, HIGH_POWER_QUANTILE = 0.05, 0.5, 0.95
 
 
-def square(rows: int, period: int) -> Floats:
+def square_wave(rows: int, period: int) -> Floats:
     """Square wave of amplitude 1 that starts high; period in samples."""
     return np.where((np.arange(rows) % period) * 2 < period, 1.0, -1.0)
 
 
-def shapes(spectrum: Spectrum, inputs: int, rows: int, step: float, seed: int) -> Iterator[tuple[str, Floats]]:
+def initial_inputs(spectrum: Spectrum, inputs: int, rows: int, step: float, seed: int) -> Iterator[tuple[str, Floats]]:
     """Yield name and commands, shape (inputs, rows), of amplitude at most 1; random signals differ between inputs."""
     rng = np.random.default_rng(seed)
     sines = multisine(spectrum, inputs, rows, step, rng)
     yield "multisine", sines
     yield "binary by multisine", np.where(sines >= 0, 1.0, -1.0)
-    low, middle, high = quantiles(spectrum, rows * step)
+    low, middle, high = power_quantiles(spectrum, rows * step)
     time = np.asarray(step * np.arange(rows), dtype=np.float64)
     sweep = _chirp(time, low, max(high, 1.5 * low))
     signs = np.where(np.arange(inputs) % 2 == 0, 1.0, -1.0)[:, None]
@@ -55,7 +55,7 @@ def shapes(spectrum: Spectrum, inputs: int, rows: int, step: float, seed: int) -
     for f in np.unique([low, math.sqrt(low * middle), middle, math.sqrt(middle * high), high]):
         period = max(2, round(1.0 / f / step))
         ratios = np.arange(inputs)
-        yield f"square, period {period * step:.3g} s", np.stack([square(rows, period << int(k)) for k in ratios])
+        yield f"square, period {period * step:.3g} s", np.stack([square_wave(rows, period << int(k)) for k in ratios])
     for f in np.unique([math.sqrt(low * middle), middle, math.sqrt(middle * high)]):
         clock = max(1, round(0.4 / f / step))
         every = -(-rows // clock)
@@ -63,14 +63,17 @@ def shapes(spectrum: Spectrum, inputs: int, rows: int, step: float, seed: int) -
         yield f"random binary, clock {clock * step:.3g} s", np.repeat(drawn, clock, axis=1)[:, :rows]
 
 
-def quantiles(spectrum: Spectrum, duration: float) -> tuple[float, float, float]:
+def power_quantiles(spectrum: Spectrum, duration: float) -> tuple[float, float, float]:
     """Low, median and high frequency of the power of a spectrum [Hz]."""
     order = np.argsort(spectrum.lines.frequencies)
     frequencies, power = spectrum.lines.frequencies[order], spectrum.power[order]
     total = np.cumsum(power)
     if not total[-1] > 0:
         return 1 / duration, 3 / duration, 10 / duration
-    low, middle, high = (float(frequencies[np.searchsorted(total, q * total[-1])]) for q in (LOW, MIDDLE, HIGH))
+    low, middle, high = (
+        float(frequencies[np.searchsorted(total, q * total[-1])])
+        for q in (LOW_POWER_QUANTILE, MEDIAN_POWER_QUANTILE, HIGH_POWER_QUANTILE)
+    )
     return low, middle, high
 
 
@@ -94,12 +97,12 @@ def multisine(spectrum: Spectrum, inputs: int, rows: int, step: float, rng: np.r
         share = sizes**2 / np.sum(sizes**2)
         phases = -2 * math.pi * np.cumsum(np.cumsum(share)) + rng.uniform(0, 2 * math.pi, sizes.size) * 1e-3
         best, crest = np.zeros(rows), math.inf
-        for _ in range(CREST_ROUNDS):
+        for _ in range(CREST_ITERATIONS):
             wave = np.fft.irfft(sizes * np.exp(1j * phases), rows)
             peak = float(np.max(np.abs(wave)))
             if peak < crest:
                 best, crest = wave, peak
-            phases = np.angle(np.fft.rfft(np.clip(wave, -CUT * peak, CUT * peak)))
+            phases = np.angle(np.fft.rfft(np.clip(wave, -CREST_CLIP_RATIO * peak, CREST_CLIP_RATIO * peak)))
         out[k] = best / crest
     return out
 
@@ -110,24 +113,24 @@ def _chirp(time: Floats, low: float, high: float) -> Floats:
 
 
 #: Minimum and maximum number of samples of a designed run.
-FEWEST, MOST = 32, 50_000
+MIN_RUN_SAMPLES, MAX_RUN_SAMPLES = 32, 50_000
 #: Number of holds of a run in the first search, and divisors of the hold length in the later ones.
-HOLDS, FINER = 125, (1, 2, 4)
+COARSE_HOLDS, HOLD_DIVISORS = 125, (1, 2, 4)
 #: Range of measured over estimated computing time. The number of exchanges is not known in advance.
-CAME_TO = (0.4, 4.0)
+TIME_FACTOR_RANGE = (0.4, 4.0)
 #: Maximum number of initial inputs for the exchange algorithm.
-BEGUN = 4
+MAX_EXCHANGE_STARTS = 4
 #: Periods of the reference square wave: five, as in the ten-second runs of the paper.
-PERIODS = 5
+REFERENCE_SQUARE_PERIODS = 5
 #: Maximum output standard deviation due to parameter uncertainty, relative to the output's RMS value.
-VAGUE = 0.5
+MAX_RELATIVE_UNCERTAINTY = 0.5
 
 
 @dataclass(frozen=True)
-class Wanted:
+class DesignTask:
     """Arguments of an input design after all checks."""
 
-    laid: Laid
+    fit: ModelFit
     step: float
     rows: int
     bounds: Bounds
@@ -138,7 +141,7 @@ class Wanted:
 
 
 def design_input(
-    model: Identification | Solved,
+    model: Identification | ModelData,
     *,
     like: Run | None = None,
     duration: float | None = None,
@@ -204,7 +207,7 @@ def design_input(
     """
     if progress is not None and not callable(progress):
         raise ModelError(f"progress is a {type(progress).__name__}; pass what is called with (done, all)")
-    wanted = _wanted(
+    wanted = _check_arguments(
         model,
         like,
         duration,
@@ -218,87 +221,91 @@ def design_input(
         period,
         seed,
     )
-    laid, bounds, goal = wanted.laid, wanted.bounds, wanted.criterion
+    laid, bounds, goal = wanted.fit, wanted.bounds, wanted.criterion
     if isinstance(progress, Progress):
         size = len(laid.names) * len(laid.outputs) * wanted.rows
-        progress.expect("the design", *between(expected(0.3 + 2e-5 * size, 1), CAME_TO))
-    course = Course(progress)
-    known = Sensitivities.of(laid, wanted.step, wanted.rows - 1, bounds.ramp(wanted.step))
-    course.at(0.05)
-    spectrum = best_spectrum(lines_of(laid, bounds, wanted.step, wanted.rows - 1), goal)
-    course.at(0.15)
-    tried = _tried(wanted, known, spectrum, course)
-    plain = np.stack([p * square(wanted.rows - 1, wanted.period) for p in bounds.peaks.values()])
-    reference = laid.run(known.written(plain), wanted.step, f"square of period {wanted.period * wanted.step:.4g} s")
+        progress.expect("the design", *duration_bounds(estimate_duration(0.3 + 2e-5 * size, 1), TIME_FACTOR_RANGE))
+    course = ShareTracker(progress)
+    known = Sensitivities.of(laid, wanted.step, wanted.rows - 1, bounds.ramp_samples(wanted.step))
+    course.advance_to(0.05)
+    spectrum = best_spectrum(spectral_lines(laid, bounds, wanted.step, wanted.rows - 1), goal)
+    course.advance_to(0.15)
+    tried = _design_candidates(wanted, known, spectrum, course)
+    plain = np.stack([p * square_wave(wanted.rows - 1, wanted.period) for p in bounds.peaks.values()])
+    reference = laid.run(
+        known.rig_commands(plain), wanted.step, f"square of period {wanted.period * wanted.step:.4g} s"
+    )
     base = float(goal.score(known.information(known.derivatives(plain))))
     best = tried[0]
-    commands = best.commands * _within(wanted, known, best.commands)
-    run = laid.run(known.written(commands), wanted.step, "designed")
+    commands = best.commands * _robust_scale(wanted, known, best.commands)
+    run = laid.run(known.rig_commands(commands), wanted.step, "designed")
     errors = _errors(laid, reference, run)
-    at = list(goal.chosen)
+    at = list(goal.indices)
     ratios = np.log(errors["square"][at]) - np.log(errors["designed"][at])
-    course.at(1.0)
+    course.advance_to(1.0)
     return DesignedInput(
         run=run,
         reference=reference,
-        shape=_shape(best, run, wanted),
+        shape=_shape_text(best, run, wanted),
         criterion=goal.kind,
-        chosen=tuple(laid.names[i] for i in at),
+        parameters=tuple(laid.names[i] for i in at),
         values=dict(zip(laid.names, laid.values, strict=True)),
         errors={k: dict(zip(laid.names, v.tolist(), strict=True)) for k, v in errors.items()},
         gain=float(np.exp(np.sum(ratios))),
         gains=tuple((d.name, math.exp(min(goal.count * (d.score - base), 700.0))) for d in tried),
-        reached=_reached(run, bounds),
+        predicted_extremes=_predicted_extremes(run, bounds),
         spectrum=spectrum,
         efficiency=math.exp(best.score - spectrum.bound),
         warnings=wanted.warnings,
     )
 
 
-def _tried(wanted: Wanted, known: Sensitivities, spectrum: Spectrum, course: Course) -> list[Design]:
+def _design_candidates(
+    wanted: DesignTask, known: Sensitivities, spectrum: Spectrum, course: ShareTracker
+) -> list[Design]:
     """Return all candidate inputs, best first: initial signals, and the exchange results of the best of them."""
-    laid, bounds, goal, rows = wanted.laid, wanted.bounds, wanted.criterion, wanted.rows - 1
-    ended = stop()
+    laid, bounds, goal, rows = wanted.fit, wanted.bounds, wanted.criterion, wanted.rows - 1
+    ended = stop_flag()
 
-    def stopped() -> None:
+    def raise_if_cancelled() -> None:
         if ended is not None and ended.is_set:
             raise KeyboardInterrupt
 
     peaks = np.array(list(bounds.peaks.values()))[:, None]
     begun = [
-        judged(name, peaks * c, known, goal, bounds)
-        for name, c in shapes(spectrum, len(laid.inputs), rows, wanted.step, wanted.seed)
+        scaled_design(name, peaks * c, known, goal, bounds)
+        for name, c in initial_inputs(spectrum, len(laid.inputs), rows, wanted.step, wanted.seed)
     ]
     found = [d for d in begun if d.score > -math.inf]
     if not found:
         raise ModelError(
-            f"no input tells {', '.join(laid.names[i] for i in goal.chosen)} from the other numbers: they move the "
+            f"no input tells {', '.join(laid.names[i] for i in goal.indices)} from the other numbers: they move the "
             "outputs in ways that no experiment of this length tells apart; name fewer numbers, or make the run longer"
         )
     # Of each kind the best one: what they lead to differs more than what they are.
     kinds: dict[str, Design] = {}
     for design in sorted(found, key=lambda d: -d.score):
         kinds.setdefault(design.name.split(",")[0].split(" by")[0], design)
-    starts = sorted(kinds.values(), key=lambda d: -d.score)[:BEGUN]
-    coarse = max(known.ramp, 1, -(-rows // HOLDS))
+    starts = sorted(kinds.values(), key=lambda d: -d.score)[:MAX_EXCHANGE_STARTS]
+    coarse = max(known.ramp, 1, -(-rows // COARSE_HOLDS))
     ends = []
     for place, design in enumerate(starts):
-        ends.append(exchanged(design, coarse, known, goal, bounds, stopped))
-        course.at(0.15 + 0.55 * (place + 1) / len(starts))
+        ends.append(exchange_holds(design, coarse, known, goal, bounds, raise_if_cancelled))
+        course.advance_to(0.15 + 0.55 * (place + 1) / len(starts))
     best = max(ends, key=lambda d: d.score)
-    for place, finer in enumerate(FINER[1:]):
+    for place, finer in enumerate(HOLD_DIVISORS[1:]):
         hold = max(known.ramp, 1, coarse // finer)
         if coarse % hold:
             continue
-        further = exchanged(best, hold, known, goal, bounds, stopped)
+        further = exchange_holds(best, hold, known, goal, bounds, raise_if_cancelled)
         best = further if further.score > best.score else best
-        course.at(0.7 + 0.25 * (place + 1) / len(FINER[1:]))
+        course.advance_to(0.7 + 0.25 * (place + 1) / len(HOLD_DIVISORS[1:]))
     ends = [replace(d, name=f"{d.name}, exchanged") for d in (*(e for e in ends if e.name != best.name), best)]
     return sorted([*found, *ends], key=lambda d: -d.score)
 
 
-def _wanted(
-    model: Identification | Solved,
+def _check_arguments(
+    model: Identification | ModelData,
     like: Run | None,
     duration: float | None,
     step: float | None,
@@ -310,41 +317,44 @@ def _wanted(
     noise: Mapping[str, float] | None,
     period: float | None,
     seed: int,
-) -> Wanted:
+) -> DesignTask:
     """Check every argument and the model."""
     solved = model.model if isinstance(model, Identification) else model
-    check_solved(solved)
+    check_model(solved)
     check_linear(solved.equations, "a design of the next experiment")
-    check_unlimited(solved, "a design of the next experiment")
+    check_no_input_nonlinearity(solved, "a design of the next experiment")
     if like is None and isinstance(model, Identification) and model.task is not None:
         like = model.task.runs[0]
     if like is not None and not isinstance(like, Run):
         raise ModelError(f"like is {type(like).__name__}, not a Run; give a run that the machine bore")
-    free = freedom_of(solved)
+    free = parameter_set_of(solved)
     outputs = solved.outputs
-    laid = Laid.of(solved, by_name("noise", noise, outputs, free.noise))
+    laid = ModelFit.of(solved, per_signal_values("noise", noise, outputs, free.noise))
     _check_signals(laid, like)
     if free.covariance is None:
-        _too_wide(laid, "some of its numbers have infinite intervals", None)
+        _raise_too_uncertain(laid, "some of its numbers have infinite intervals", None)
     time = _positive("step", step if step is not None else None if like is None else like.step, "a step [s]")
     length = _positive(
         "duration", duration if duration is not None else None if like is None else like.duration, "a length [s]"
     )
     rows = round(min(length / time, 1e9)) + 1
-    if not FEWEST <= rows <= MOST:
+    if not MIN_RUN_SAMPLES <= rows <= MAX_RUN_SAMPLES:
         raise ModelError(
-            f"duration = {length:g} s in steps of {time:g} s are {rows} rows; give a run of {FEWEST} to {MOST} rows"
+            f"duration = {length:g} s in steps of {time:g} s are {rows} rows; give a run of {MIN_RUN_SAMPLES} to "
+            f"{MAX_RUN_SAMPLES} rows"
         )
-    swings = dict.fromkeys(outputs, math.inf) | ({} if like is None else _largest(like, outputs, moved=True))
+    swings = dict.fromkeys(outputs, math.inf) | ({} if like is None else _largest_values(like, outputs, moved=True))
     bounds = Bounds(
-        by_name("peak", peak, laid.inputs, None if like is None else _largest(like, laid.inputs, moved=False)),
-        by_name("slew", slew, laid.inputs, dict.fromkeys(laid.inputs, math.inf)),
-        by_name("limits", limits, outputs, swings),
+        per_signal_values(
+            "peak", peak, laid.inputs, None if like is None else _largest_values(like, laid.inputs, moved=False)
+        ),
+        per_signal_values("slew", slew, laid.inputs, dict.fromkeys(laid.inputs, math.inf)),
+        per_signal_values("limits", limits, outputs, swings),
     )
     for name, value in bounds.peaks.items():
         if math.isinf(value):
             raise ModelError(f"peak of {name} is infinite: the louder the better; give what the machine bears")
-    ramp = bounds.ramp(time)
+    ramp = bounds.ramp_samples(time)
     if ramp > rows // 4:
         slow = min(bounds.slews, key=lambda n: bounds.slews[n] / bounds.peaks[n])
         raise ModelError(
@@ -353,14 +363,18 @@ def _wanted(
             "duration="
         )
     _check_stable(laid, bounds)
-    _check_known_enough(laid, time, length)
-    at = _chosen(laid, names)
+    _check_uncertainty(laid, time, length)
+    at = _parameter_indices(laid, names)
     if not isinstance(criterion, str) or criterion not in ("D", "E"):
-        raise ModelError(f"criterion = {shown(criterion)} is not known; use 'D' (all intervals) or 'E' (the widest)")
+        raise ModelError(
+            f"criterion = {short_repr(criterion)} is not known; use 'D' (all intervals) or 'E' (the widest)"
+        )
     # An order is of size 1 by itself; what else is known, is known as a share of itself.
     units = [1.0 if laid.names[i] in laid.problem.orders else abs(laid.values[i]) or 1.0 for i in at]
     begun = check_seed(seed)
-    every = round(_positive("period", length / PERIODS if period is None else period, "a time [s]") / time)
+    every = round(
+        _positive("period", length / REFERENCE_SQUARE_PERIODS if period is None else period, "a time [s]") / time
+    )
     if not 2 <= every <= 2 * rows:
         raise ModelError(f"period = {period:g} s is not between two steps and twice the run; give another one")
     told = () if solved.estimate is None else solved.estimate.warnings
@@ -370,16 +384,16 @@ def _wanted(
         if colour is None or noise is not None
         else ("predicted for white noise, and of the model it is said: " + colour,)
     )
-    return Wanted(
+    return DesignTask(
         laid, time, rows, bounds, Criterion("D" if criterion == "D" else "E", at, tuple(units)), every, begun, words
     )
 
 
-def _check_signals(laid: Laid, like: Run | None) -> None:
+def _check_signals(laid: ModelFit, like: Run | None) -> None:
     """Raise if a model has no usable input, or a run lacks its inputs."""
     if not laid.inputs:
         raise ModelError("the model has no input, so there is nothing to design; give one with an input")
-    if laid.problem.structure.behind_filter:
+    if laid.problem.structure.all_filtered:
         raise ModelError(
             "an input of the model passed its sensor filter, and what a rig is given did not; identify it with the "
             "filter on outputs alone"
@@ -403,7 +417,7 @@ def _positive(name: str, value: object, what: str) -> float:
     return number
 
 
-def _largest(run: Run, names: Sequence[str], *, moved: bool) -> dict[str, float]:
+def _largest_values(run: Run, names: Sequence[str], *, moved: bool) -> dict[str, float]:
     """Largest size of signals of a run, of outputs from their first value; omits missing and constant signals."""
     out = {}
     for name in names:
@@ -416,7 +430,7 @@ def _largest(run: Run, names: Sequence[str], *, moved: bool) -> dict[str, float]
     return out
 
 
-def _chosen(laid: Laid, names: Sequence[str] | None) -> tuple[int, ...]:
+def _parameter_indices(laid: ModelFit, names: Sequence[str] | None) -> tuple[int, ...]:
     """Return the indices of the parameters of interest."""
     if isinstance(names, str):
         names = [names]
@@ -429,7 +443,7 @@ def _chosen(laid: Laid, names: Sequence[str] | None) -> tuple[int, ...]:
         if not isinstance(name, str) or name not in laid.names:
             near = nearest(name, laid.names) if isinstance(name, str) else ""
             raise ModelError(
-                f"names[{k}] = {shown(name)} is no free number of the model{near}; it has {', '.join(laid.names)}"
+                f"names[{k}] = {short_repr(name)} is no free number of the model{near}; it has {', '.join(laid.names)}"
             )
         if name in given[:k]:
             raise ModelError(f"names has {name!r} twice; give each once")
@@ -438,7 +452,7 @@ def _chosen(laid: Laid, names: Sequence[str] | None) -> tuple[int, ...]:
     return tuple(laid.names.index(n) for n in given)
 
 
-def _check_stable(laid: Laid, bounds: Bounds) -> None:
+def _check_stable(laid: ModelFit, bounds: Bounds) -> None:
     """Raise if a model is unstable, or integrates without a limit of its output."""
     found = stability(laid.model)
     if found.unstable_poles != 0 or found.on_axis:
@@ -446,7 +460,7 @@ def _check_stable(laid: Laid, bounds: Bounds) -> None:
             f"the model is {found}: whatever an experiment begins with grows, and none can be laid out on it; identify "
             "the machine in a loop that holds it, or check the model"
         )
-    drifting = [o for o, limit in bounds.swings.items() if math.isinf(limit)]
+    drifting = [o for o, limit in bounds.output_limits.items() if math.isinf(limit)]
     if found.origin_order > 0 and drifting:
         raise ModelError(
             f"the model integrates its input (order {found.origin_order:g}), so that {drifting[0]} may drift anywhere; "
@@ -454,18 +468,18 @@ def _check_stable(laid: Laid, bounds: Bounds) -> None:
         )
 
 
-def _check_known_enough(laid: Laid, step: float, length: float) -> None:
+def _check_uncertainty(laid: ModelFit, step: float, length: float) -> None:
     """Raise if the model is too uncertain: an input optimal for it may be poor for the machine."""
     spread = laid.covariance
     errors = np.sqrt(np.diag(spread))
     vague = [
         f"{n} = {v:.3g} ± {e:.2g}"
         for n, v, e in zip(laid.names, laid.values, errors, strict=True)
-        if n in laid.problem.orders and not e <= VAGUE_ORDER
+        if n in laid.problem.orders and not e <= MAX_ORDER_ERROR
     ]
     if vague:
-        _too_wide(laid, f"order {vague[0]}", (step, length))
-    rows = min(max(round(length / step), FEWEST), 2000)
+        _raise_too_uncertain(laid, f"order {vague[0]}", (step, length))
+    rows = min(max(round(length / step), MIN_RUN_SAMPLES), 2000)
     coarse = length / rows
     probe = np.stack(
         [np.where(np.random.default_rng(k).random(rows) < 0.5, -1.0, 1.0) for k in range(len(laid.inputs))]
@@ -476,11 +490,13 @@ def _check_known_enough(laid: Laid, step: float, length: float) -> None:
     for output, part in zip(laid.outputs, np.split(moved, len(laid.outputs)), strict=True):
         size = float(np.sqrt(np.mean((run[output] / laid.noise[output]) ** 2)))
         share = float(np.sqrt(np.mean(np.maximum(part, 0.0)))) / max(size, 1e-300)
-        if not share <= VAGUE:
-            _too_wide(laid, f"its own uncertainty moves what {output} does by {100 * share:.0f} %", (step, length))
+        if not share <= MAX_RELATIVE_UNCERTAINTY:
+            _raise_too_uncertain(
+                laid, f"its own uncertainty moves what {output} does by {100 * share:.0f} %", (step, length)
+            )
 
 
-def _too_wide(laid: Laid, why: str, times: tuple[float, float] | None) -> None:
+def _raise_too_uncertain(laid: ModelFit, why: str, times: tuple[float, float] | None) -> None:
     """Raise with a recommended first experiment."""
     low, high = (0.1, 10.0) if times is None else (1.0 / times[1], 0.1 / times[0])
     try:
@@ -498,40 +514,43 @@ def _too_wide(laid: Laid, why: str, times: tuple[float, float] | None) -> None:
     )
 
 
-def _within(wanted: Wanted, known: Sensitivities, commands: Floats) -> float:
+def _robust_scale(wanted: DesignTask, known: Sensitivities, commands: Floats) -> float:
     """Factor that keeps outputs within their limits over the confidence intervals of the model."""
-    moved, slopes = known.moved(commands), known.derivatives(commands)
-    spread = np.einsum("pot,pq,qot->ot", slopes, wanted.laid.covariance, slopes)
-    noise = np.array([wanted.laid.noise[o] for o in wanted.laid.outputs])[:, None]
+    moved, slopes = known.outputs(commands), known.derivatives(commands)
+    spread = np.einsum("pot,pq,qot->ot", slopes, wanted.fit.covariance, slopes)
+    noise = np.array([wanted.fit.noise[o] for o in wanted.fit.outputs])[:, None]
     reach = np.abs(moved) + NORMAL_95 * noise * np.sqrt(np.maximum(spread, 0.0))
     return wanted.bounds.scale(commands, reach)
 
 
-def _errors(laid: Laid, reference: Run, run: Run) -> dict[str, Floats]:
+def _errors(laid: ModelFit, reference: Run, run: Run) -> dict[str, Floats]:
     """Standard errors of the model, and predicted ones of fits of the designed and of the reference run."""
-    now, new = laid.covariance, laid.predicted(run)
+    now, new = laid.covariance, laid.predicted_covariance(run)
     size = np.sqrt(np.diag(now))
     told = np.linalg.inv(now / np.outer(size, size)) + np.linalg.inv(new / np.outer(size, size))
     both = np.linalg.inv(told) * np.outer(size, size)
-    every = {"now": now, "square": laid.predicted(reference), "designed": new, "both": both}
+    every = {"now": now, "square": laid.predicted_covariance(reference), "designed": new, "both": both}
     return {k: np.sqrt(np.diag(v)) for k, v in every.items()}
 
 
-def _reached(run: Run, bounds: Bounds) -> tuple[Reached, ...]:
+def _predicted_extremes(run: Run, bounds: Bounds) -> tuple[PredictedExtreme, ...]:
     out = []
     for name, limit in bounds.peaks.items():
-        out.append(Reached(name, float(np.max(np.abs(run[name]))), limit))
+        out.append(PredictedExtreme(name, float(np.max(np.abs(run[name]))), limit))
         if math.isfinite(bounds.slews[name]):
             fastest = float(np.max(np.abs(np.diff(run[name][:-1], prepend=0.0)))) / run.step
-            out.append(Reached(f"slew of {name}", fastest, bounds.slews[name]))
-    return (*out, *(Reached(o, float(np.max(np.abs(run[o]))), limit) for o, limit in bounds.swings.items()))
+            out.append(PredictedExtreme(f"slew of {name}", fastest, bounds.slews[name]))
+    return (
+        *out,
+        *(PredictedExtreme(o, float(np.max(np.abs(run[o]))), limit) for o, limit in bounds.output_limits.items()),
+    )
 
 
-def _shape(best: Design, run: Run, wanted: Wanted) -> str:
+def _shape_text(best: Design, run: Run, wanted: DesignTask) -> str:
     """Describe the designed input."""
     if not best.name.endswith("exchanged"):
         return best.name
-    first = next(iter(wanted.laid.inputs))
-    switches = int(np.sum(np.diff(run[first][:-1]) != 0)) if wanted.bounds.ramp(wanted.step) == 1 else 0
+    first = next(iter(wanted.fit.inputs))
+    switches = int(np.sum(np.diff(run[first][:-1]) != 0)) if wanted.bounds.ramp_samples(wanted.step) == 1 else 0
     begun = best.name.removesuffix(", exchanged")
     return f"levels exchanged from {begun}" + (f", {switches} switches" if switches else "")

@@ -14,13 +14,13 @@ from ftlm.experiment_design.sensitivity import Sensitivities
 from ftlm.utils.validation import Complex, Floats
 
 #: Levels of a command, as fractions of its peak.
-LEVELS = (-1.0, 0.0, 1.0)
+COMMAND_LEVELS = (-1.0, 0.0, 1.0)
 #: Changes of a level, and distances in holds at which a second hold may change by the opposite amount (0: none).
-STEPS, GAPS = (-2.0, -1.0, 1.0, 2.0), (1, 2, 4, 8)
+LEVEL_CHANGES, PAIR_GAPS_HOLDS = (-2.0, -1.0, 1.0, 2.0), (1, 2, 4, 8)
 #: Maximum number of exchanges with the largest linearized gain that are evaluated exactly.
-FOLLOWED = 200
+MAX_EVALUATED_EXCHANGES = 200
 #: Maximum number of exchanges, and minimum gain in score of one.
-MOST, LEAST = 400, 1e-7
+MAX_EXCHANGES, MIN_SCORE_GAIN = 400, 1e-7
 
 
 @dataclass(frozen=True)
@@ -45,14 +45,14 @@ class Design:
     exchanges: int = 0
 
 
-def judged(name: str, commands: Floats, known: Sensitivities, criterion: Criterion, bounds: Bounds) -> Design:
+def scaled_design(name: str, commands: Floats, known: Sensitivities, criterion: Criterion, bounds: Bounds) -> Design:
     """Return commands scaled down until all limits hold, with their score."""
-    scale = bounds.scale(commands, known.moved(commands))
+    scale = bounds.scale(commands, known.outputs(commands))
     score = float(criterion.score(known.information(known.derivatives(commands)))) + math.log(scale)
     return Design(name, scale * commands, score)
 
 
-def exchanged(
+def exchange_holds(
     begin: Design,
     hold: int,
     known: Sensitivities,
@@ -69,43 +69,45 @@ def exchanged(
     inputs, rows = begin.commands.shape
     starts = np.arange(0, rows, hold)
     peaks = np.array(list(bounds.peaks.values()))[:, None]
-    limits = np.array(list(bounds.swings.values()))[:, None]
+    limits = np.array(list(bounds.output_limits.values()))[:, None]
     means = np.add.reduceat(begin.commands, starts, axis=1) / np.diff(np.append(starts, rows))
-    level = _nearest(means / np.maximum(np.max(np.abs(means), axis=1, keepdims=True), 1e-300))
+    level = _nearest_level(means / np.maximum(np.max(np.abs(means), axis=1, keepdims=True), 1e-300))
     holds = [Hold.of(known, k, hold, starts, float(peaks[k, 0])) for k in range(inputs)]
 
     def commands() -> Floats:
         return np.asarray(np.repeat(level, hold, axis=1)[:, :rows] * peaks)
 
-    derivatives, moved = known.derivatives(commands()), known.moved(commands())
+    derivatives, moved = known.derivatives(commands()), known.outputs(commands())
     information = known.information(derivatives)
-    score = float(criterion.score(information)) - _over(moved, limits)
+    score = float(criterion.score(information)) - _log_limit_excess(moved, limits)
     made = 0
-    while made < MOST:
+    while made < MAX_EXCHANGES:
         stopped()
-        slope = None if score == -math.inf else criterion.slope(information) / 2
+        slope = None if score == -math.inf else criterion.gradient(information) / 2
         moves: list[tuple[float, int, int, int, float, Floats]] = []
         for k, one in enumerate(holds):
-            for gap, shared, own in one.mixed(known, derivatives):
-                for step in STEPS:
-                    there = _allowed(level[k], step, gap)
+            for gap, shared, own in one.information_changes(known, derivatives):
+                for step in LEVEL_CHANGES:
+                    there = _feasible_starts(level[k], step, gap)
                     gain = np.zeros(len(shared))
                     if slope is not None:
                         gain = np.einsum("spq,pq->s", step * shared + step**2 * own, slope)
-                    for at in np.argsort(np.where(there, -gain, np.inf))[: min(FOLLOWED, int(np.sum(there)))]:
+                    for at in np.argsort(np.where(there, -gain, np.inf))[
+                        : min(MAX_EVALUATED_EXCHANGES, int(np.sum(there)))
+                    ]:
                         moves.append((float(gain[at]), k, int(at), gap, step, step * shared[at] + step**2 * own[at]))
-        moves = sorted(moves, key=lambda m: -m[0])[:FOLLOWED]
+        moves = sorted(moves, key=lambda m: -m[0])[:MAX_EVALUATED_EXCHANGES]
         if not moves:
             break
         told = criterion.score(information + np.stack([m[5] for m in moves]))
-        best, then = score + LEAST, moved
+        best, then = score + MIN_SCORE_GAIN, moved
         chosen: tuple[int, int, int, float] | None = None
         for place in np.argsort(-told):
             if not told[place] > best:
                 break
             _, k, at, gap, step, _ = moves[place]
             after = holds[k].after(moved, at, gap, step, shown=True)
-            reached = float(told[place]) - _over(after, limits)
+            reached = float(told[place]) - _log_limit_excess(after, limits)
             if reached > best:
                 best, then, chosen = reached, after, (k, at, gap, step)
         if chosen is None:
@@ -115,23 +117,23 @@ def exchanged(
         level[k, at] += step
         if gap:
             level[k, at + gap] -= step
-        derivatives = holds[k].after(derivatives, at, gap, step, shown=False)
+        derivatives = holds[k].apply_exchange(derivatives, at, gap, step, shown=False)
         information = known.information(derivatives)
         made += 1
-    ended = judged(begin.name, commands(), known, criterion, bounds)
+    ended = scaled_design(begin.name, commands(), known, criterion, bounds)
     return Design(begin.name, ended.commands, ended.score, made)
 
 
-def _over(moved: Floats, limits: Floats) -> float:
+def _log_limit_excess(moved: Floats, limits: Floats) -> float:
     """Logarithm of the largest ratio of outputs to their limits; 0 if all limits hold."""
     return math.log(max(1.0, float(np.max(np.abs(moved) / limits))))
 
 
-def _allowed(level: Floats, step: float, gap: int) -> NDArray[np.bool_]:
+def _feasible_starts(level: Floats, step: float, gap: int) -> NDArray[np.bool_]:
     """Mask of the holds that may change by a step, with the hold one gap later changed by the opposite amount."""
-    there: NDArray[np.bool_] = np.abs(level + step) < LEVELS[-1] + 0.5
+    there: NDArray[np.bool_] = np.abs(level + step) < COMMAND_LEVELS[-1] + 0.5
     if gap:
-        there[:-gap] &= np.abs(level[gap:] - step) < LEVELS[-1] + 0.5
+        there[:-gap] &= np.abs(level[gap:] - step) < COMMAND_LEVELS[-1] + 0.5
         there[-gap:] = False
     return there
 
@@ -156,7 +158,7 @@ class Hold:
 
     starts: NDArray[np.int64]
     block: Floats
-    shown: Floats
+    response: Floats
     spectrum: Complex
     offsets: Floats
     own: Mapping[int, Floats]
@@ -164,26 +166,29 @@ class Hold:
     @classmethod
     def of(cls, known: Sensitivities, place: int, hold: int, starts: NDArray[np.int64], peak: float) -> Hold:
         """Compute the response of one input."""
-        block, shown = _held(known.kernels[place], hold) * peak, _held(known.answers[place], hold) * peak
+        block, shown = (
+            _hold_response(known.kernels[place], hold) * peak,
+            _hold_response(known.responses[place], hold) * peak,
+        )
         spectrum = np.fft.rfft(block, known.length)
-        offsets = _at_starts(known, known.nuisance.reshape(-1, *block.shape[1:]), spectrum, starts)
-        alone = _together(known, block, block, starts) - np.einsum("spr,sqr->spq", offsets, offsets)
+        offsets = _correlate_at_starts(known, known.nuisance.reshape(-1, *block.shape[1:]), spectrum, starts)
+        alone = _inner_products(known, block, block, starts) - np.einsum("spr,sqr->spq", offsets, offsets)
         own = {0: alone}
-        for gap in GAPS:
+        for gap in PAIR_GAPS_HOLDS:
             if gap >= len(starts):
                 break
             late = np.zeros_like(block)
             late[..., gap * hold :] = block[..., : known.rows - gap * hold]
-            mixed = _together(known, block, late, starts)[:-gap]
+            mixed = _inner_products(known, block, late, starts)[:-gap]
             mixed = mixed - np.einsum("spr,sqr->spq", offsets[:-gap], offsets[gap:])
             pair = np.zeros_like(alone)
             pair[:-gap] = alone[:-gap] + alone[gap:] - mixed - np.swapaxes(mixed, -1, -2)
             own[gap] = pair
         return cls(starts, block, shown, spectrum, offsets, own)
 
-    def mixed(self, known: Sensitivities, derivatives: Floats) -> Iterator[tuple[int, Floats, Floats]]:
+    def information_changes(self, known: Sensitivities, derivatives: Floats) -> Iterator[tuple[int, Floats, Floats]]:
         """Yield for each gap the first- and second-order change of the information by an exchange, by its start."""
-        shared = _at_starts(known, derivatives, self.spectrum, self.starts)
+        shared = _correlate_at_starts(known, derivatives, self.spectrum, self.starts)
         if len(known.nuisance):
             flat = derivatives.reshape(len(derivatives), -1) @ known.nuisance.T
             shared = shared - np.einsum("spr,qr->spq", self.offsets, flat)
@@ -195,28 +200,28 @@ class Hold:
                 pair[:-gap] = shared[:-gap] - shared[gap:]
             yield gap, pair, own
 
-    def after(self, series: Floats, at: int, gap: int, step: float, *, shown: bool) -> Floats:
+    def apply_exchange(self, series: Floats, at: int, gap: int, step: float, *, shown: bool) -> Floats:
         """Return derivatives, or outputs, after an exchange."""
-        block, out = self.shown if shown else self.block, series.copy()
+        block, out = self.response if shown else self.block, series.copy()
         for begins, size in ((self.starts[at], step), *(((self.starts[at + gap], -step),) if gap else ())):
             out[..., begins:] += size * block[..., : block.shape[-1] - begins]
         return out
 
 
-def _nearest(values: Floats) -> Floats:
+def _nearest_level(values: Floats) -> Floats:
     """Return the nearest level of each value; a midpoint goes to the outer level."""
-    levels = np.array(LEVELS)
+    levels = np.array(COMMAND_LEVELS)
     return np.asarray(levels[np.argmin(np.abs(values[..., None] * (1 + 1e-9) - levels), axis=-1)])
 
 
-def _held(kernel: Floats, hold: int) -> Floats:
+def _hold_response(kernel: Floats, hold: int) -> Floats:
     """Response to a hold from the response to one sample."""
     total = np.cumsum(kernel, axis=-1)
     total[..., hold:] -= total[..., :-hold].copy()
     return total
 
 
-def _together(known: Sensitivities, one: Floats, other: Floats, starts: NDArray[np.int64]) -> Floats:
+def _inner_products(known: Sensitivities, one: Floats, other: Floats, starts: NDArray[np.int64]) -> Floats:
     """Inner products of two responses from their common start to the end of the run, by that start."""
     grown = np.zeros((len(starts), len(one), len(other)))
     for p, row in enumerate(one):
@@ -225,7 +230,7 @@ def _together(known: Sensitivities, one: Floats, other: Floats, starts: NDArray[
     return grown
 
 
-def _at_starts(known: Sensitivities, series: Floats, spectrum: Complex, starts: NDArray[np.int64]) -> Floats:
+def _correlate_at_starts(known: Sensitivities, series: Floats, spectrum: Complex, starts: NDArray[np.int64]) -> Floats:
     """Inner products of series with holds that start at given samples, shape (starts, parameters, series)."""
     out = np.zeros((len(starts), spectrum.shape[0], len(series)))
     for place, one in enumerate(np.fft.rfft(series, known.length)):

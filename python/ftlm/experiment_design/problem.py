@@ -10,13 +10,13 @@ from typing import Literal
 import numpy as np
 
 from ftlm.errors import ModelError
-from ftlm.utils.validation import Floats, nearest, real_number, shown
+from ftlm.utils.validation import Floats, nearest, real_number, short_repr
 
 Kind = Literal["D", "E"]
 #: Exponent of Kiefer's mean, the smooth substitute of the widest axis: within s^(1/16) of it for s parameters.
-SHARP = 16
+KIEFER_MEAN_EXPONENT = 16
 #: Determinant of the information, scaled to a unit diagonal, below which it is numerically singular.
-LOST = 1e-28
+MIN_SCALED_DETERMINANT = 1e-28
 
 
 @dataclass(frozen=True)
@@ -34,13 +34,13 @@ class Criterion:
     """
 
     kind: Kind
-    chosen: tuple[int, ...]
+    indices: tuple[int, ...]
     units: tuple[float, ...]
 
     @property
     def count(self) -> int:
         """Number of parameters of interest."""
-        return len(self.chosen)
+        return len(self.indices)
 
     def score(self, information: Floats) -> Floats:
         """Score of information matrices, shape (…, p, p); -inf if the parameters are not identifiable."""
@@ -54,25 +54,28 @@ class Criterion:
                 found = np.where(axes[..., 0] > 0, -0.5 * np.log(axes[..., -1]), -np.inf)
         return np.where(np.isfinite(spread[..., 0, 0]), found, -np.inf)
 
-    def mean(self, information: Floats) -> float:
+    def smooth_score(self, information: Floats) -> float:
         """Differentiable score: for E, Kiefer's mean in place of the widest axis; never below :meth:`score`."""
         if self.kind == "D":
             return float(self.score(information))
         axes = np.linalg.eigvalsh(self._inverse(information))
         if not (np.all(np.isfinite(axes)) and axes[0] > 0):
             return -math.inf
-        return float(-0.5 * (np.log(axes[-1]) + np.log(np.mean((axes / axes[-1]) ** SHARP)) / SHARP))
+        return float(
+            -0.5
+            * (np.log(axes[-1]) + np.log(np.mean((axes / axes[-1]) ** KIEFER_MEAN_EXPONENT)) / KIEFER_MEAN_EXPONENT)
+        )
 
-    def slope(self, information: Floats) -> Floats:
+    def gradient(self, information: Floats) -> Floats:
         """Gradient of twice :meth:`smooth_score`, shape (p, p); its inner product with the information is 1."""
         p = len(information)
         size = np.sqrt(np.diag(information))
         whole = np.linalg.inv(information / np.outer(size, size)) / np.outer(size, size)
-        arms = whole[:, self.chosen] / np.asarray(self.units)
-        block = arms[list(self.chosen)] / np.asarray(self.units)[:, None]
+        arms = whole[:, self.indices] / np.asarray(self.units)
+        block = arms[list(self.indices)] / np.asarray(self.units)[:, None]
         axes, turn = np.linalg.eigh(0.5 * (block + block.T))
         axes = np.maximum(axes, np.finfo(np.float64).tiny)
-        power = SHARP if self.kind == "E" else 0
+        power = KIEFER_MEAN_EXPONENT if self.kind == "E" else 0
         share = (axes / axes[-1]) ** power
         weights = share / axes / np.sum(share)
         lever = arms @ turn
@@ -86,16 +89,16 @@ class Criterion:
         scaled = information / (size[..., :, None] * size[..., None, :])
         scaled = np.where(seen[..., None, None], scaled, np.eye(scaled.shape[-1]))
         sign, determinant = np.linalg.slogdet(scaled)
-        good = seen & (sign > 0) & (determinant > math.log(LOST) * 2)
+        good = seen & (sign > 0) & (determinant > math.log(MIN_SCALED_DETERMINANT) * 2)
         scaled = np.where(good[..., None, None], scaled, np.eye(scaled.shape[-1]))
-        at = list(self.chosen)
+        at = list(self.indices)
         unit = size[..., at] * np.asarray(self.units)
         inverse = np.linalg.inv(scaled)[..., at, :][..., at] / (unit[..., :, None] * unit[..., None, :])
         return np.where(good[..., None, None], inverse, np.inf)
 
 
 #: Range of a finite limit. Beyond it squares of ratios overflow.
-SIZES = (1e-50, 1e50)
+LIMIT_RANGE = (1e-50, 1e50)
 
 
 @dataclass(frozen=True)
@@ -114,9 +117,9 @@ class Bounds:
 
     peaks: Mapping[str, float]
     slews: Mapping[str, float]
-    swings: Mapping[str, float]
+    output_limits: Mapping[str, float]
 
-    def ramp(self, step: float) -> int:
+    def ramp_samples(self, step: float) -> int:
         """Number of samples that a change from one peak to the other takes under the slew rates."""
         return max(1, *(math.ceil(min(2 * p / self.slews[n] / step, 1e18) - 1e-9) for n, p in self.peaks.items()))
 
@@ -126,7 +129,7 @@ class Bounds:
             1.0,
             *(
                 limit / float(np.max(np.abs(row), initial=0.0)) if np.any(row) else 1.0
-                for limit, row in zip(self.swings.values(), moved, strict=True)
+                for limit, row in zip(self.output_limits.values(), moved, strict=True)
             ),
             *(
                 limit / float(np.max(np.abs(row), initial=0.0)) if np.any(row) else 1.0
@@ -135,7 +138,9 @@ class Bounds:
         )
 
 
-def by_name(what: str, given: object, names: Sequence[str], default: Mapping[str, float] | None) -> dict[str, float]:
+def per_signal_values(
+    what: str, given: object, names: Sequence[str], default: Mapping[str, float] | None
+) -> dict[str, float]:
     """Return one positive number for each name, from a number, a mapping, or the default.
 
     Raises
@@ -148,7 +153,7 @@ def by_name(what: str, given: object, names: Sequence[str], default: Mapping[str
             if name not in names:
                 near = nearest(name, names) if isinstance(name, str) else ""
                 raise ModelError(
-                    f"{what} names {shown(name)}{near}, which is none of {', '.join(names) or 'nothing'}; "
+                    f"{what} names {short_repr(name)}{near}, which is none of {', '.join(names) or 'nothing'}; "
                     "name one of them"
                 )
     elif given is not None:
@@ -166,9 +171,10 @@ def by_name(what: str, given: object, names: Sequence[str], default: Mapping[str
         value = real_number(f"{what} of {name}", said)
         if not value > 0:
             raise ModelError(f"{what} of {name} = {value:g} is not above 0; give the largest size it may have")
-        if not SIZES[0] <= value <= SIZES[1] and not math.isinf(value):
+        if not LIMIT_RANGE[0] <= value <= LIMIT_RANGE[1] and not math.isinf(value):
             raise ModelError(
-                f"{what} of {name} = {value:g} is no size from {SIZES[0]:g} to {SIZES[1]:g}; use other units"
+                f"{what} of {name} = {value:g} is no size from {LIMIT_RANGE[0]:g} to {LIMIT_RANGE[1]:g}; use other "
+                "units"
             )
         out[name] = value
     return out

@@ -14,19 +14,19 @@ from ftlm.data.run import Run
 from ftlm.experiment_design.problem import Kind
 from ftlm.experiment_design.spectrum import Spectrum
 from ftlm.utils.files import to_frame
-from ftlm.utils.formatting import unbounded
+from ftlm.utils.formatting import format_bound
 from ftlm.utils.statistics import NORMAL_95
 from ftlm.utils.validation import Floats
 from ftlm.validation.comparison import finite
 
 #: A limit counts as active from this fraction of it on.
-BINDS = 0.98
+ACTIVE_LIMIT_FRACTION = 0.98
 #: Maximum number of candidate inputs in the printed text.
-SHOWN = 6
+MAX_PRINTED_INPUTS = 6
 
 
 @dataclass(frozen=True)
-class Reached:
+class PredictedExtreme:
     """Extreme value predicted for a signal of the designed run, and its limit; slew rates are per second."""
 
     name: str
@@ -34,12 +34,12 @@ class Reached:
     limit: float
 
     @property
-    def binds(self) -> bool:
+    def is_active(self) -> bool:
         """Whether the constraint is active."""
-        return self.largest >= BINDS * self.limit
+        return self.largest >= ACTIVE_LIMIT_FRACTION * self.limit
 
     def __str__(self) -> str:
-        limit = "no limit" if math.isinf(self.limit) else f"of {self.limit:.4g}{', binds' if self.binds else ''}"
+        limit = "no limit" if math.isinf(self.limit) else f"of {self.limit:.4g}{', binds' if self.is_active else ''}"
         return f"{self.name} {self.largest:.4g} ({limit})"
 
 
@@ -84,12 +84,12 @@ class DesignedInput:
     reference: Run
     shape: str
     criterion: Kind
-    chosen: tuple[str, ...]
+    parameters: tuple[str, ...]
     values: Mapping[str, float]
     errors: Mapping[str, Mapping[str, float]]
     gain: float
     gains: tuple[tuple[str, float], ...]
-    reached: tuple[Reached, ...]
+    predicted_extremes: tuple[PredictedExtreme, ...]
     spectrum: Spectrum = field(repr=False)
     efficiency: float
     warnings: tuple[str, ...] = ()
@@ -111,9 +111,9 @@ class DesignedInput:
         return {n: (v - NORMAL_95 * errors[n], v + NORMAL_95 * errors[n]) for n, v in self.values.items()}
 
     @property
-    def binding(self) -> tuple[str, ...]:
+    def active_constraints(self) -> tuple[str, ...]:
         """Names of the active constraints."""
-        return tuple(r.name for r in self.reached if r.binds)
+        return tuple(r.name for r in self.predicted_extremes if r.is_active)
 
     def save(self, path: str | os.PathLike[str], *, force: bool = False) -> None:
         """Write the designed run as csv, the format of ``ftlm record --input csv --file PATH``.
@@ -145,7 +145,7 @@ class DesignedInput:
         return {
             "shape": self.shape,
             "criterion": self.criterion,
-            "chosen": list(self.chosen),
+            "chosen": list(self.parameters),
             "duration": self.run.duration,
             "step": self.step,
             "values": dict(self.values),
@@ -153,7 +153,8 @@ class DesignedInput:
             "gain": finite(self.gain),
             "gains": dict(self.gains),
             "reached": {
-                r.name: {"largest": r.largest, "limit": finite(r.limit), "binds": r.binds} for r in self.reached
+                r.name: {"largest": r.largest, "limit": finite(r.limit), "binds": r.is_active}
+                for r in self.predicted_extremes
             },
             "efficiency": finite(self.efficiency),
             "spectrum": {
@@ -168,27 +169,27 @@ class DesignedInput:
         square = self.reference.name
         lines = [
             f"{', '.join(self.run.inputs)}: {self.shape}, {self.run.duration:.6g} s in steps of {self.step:.6g} s, "
-            f"{self.criterion}-optimal for {', '.join(self.chosen)}",
+            f"{self.criterion}-optimal for {', '.join(self.parameters)}",
             "",
             f"  {'standard error of':<18}{'now':>12}{'square':>12}{'this':>12}{'with now':>12}{'square / this':>15}",
         ]
         for name, value in self.values.items():
             now, before, then, both = (self.errors[k][name] for k in ("now", "square", "designed", "both"))
-            mark = "*" if name in self.chosen else " "
+            mark = "*" if name in self.parameters else " "
             ratio = before / then if then > 0 else math.nan
-            cells = "".join(f"{unbounded(v):>12}" for v in (now, before, then, both))
+            cells = "".join(f"{format_bound(v):>12}" for v in (now, before, then, both))
             lines.append(f"{mark} {f'{name} = {value:.6g}':<18}{cells}{ratio:>15.2f}")
         most, last = self.spectrum.gap, f"{100 * self.efficiency:.0f} %"
         lines += [
             "",
             f"intervals of the numbers marked *: their product {self.gain:.3g} times smaller than with a {square} of "
             "the same length and peak",
-            f"limits: {'; '.join(map(str, self.reached))}",
+            f"limits: {'; '.join(map(str, self.predicted_extremes))}",
             f"the best periodic input within them, in steady state, is known to {100 * most:.2g} %: this one has "
             f"{last} of its precision (a start from rest may tell more)",
             "tried: "
-            + ", ".join(f"{name} {value:.3g}" for name, value in self.gains[:SHOWN])
-            + (f" and {len(self.gains) - SHOWN} more" if len(self.gains) > SHOWN else "")
+            + ", ".join(f"{name} {value:.3g}" for name, value in self.gains[:MAX_PRINTED_INPUTS])
+            + (f" and {len(self.gains) - MAX_PRINTED_INPUTS} more" if len(self.gains) > MAX_PRINTED_INPUTS else "")
             + f" (times better than the {square})",
         ]
         lines += [f"! {w}" for w in self.warnings]

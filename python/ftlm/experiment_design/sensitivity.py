@@ -11,23 +11,23 @@ import numpy as np
 from ftlm.data.run import Run
 from ftlm.errors import ModelError
 from ftlm.estimation.free_parameters import FreeProblem
-from ftlm.estimation.objective import Attempt, Grid
-from ftlm.estimation.output_error import freedom_of, problem_of
-from ftlm.model.model import Solved
+from ftlm.estimation.objective import Iterate, Objective
+from ftlm.estimation.output_error import parameter_set_of, problem_of
+from ftlm.model.model import ModelData
 from ftlm.simulation.simulate import simulate
 from ftlm.structure.equation import Term
 from ftlm.structure.order import Order
-from ftlm.utils.linalg import orthonormal, singular
+from ftlm.utils.linalg import orthonormal, thin_svd
 from ftlm.utils.validation import Complex, Floats
 
 #: Relative size below which a direction of the offset responses is rounding error.
-ROUNDING = 1e-10
+OFFSET_RANK_TOLERANCE = 1e-10
 #: Relative change at which the step refinement of the simulations terminates.
-TOLERANCE = 1e-7
+SIMULATION_TOLERANCE = 1e-7
 
 
 @dataclass(frozen=True)
-class Laid:
+class ModelFit:
     """Fit of a model as input design needs it: free parameters, their values, and the noise of each output.
 
     Parameters
@@ -42,18 +42,18 @@ class Laid:
         Block pulses per sampling interval.
     """
 
-    model: Solved
+    model: ModelData
     problem: FreeProblem
     values: tuple[float, ...]
     noise: Mapping[str, float]
-    every: int
+    refinement: int
 
     @classmethod
-    def of(cls, model: Solved, noise: Mapping[str, float]) -> Laid:
+    def of(cls, model: ModelData, noise: Mapping[str, float]) -> ModelFit:
         """Build from a model that records which of its parameters were free."""
         problem, values = problem_of(model)
         whole = replace(model, structure=replace(model.structure, coupling="simulated", initial="rest"))
-        return cls(whole, problem, tuple(values), noise, freedom_of(model).refinement)
+        return cls(whole, problem, tuple(values), noise, parameter_set_of(model).refinement)
 
     @property
     def names(self) -> tuple[str, ...]:
@@ -73,7 +73,7 @@ class Laid:
     @property
     def covariance(self) -> Floats:
         """Covariance of the free parameters, as estimated from the runs of the model."""
-        known = freedom_of(self.model)
+        known = parameter_set_of(self.model)
         at = [known.names.index(n) for n in self.names]
         return np.asarray(known.covariance)[np.ix_(at, at)]
 
@@ -86,7 +86,7 @@ class Laid:
             units={s: u for s, u in self.model.units.items() if u and s in (*self.inputs, *self.outputs)},
             name=name,
         )
-        answer = simulate(self.model, blank, tolerance=TOLERANCE)
+        answer = simulate(self.model, blank, tolerance=SIMULATION_TOLERANCE)
         return blank.with_outputs({o: answer[o] for o in self.outputs})
 
     def jacobian(self, run: Run, *, offset: bool = True) -> Floats:
@@ -98,18 +98,18 @@ class Laid:
         problem = self.problem
         if not offset:
             problem = replace(problem, structure=replace(problem.structure, offset="none"))
-        return _derivatives(problem, self.values, run, [1.0 / self.noise[o] for o in self.outputs], self.every)
+        return _derivatives(problem, self.values, run, [1.0 / self.noise[o] for o in self.outputs], self.refinement)
 
-    def predicted(self, run: Run) -> Floats:
+    def predicted_covariance(self, run: Run) -> Floats:
         """Return the covariance predicted for a fit of a simulated run alone, from exact derivatives."""
-        return _inverse(self.jacobian(run))
+        return _covariance_of(self.jacobian(run))
 
 
-def _inverse(rows: Floats) -> Floats:
+def _covariance_of(rows: Floats) -> Floats:
     """Inverse of the information of scaled derivatives; infinite variances if a parameter is not identifiable."""
     size = np.linalg.norm(rows, axis=1)
     scaled = rows / np.where(size > 0, size, 1.0)[:, None]
-    _, sizes, right = singular(scaled.T)
+    _, sizes, right = thin_svd(scaled.T)
     lost = np.finfo(np.float64).eps * np.sqrt(rows.shape[1])
     if np.any(size == 0) or sizes[-1] <= lost * sizes[0]:
         return np.diag(np.full(len(rows), np.inf))
@@ -119,8 +119,8 @@ def _inverse(rows: Floats) -> Floats:
 
 def _derivatives(problem: FreeProblem, values: tuple[float, ...], run: Run, weights: list[float], every: int) -> Floats:
     orders, coefficients, inputs = problem.split(values)
-    grid = Grid(problem, [run], weights, every=every)
-    here = grid.descend(Attempt(orders, coefficients, "the model", {}, inputs), 1, plain=True)
+    grid = Objective(problem, [run], weights, every=every)
+    here = grid.minimize(Iterate(orders, coefficients, "the model", {}, inputs), 1, plain=True)
     return np.asarray(here.outcome["jacobian"])
 
 
@@ -147,16 +147,16 @@ class Sensitivities:
         Orthonormal basis of the responses to offsets of the run, shape (basis vectors, outputs · rows).
     """
 
-    laid: Laid
+    fit: ModelFit
     step: float
     rows: int
     ramp: int
     kernels: Floats
-    answers: Floats
+    responses: Floats
     nuisance: Floats
 
     @classmethod
-    def of(cls, laid: Laid, step: float, rows: int, ramp: int) -> Sensitivities:
+    def of(cls, laid: ModelFit, step: float, rows: int, ramp: int) -> Sensitivities:
         """Simulate the response to one sample of each input."""
         kernels, answers, inputs = [], [], len(laid.inputs)
         for k in range(inputs):
@@ -167,7 +167,7 @@ class Sensitivities:
             found = laid.jacobian(run, offset=False)
             kernels.append(found.reshape(len(laid.names), len(laid.outputs), rows))
             answers.append(np.stack([run[o][1:-1] for o in laid.outputs]))
-        nuisance = _offsets(laid, step, rows)
+        nuisance = _offset_responses(laid, step, rows)
         return cls(laid, step, rows, ramp, np.stack(kernels), np.stack(answers), nuisance)
 
     @cached_property
@@ -178,7 +178,7 @@ class Sensitivities:
     @cached_property
     def spectra(self) -> tuple[Complex, Complex]:
         """Fourier transforms of the kernels and of the responses."""
-        return np.fft.rfft(self.kernels, self.length), np.fft.rfft(self.answers, self.length)
+        return np.fft.rfft(self.kernels, self.length), np.fft.rfft(self.responses, self.length)
 
     def derivatives(self, commands: Floats) -> Floats:
         """Derivatives over the noise, shape (parameters, outputs, rows), for commands of shape (inputs, rows)."""
@@ -186,7 +186,7 @@ class Sensitivities:
         total = np.einsum("ipof,if->pof", self.spectra[0], drive)
         return np.asarray(np.fft.irfft(total, self.length)[..., : self.rows])
 
-    def moved(self, commands: Floats) -> Floats:
+    def outputs(self, commands: Floats) -> Floats:
         """Outputs of the model, shape (outputs, rows), for commands of shape (inputs, rows)."""
         total = np.einsum("iof,if->of", self.spectra[1], np.fft.rfft(commands, self.length))
         return np.asarray(np.fft.irfft(total, self.length)[..., : self.rows])
@@ -200,7 +200,7 @@ class Sensitivities:
             told = told - shared @ shared.T
         return np.asarray(told)
 
-    def written(self, commands: Floats) -> Floats:
+    def rig_commands(self, commands: Floats) -> Floats:
         """Commands for a rig, shape (inputs, rows + 1): changes as ramps, and a last row of zeros."""
         total = np.cumsum(commands, axis=1)
         before = np.pad(total, ((0, 0), (self.ramp, 0)))[:, : self.rows]
@@ -208,7 +208,7 @@ class Sensitivities:
         return np.pad(smooth, ((0, 0), (0, 1)))
 
 
-def _offsets(laid: Laid, step: float, rows: int) -> Floats:
+def _offset_responses(laid: ModelFit, step: float, rows: int) -> Floats:
     """Responses, over the noise, to unknown constants (and ramps) in the equations of one run."""
     structure = laid.problem.structure
     drives = {"none": 0, "constant": 1, "ramp": 2}.get(structure.offset)
@@ -233,13 +233,13 @@ def _offsets(laid: Laid, step: float, rows: int) -> Floats:
         tuple(values.get(n, 0.0) for n in problem.names),
         run,
         [1.0 / laid.noise[o] for o in laid.outputs],
-        laid.every,
+        laid.refinement,
     )
     own = [i for i, n in enumerate(problem.names) if n not in values]
     # They are told from the second sample on; at the first, a run from rest shows nothing of them.
     told = found[own].reshape(len(own), len(laid.outputs), rows)
     told = np.pad(told, ((0, 0), (0, 0), (1, 0)))[..., :rows]
-    return orthonormal(told.reshape(len(own), -1).T, ROUNDING).T
+    return orthonormal(told.reshape(len(own), -1).T, OFFSET_RANK_TOLERANCE).T
 
 
 def fast_length(least: int) -> int:

@@ -8,24 +8,29 @@ from dataclasses import dataclass, replace
 
 import numpy as np
 
-from ftlm.analysis.frequency_response import DELTA, frequency_response, model_numbers, with_numbers
+from ftlm.analysis.frequency_response import (
+    DERIVATIVE_STEP_RATIO,
+    frequency_response,
+    parameter_vector,
+    with_parameter_vector,
+)
 from ftlm.experiment_design.problem import Bounds, Criterion
-from ftlm.experiment_design.sensitivity import Laid
-from ftlm.model.model import Solved
+from ftlm.experiment_design.sensitivity import ModelFit
+from ftlm.model.model import ModelData
 from ftlm.utils.validation import Complex, Floats
 
 #: Maximum number of lines of a spectrum. Information changes little between neighboring lines.
-LINES = 240
+MAX_SPECTRAL_LINES = 240
 #: Highest line, as a fraction of the sampling frequency.
-HIGHEST = 0.25
+MAX_FREQUENCY_RATIO = 0.25
 #: Maximum number of weight iterations at fixed prices of the limits, and of price updates.
-ROUNDS, PRICES = 60, 40
+MAX_WEIGHT_ITERATIONS, MAX_PRICE_ITERATIONS = 60, 40
 #: Relative gap in precision at which a design counts as optimal.
-CLOSE = 1e-3
+OPTIMALITY_TOLERANCE = 1e-3
 
 
 @dataclass(frozen=True)
-class Lines:
+class SpectralLines:
     """Information and use of each limit, per unit of power at each line of each input.
 
     Parameters
@@ -60,7 +65,7 @@ class Spectrum:
         Upper bound of the criterion over all periodic inputs within the limits.
     """
 
-    lines: Lines
+    lines: SpectralLines
     power: Floats
     score: float
     bound: float
@@ -71,17 +76,17 @@ class Spectrum:
         return math.expm1(self.bound - self.score)
 
 
-def lines_of(laid: Laid, bounds: Bounds, step: float, rows: int) -> Lines:
+def spectral_lines(laid: ModelFit, bounds: Bounds, step: float, rows: int) -> SpectralLines:
     """Lines of a run that is one period, distributed among inputs so that no two share a line."""
     inputs = laid.inputs
-    most = max(int(HIGHEST * rows), len(inputs) + 1)
-    numbers = np.unique(np.round(np.geomspace(1, most, LINES * 4)).astype(np.int64))
-    if len(numbers) > LINES:
-        numbers = np.unique(np.round(np.geomspace(1, most, LINES)).astype(np.int64))
+    most = max(int(MAX_FREQUENCY_RATIO * rows), len(inputs) + 1)
+    numbers = np.unique(np.round(np.geomspace(1, most, MAX_SPECTRAL_LINES * 4)).astype(np.int64))
+    if len(numbers) > MAX_SPECTRAL_LINES:
+        numbers = np.unique(np.round(np.geomspace(1, most, MAX_SPECTRAL_LINES)).astype(np.int64))
     frequencies = numbers / (rows * step)
-    slopes, gains = _responses(laid, 2 * math.pi * frequencies, step)
+    slopes, gains = _response_sensitivities(laid, 2 * math.pi * frequencies, step)
     peaks = np.array(list(bounds.peaks.values()))
-    swings = np.array(list(bounds.swings.values()))
+    swings = np.array(list(bounds.output_limits.values()))
     weights = 1.0 / np.array([laid.noise[o] for o in laid.outputs])
     told = (
         np.einsum("oilp,oilq,o->ilpq", slopes, slopes.conj(), weights**2).real * rows * peaks[:, None, None, None] ** 2
@@ -92,14 +97,14 @@ def lines_of(laid: Laid, bounds: Bounds, step: float, rows: int) -> Lines:
         costs[k, k] = 1.0
     costs[count:] = (np.abs(gains) * peaks[:, None] / swings[:, None, None]) ** 2
     kept = [(k, np.arange(k, len(numbers), count)) for k in range(count)]
-    return Lines(
+    return SpectralLines(
         np.concatenate([frequencies[at] for _, at in kept]),
         np.concatenate([told[k, at] for k, at in kept]),
         np.concatenate([costs[:, k, at] for k, at in kept], axis=1),
     )
 
 
-def _responses(laid: Laid, w: Floats, step: float) -> tuple[Complex, Complex]:
+def _response_sensitivities(laid: ModelFit, w: Floats, step: float) -> tuple[Complex, Complex]:
     """Derivatives (outputs, inputs, W, parameters) of frequency responses to zero-order-hold inputs, and these."""
     held = np.exp(-0.5j * w * step) * np.sinc(w * step / (2 * math.pi))
     gains = frequency_response(laid.model, w)
@@ -107,7 +112,7 @@ def _responses(laid: Laid, w: Floats, step: float) -> tuple[Complex, Complex]:
     own = replace(laid.model, structure=replace(laid.model.structure, coupling=coupling))
     orders, coefficients, _ = laid.problem.split(laid.values)
     chain = laid.problem.number_jacobian(orders, coefficients)
-    values = model_numbers(own)
+    values = parameter_vector(own)
     # What drives an equation is measured, or follows with it.
     drives = (
         gains
@@ -119,12 +124,12 @@ def _responses(laid: Laid, w: Floats, step: float) -> tuple[Complex, Complex]:
     for k, value in enumerate(values):
         if not np.any(chain[k]):
             continue
-        small = DELTA * max(abs(value), 1e-3)
+        small = DERIVATIVE_STEP_RATIO * max(abs(value), 1e-3)
         ends = []
         for at in (value + small, value - small):
             moved = values.copy()
             moved[k] = at
-            ends.append(_driven(with_numbers(own, moved), w, coupling, drives, signals))
+            ends.append(_output_responses(with_parameter_vector(own, moved), w, coupling, drives, signals))
         slopes += ((ends[0] - ends[1]) / (2 * small))[..., None] * chain[k]
     for place, item in enumerate(laid.problem.inputs, start=len(laid.names) - len(laid.problem.inputs)):
         at = laid.inputs.index(item.signal)
@@ -132,7 +137,7 @@ def _responses(laid: Laid, w: Floats, step: float) -> tuple[Complex, Complex]:
     return slopes * held[:, None], gains * held
 
 
-def _driven(model: Solved, w: Floats, coupling: str, drives: Complex, signals: Sequence[str]) -> Complex:
+def _output_responses(model: ModelData, w: Floats, coupling: str, drives: Complex, signals: Sequence[str]) -> Complex:
     """Output responses for simulated coupling, or for measured coupling with given responses of the other signals."""
     if coupling == "simulated":
         return frequency_response(model, w)
@@ -143,7 +148,7 @@ def _driven(model: Solved, w: Floats, coupling: str, drives: Complex, signals: S
     return np.asarray(np.einsum("osw,siw->oiw", alone, drives[[list(signals).index(s) for s in inputs]]))
 
 
-def best_spectrum(lines: Lines, criterion: Criterion) -> Spectrum:
+def best_spectrum(lines: SpectralLines, criterion: Criterion) -> Spectrum:
     """Optimal power of each line under all limits.
 
     With a price for each limit the problem is one of weights that sum to one, solved by Titterington's multiplicative
@@ -156,38 +161,38 @@ def best_spectrum(lines: Lines, criterion: Criterion) -> Spectrum:
     weights = np.full(points, 1.0 / points)
     best, power, bound = -math.inf, weights, math.inf
     damp = 1.0 if criterion.kind == "D" else 0.2
-    for turn in range(PRICES):
+    for turn in range(MAX_PRICE_ITERATIONS):
         cost = price @ lines.costs
         told = lines.information / cost[:, None, None]
-        for _ in range(ROUNDS):
-            gain = _gains(weights, told, criterion)
+        for _ in range(MAX_WEIGHT_ITERATIONS):
+            gain = _gain_per_point(weights, told, criterion)
             if gain is None:
                 return Spectrum(lines, np.zeros(points), -math.inf, math.inf)
             weights = weights * np.maximum(gain, 0.0) ** damp
             weights = weights / np.sum(weights)
-            if np.max(gain) < 1 + CLOSE:
+            if np.max(gain) < 1 + OPTIMALITY_TOLERANCE:
                 break
-        gain = _gains(weights, told, criterion)
+        gain = _gain_per_point(weights, told, criterion)
         if gain is None:
             return Spectrum(lines, np.zeros(points), -math.inf, math.inf)
         total = np.tensordot(weights, told, 1)
-        bound = min(bound, criterion.mean(total) + 0.5 * math.log(max(float(np.max(gain)), 1.0)))
+        bound = min(bound, criterion.smooth_score(total) + 0.5 * math.log(max(float(np.max(gain)), 1.0)))
         spent = weights / cost
         used = lines.costs @ spent
         feasible = spent / np.max(used)
         score = float(criterion.score(np.tensordot(feasible, lines.information, 1)))
         if score > best:
             best, power = score, feasible
-        if bound - best < CLOSE:
+        if bound - best < OPTIMALITY_TOLERANCE:
             break
-        price = price * used ** (0.7 if turn < PRICES // 2 else 0.4)
+        price = price * used ** (0.7 if turn < MAX_PRICE_ITERATIONS // 2 else 0.4)
         price = np.maximum(price / np.sum(price), 1e-9)
     return Spectrum(lines, power, best, bound)
 
 
-def _gains(weights: Floats, told: Floats, criterion: Criterion) -> Floats | None:
+def _gain_per_point(weights: Floats, told: Floats, criterion: Criterion) -> Floats | None:
     """Derivative of the criterion with respect to the power of each point, 1 on average; None if not identifiable."""
     total = np.tensordot(weights, told, 1)
     if not np.isfinite(criterion.score(total)):
         return None
-    return np.asarray(np.einsum("kpq,pq->k", told, criterion.slope(total)))
+    return np.asarray(np.einsum("kpq,pq->k", told, criterion.gradient(total)))

@@ -1,1 +1,1 @@
-"""Files read: text, .mat, parquet."""
+"""Reading of measured data from text, spreadsheet, array and frequency-response files."""

@@ -1,15 +1,15 @@
-"""Reads arrays and sheets from binary files in a process of its own: a damaged file can crash the libraries.
+"""Binary reader, run in a separate process because a damaged file can crash the libraries.
 
 Run by path, never imported by the parent: ``python -I reader.py KIND OPTIONS FILE…`` with KIND mat, hdf5, parquet,
-feather, numpy or sheet, and OPTIONS a JSON object: the folders that hold the packages, the sheet that is asked for. For
-every file it writes to standard output one line of JSON and then the numbers:
+feather, numpy or sheet, and OPTIONS a JSON object with the folders of the packages and the requested sheet. For every
+file it writes one line of JSON to standard output, followed by the numbers:
 
-``{"arrays": [{"name": …, "rows": …, "columns": …, "type": …}], "skipped": {name: why}}`` followed by the arrays, each
-little-endian float64, column after column; or ``{"error": why, "way_out": what to do}`` and the end. An array may
-state its ``"unit"``; one of moments says ``"since"``, whole nanoseconds since 1970 from which its own nanoseconds
-count. Of columns, not matrices, it says ``"text": true``, and for a run that ftlm wrote ``"ftlm-run"``: its own header.
-Of a sheet it says ``"sheet"``, its name, ``"others"``, which are empty, and ``"bytes"``: so many of UTF-8 text follow,
-a line a row, cells between tabs.
+``{"arrays": [{"name": …, "rows": …, "columns": …, "type": …}], "skipped": {name: why}}`` followed by the arrays as
+little-endian float64, column after column; or ``{"error": why, "way_out": what to do}`` and nothing else. An array may
+have a ``"unit"``. An array of timestamps has ``"since"``, the reference time in integer nanoseconds since 1970 for its
+values in nanoseconds. Columns that do not come from matrices have ``"text": true``; a run written by ftlm has
+``"ftlm-run"``, its header. A sheet has ``"sheet"``, its name, ``"others"``, the names of empty sheets, and ``"bytes"``,
+the number of bytes of UTF-8 text that follow: one line per row, tabs between cells.
 """
 
 from __future__ import annotations
@@ -30,17 +30,17 @@ from typing import Any, BinaryIO
 MEMORY_LIMIT = 4 << 30
 SECONDS_LIMIT = 60
 SIZE_LIMIT = 1 << 30
-MOST_ARRAYS = 10_000
-MOST_DEPTH = 8
-WHICH = "say which with layout=dict(sheet=NAME)"
+MAX_ARRAYS = 10_000
+MAX_GROUP_DEPTH = 8
+SHEET_CHOICE_HINT = "say which with layout=dict(sheet=NAME)"
 SAVE_AGAIN = "save it again with save('FILE.mat', '-v7')"
-NUMERIC = frozenset(
+NUMERIC_MATLAB_CLASSES = frozenset(
     ("double", "single", "logical", "int8", "uint8", "int16", "uint16", "int32", "uint32", "int64", "uint64")
 )
 
 
 class UnreadableError(Exception):
-    """A file that is refused: why, and what to do about it; nothing where it is damaged."""
+    """File that cannot be read: reason and remedy; no remedy if it is damaged."""
 
     def __init__(self, why: str, way_out: str = "") -> None:
         super().__init__(why)
@@ -48,7 +48,7 @@ class UnreadableError(Exception):
 
 
 def limit_resources() -> None:
-    """Bound this process's memory and time where the system can."""
+    """Limit memory and CPU time of this process, if the system supports it."""
     try:
         resource: Any = importlib.import_module("resource")
     except ImportError:
@@ -84,7 +84,7 @@ def read_matlab(path: str, budget: int) -> tuple[dict[str, Any], list[Any]]:
     """Return the header of a .mat file and its matrices, of at most `budget` bytes as float64."""
     numpy: Any = importlib.import_module("numpy")
     matlab: Any = importlib.import_module("scipy.io")
-    # SciPy says with warnings that it left something out; nothing may be left out in silence.
+    # SciPy only warns when it skips data; turn such warnings into errors.
     warnings.simplefilter("ignore")
     warnings.simplefilter("error", UserWarning)
     warnings.simplefilter("error", RuntimeWarning)
@@ -98,7 +98,7 @@ def read_matlab(path: str, budget: int) -> tuple[dict[str, Any], list[Any]]:
             raise UnreadableError(f"the variable {name!r} is in it twice")
         seen.add(name)
         count = math.prod(map(int, shape))
-        if kind not in NUMERIC:
+        if kind not in NUMERIC_MATLAB_CLASSES:
             skipped[name] = str(kind)
         elif len(shape) != 2:
             skipped[name] = f"{len(shape)} dimensions"
@@ -111,8 +111,8 @@ def read_matlab(path: str, budget: int) -> tuple[dict[str, Any], list[Any]]:
         raise UnreadableError(
             f"with it the arrays take more than {SIZE_LIMIT} bytes (it declares {size})", "save a part of it"
         )
-    if len(seen) > MOST_ARRAYS:
-        raise UnreadableError(f"it holds {len(seen)} variables, more than {MOST_ARRAYS}", "save a part of it")
+    if len(seen) > MAX_ARRAYS:
+        raise UnreadableError(f"it holds {len(seen)} variables, more than {MAX_ARRAYS}", "save a part of it")
     # With mat_dtype=True SciPy drops imaginary parts; the stored type loses nothing.
     loaded = matlab.loadmat(path, mat_dtype=False, variable_names=list(wanted)) if wanted else {}
     header: dict[str, Any] = {"arrays": [], "skipped": skipped}
@@ -130,16 +130,16 @@ def read_matlab(path: str, budget: int) -> tuple[dict[str, Any], list[Any]]:
 
 
 def check_size(rows: int, columns: int) -> None:
-    """Refuse a table that declares too much."""
-    if columns > MOST_ARRAYS or 8 * rows * columns > SIZE_LIMIT:
+    """Raise if a table declares too many columns or bytes."""
+    if columns > MAX_ARRAYS or 8 * rows * columns > SIZE_LIMIT:
         raise UnreadableError(
-            f"it declares {rows} rows of {columns} columns, more than {SIZE_LIMIT} bytes or {MOST_ARRAYS} columns",
+            f"it declares {rows} rows of {columns} columns, more than {SIZE_LIMIT} bytes or {MAX_ARRAYS} columns",
             "save a part of it",
         )
 
 
-def moments_of(nanoseconds: Any, gone: Any) -> tuple[dict[str, Any], Any]:
-    """What is said of a column of moments, and nanoseconds since the first of them that is there."""
+def timestamp_array(nanoseconds: Any, gone: Any) -> tuple[dict[str, Any], Any]:
+    """Encode a column of timestamps: header entry, and nanoseconds since the first valid one."""
     numpy: Any = importlib.import_module("numpy")
     there = numpy.flatnonzero(~gone)
     since = int(nanoseconds[there[0]]) if there.size else 0
@@ -175,7 +175,7 @@ def read_parquet(path: str, budget: int) -> tuple[dict[str, Any], list[Any]]:
 
 
 def arrow_columns(table: Any) -> tuple[dict[str, Any], list[Any]]:
-    """Return the header and the columns of a table of Arrow's."""
+    """Return the header and the columns of an Arrow table."""
     numpy: Any = importlib.import_module("numpy")
     types: Any = importlib.import_module("pyarrow.types")
     compute: Any = importlib.import_module("pyarrow.compute")
@@ -190,7 +190,7 @@ def arrow_columns(table: Any) -> tuple[dict[str, Any], list[Any]]:
         if types.is_timestamp(kind) or types.is_date(kind):
             whole = compute.cast(compute.cast(column, "timestamp[ns]"), "int64").combine_chunks()
             gone = numpy.asarray(whole.is_null())
-            said, values = moments_of(whole.fill_null(0).to_numpy(zero_copy_only=False), gone)
+            said, values = timestamp_array(whole.fill_null(0).to_numpy(zero_copy_only=False), gone)
             header["arrays"].append({"name": name, "rows": len(values), "columns": 1, **said})
             arrays.append(values)
             continue
@@ -203,7 +203,7 @@ def arrow_columns(table: Any) -> tuple[dict[str, Any], list[Any]]:
         arrays.append(numpy.asarray(values, dtype=numpy.float64))
         made.update(f"\0{name}\0{len(values)}\0".encode())
         made.update(numpy.ascontiguousarray(arrays[-1], dtype="<f8").tobytes())
-    # Runs of ftlm say how many rows they have, and what all of them come to.
+    # Runs written by ftlm store row count and digest.
     check = (table.schema.metadata or {}).get(b"ftlm-check")
     if check is not None and check != f"{table.num_rows} {made.hexdigest()}".encode():
         said = check.split(b" ")[0].decode("utf-8", errors="replace")[:20]
@@ -214,7 +214,7 @@ def arrow_columns(table: Any) -> tuple[dict[str, Any], list[Any]]:
 
 
 class Arrays:
-    """Arrays as they are gathered, within the bytes that are left."""
+    """Collector of arrays within a byte budget."""
 
     def __init__(self, budget: int) -> None:
         self.header: dict[str, Any] = {"arrays": [], "skipped": {}}
@@ -222,7 +222,7 @@ class Arrays:
         self.left = budget
 
     def fits(self, name: str, shape: tuple[int, ...], kind: Any) -> bool:
-        """Whether an array of that shape and type is to be read; what is not a table of numbers is skipped."""
+        """Whether an array of this shape and type is read; others are recorded as skipped."""
         why = None
         if kind.hasobject:
             why = "pickled objects, which are not read"
@@ -238,13 +238,13 @@ class Arrays:
         size = 8 * math.prod(shape) * len(kind.names or " ")
         if size > self.left:
             raise UnreadableError(f"with {name!r} the arrays take more than {SIZE_LIMIT} bytes", "save a part of it")
-        if len(self.values) + len(kind.names or " ") > MOST_ARRAYS:
-            raise UnreadableError(f"it holds more than {MOST_ARRAYS} arrays", "save a part of it")
+        if len(self.values) + len(kind.names or " ") > MAX_ARRAYS:
+            raise UnreadableError(f"it holds more than {MAX_ARRAYS} arrays", "save a part of it")
         self.left -= size
         return True
 
     def add(self, name: str, values: Any, unit: str = "") -> None:
-        """Take an array; the fields of a structured one are columns of their own."""
+        """Add an array; each field of a structured array becomes a column."""
         numpy: Any = importlib.import_module("numpy")
         if values.dtype.names:
             for field in values.dtype.names:
@@ -262,7 +262,7 @@ class Arrays:
                 self.header["skipped"][name] = "a matrix of dates"
                 return
             flat = values.ravel().astype("datetime64[ns]")
-            said, matrix = moments_of(flat.astype(numpy.int64), numpy.isnat(flat))
+            said, matrix = timestamp_array(flat.astype(numpy.int64), numpy.isnat(flat))
             matrix = matrix.reshape(-1, 1)
         if unit:
             said["unit"] = unit[:40]
@@ -271,7 +271,7 @@ class Arrays:
 
 
 def read_numpy(path: str, budget: int) -> tuple[dict[str, Any], list[Any]]:
-    """Return the arrays of a file that NumPy wrote; nothing in it is unpickled."""
+    """Return the arrays of a NumPy file; pickled objects are never loaded."""
     found = Arrays(budget)
     if path.lower().endswith(".npy"):
         with open(path, "rb") as stream:
@@ -297,7 +297,7 @@ def read_numpy(path: str, budget: int) -> tuple[dict[str, Any], list[Any]]:
 
 
 def numpy_array(stream: Any, name: str, found: Arrays) -> Any:
-    """One array, or None where it is none to be read; its size is known before its numbers are."""
+    """Read one NumPy array; None if it is skipped. The size is checked before the data are read."""
     form: Any = importlib.import_module("numpy.lib.format")
     version = form.read_magic(stream)
     read_header = {(1, 0): form.read_array_header_1_0, (2, 0): form.read_array_header_2_0}.get(version)
@@ -315,7 +315,7 @@ def numpy_array(stream: Any, name: str, found: Arrays) -> Any:
 
 
 def read_hdf5(path: str, budget: int) -> tuple[dict[str, Any], list[Any]]:
-    """Return the matrices of an HDF5 file, of MATLAB or others; nothing outside of it is followed."""
+    """Return the matrices of an HDF5 file, including MATLAB 7.3; external links are not followed."""
     hdf5: Any = importlib.import_module("h5py")
     found = Arrays(budget)
     with hdf5.File(path, "r") as file:
@@ -324,7 +324,7 @@ def read_hdf5(path: str, budget: int) -> tuple[dict[str, Any], list[Any]]:
 
 
 def _gather(hdf5: Any, group: Any, prefix: str, found: Arrays, depth: int) -> None:
-    """Take what a group holds."""
+    """Collect the arrays of an HDF5 group recursively."""
     for key in group:
         name, link = f"{prefix}{key}", group.get(key, getlink=True)
         if not isinstance(link, hdf5.HardLink):
@@ -333,14 +333,14 @@ def _gather(hdf5: Any, group: Any, prefix: str, found: Arrays, depth: int) -> No
         item = group[key]
         matlab = item.attrs.get("MATLAB_class")
         kind = matlab.decode(errors="replace") if isinstance(matlab, bytes) else "" if matlab is None else str(matlab)
-        if len(found.header["skipped"]) > MOST_ARRAYS:
-            raise UnreadableError(f"it holds more than {MOST_ARRAYS} things that are no arrays", "save a part of it")
+        if len(found.header["skipped"]) > MAX_ARRAYS:
+            raise UnreadableError(f"it holds more than {MAX_ARRAYS} things that are no arrays", "save a part of it")
         if isinstance(item, hdf5.Group):
-            if kind or key.startswith("#") or depth >= MOST_DEPTH:
+            if kind or key.startswith("#") or depth >= MAX_GROUP_DEPTH:
                 found.header["skipped"][name] = kind or "of MATLAB's own"
             else:
                 _gather(hdf5, item, f"{name}/", found, depth + 1)
-        elif not isinstance(item, hdf5.Dataset) or (kind and kind not in NUMERIC):
+        elif not isinstance(item, hdf5.Dataset) or (kind and kind not in NUMERIC_MATLAB_CLASSES):
             found.header["skipped"][name] = kind or "no array"
         elif not has_numbers(item):
             found.header["skipped"][name] = "no numbers"
@@ -352,12 +352,12 @@ def _gather(hdf5: Any, group: Any, prefix: str, found: Arrays, depth: int) -> No
             values = item[()]
             unit = item.attrs.get("units", item.attrs.get("unit", ""))
             unit = unit.decode(errors="replace") if isinstance(unit, bytes) else unit if isinstance(unit, str) else ""
-            # MATLAB counts along columns, so that what it writes is turned.
+            # MATLAB stores arrays in column-major order, so HDF5 shows them transposed.
             found.add(name, values.T if kind and values.ndim == 2 else values, unit)
 
 
 def has_numbers(item: Any) -> bool:
-    """Whether NumPy knows the type of an array of HDF5, and it is none of objects."""
+    """Whether an HDF5 dataset has a NumPy type without Python objects."""
     try:
         return not item.dtype.hasobject
     except (TypeError, ValueError):
@@ -371,7 +371,7 @@ def read_sheet(path: str, sheet: str | None) -> tuple[dict[str, Any], bytes]:
             size = sum(entry.file_size for entry in archive.infolist())
         if size > SIZE_LIMIT:
             raise UnreadableError(f"unpacked, it has {size} bytes, more than {SIZE_LIMIT}", "save a part of it")
-        # What reads the sheet does not come to the checksum of each part, which stands behind it.
+        # The spreadsheet library does not verify the checksum of the archive members.
         with zipfile.ZipFile(path) as archive:
             damaged = archive.testzip()
         if damaged is not None:
@@ -380,7 +380,9 @@ def read_sheet(path: str, sheet: str | None) -> tuple[dict[str, Any], bytes]:
     book = calamine.CalamineWorkbook.from_path(path)
     names = list(book.sheet_names)
     if sheet is not None and sheet not in names:
-        raise UnreadableError(f"it has no sheet {sheet!r}; its sheets are {', '.join(map(repr, names[:20]))}", WHICH)
+        raise UnreadableError(
+            f"it has no sheet {sheet!r}; its sheets are {', '.join(map(repr, names[:20]))}", SHEET_CHOICE_HINT
+        )
     filled = {}
     for name in names if sheet is None else [sheet]:
         try:
@@ -396,7 +398,8 @@ def read_sheet(path: str, sheet: str | None) -> tuple[dict[str, Any], bytes]:
         )
     if len(filled) > 1:
         raise UnreadableError(
-            f"it has {len(filled)} sheets that are not empty: {', '.join(map(repr, list(filled)[:20]))}", WHICH
+            f"it has {len(filled)} sheets that are not empty: {', '.join(map(repr, list(filled)[:20]))}",
+            SHEET_CHOICE_HINT,
         )
     ((name, found),) = filled.items()
     out = io.StringIO(newline="")
@@ -411,13 +414,13 @@ def read_sheet(path: str, sheet: str | None) -> tuple[dict[str, Any], bytes]:
 
 
 def cell_text(cell: Any) -> str:
-    """What a cell of a sheet holds, as text: numbers to their last digit."""
+    """Text of a spreadsheet cell; numbers keep all digits."""
     if isinstance(cell, bool):
         return str(cell)
     if isinstance(cell, int | float):
         return repr(cell)
     if isinstance(cell, datetime.timedelta):
-        # A time that passed has its unit in itself, which a number would take from the header.
+        # A duration keeps its unit this way; a plain number would get the unit of the header.
         seconds, rest = divmod(abs(cell) // datetime.timedelta(microseconds=1), 1_000_000)
         return f"{'-' if cell < datetime.timedelta() else ''}PT{seconds}.{rest:06}S"
     if isinstance(cell, datetime.datetime):
@@ -427,11 +430,17 @@ def cell_text(cell: Any) -> str:
     return " ".join(str(cell).replace("\0", " ").split())
 
 
-READERS = {"mat": read_matlab, "hdf5": read_hdf5, "parquet": read_parquet, "feather": read_feather, "numpy": read_numpy}
+READERS_BY_FORMAT = {
+    "mat": read_matlab,
+    "hdf5": read_hdf5,
+    "parquet": read_parquet,
+    "feather": read_feather,
+    "numpy": read_numpy,
+}
 
 
 def answer(kind: str, path: str, out: BinaryIO, budget: int, sheet: str | None) -> int:
-    """Write what one file holds, or why it cannot be read; return the number of bytes of its arrays."""
+    """Write the arrays or cells of one file, or the error; return their number of bytes."""
     matlab = path.lower().endswith(".mat")
     damaged = f"the file is damaged; get an intact copy or {SAVE_AGAIN if matlab else 'save it again'}"
     cells, payload = b"", []
@@ -439,7 +448,7 @@ def answer(kind: str, path: str, out: BinaryIO, budget: int, sheet: str | None) 
         if kind == "sheet":
             header, cells = read_sheet(path, sheet)
         else:
-            header, arrays = READERS[kind](path, budget)
+            header, arrays = READERS_BY_FORMAT[kind](path, budget)
             payload = [values.astype("<f8", copy=False).ravel(order="F") for values in arrays]
     except UnreadableError as error:
         header, payload = {"error": str(error), "way_out": error.way_out or damaged}, []
@@ -457,8 +466,8 @@ def answer(kind: str, path: str, out: BinaryIO, budget: int, sheet: str | None) 
 
 
 def main(arguments: list[str]) -> None:
-    """Answer for every file in turn."""
-    # One thread: every further one would reserve memory that counts against the limit, as pools of memory do.
+    """Read the files of the command line and write one answer each."""
+    # One thread and no memory pool: both would reserve memory that counts against the limit.
     os.environ["OPENBLAS_NUM_THREADS"] = "1"
     os.environ["ARROW_DEFAULT_MEMORY_POOL"] = "system"
     limit_resources()

@@ -1,4 +1,4 @@
-"""Cells of text: their numbers, the lines that they are cut from, and what names and units look like."""
+"""Parsing of text cells: numbers, units, dates and times of day."""
 
 from __future__ import annotations
 
@@ -11,81 +11,86 @@ from dataclasses import dataclass
 import numpy as np
 import numpy.typing as npt
 
-from ftlm.data.units import TIME_UNITS, header_time, spelled_unit
+from ftlm.data.units import TIME_UNITS, parse_unit, split_time_header
 from ftlm.errors import DataError
 from ftlm.utils.validation import Floats, bad_rows
 
 DECIMAL_COMMA = re.compile(r"[+-]?\d*,\d+(?:[eE][+-]?\d+)?|[+-]?\d+,(?:[eE][+-]?\d+)?")
-#: What stands before a unit at the end of a name, where it has no brackets.
+#: Separators before a unit at the end of a column name without brackets.
 _BEFORE_UNITS = (" / ", ",", " in ")
-#: What people group thousands by, as character classes.
-THOUSANDS = {"point": "[.]", "comma": "[,]", "space": "[ \u00a0\u202f]", "apostrophe": "['\u2019]"}
-#: Exponents of Fortran; without a point or a sign, a D between digits is part of a name.
-_FORTRAN = re.compile(r"\s*[+-]?(?:(?:\d+[.]\d*|[.]\d+)[dD][+-]?\d{1,3}|\d+[dD][+-]\d{1,3})\s*", re.ASCII)
-#: What stands for no number, without capitals.
-_GAPS = frozenset(("", "n/a", "na", "#n/a", "null", "none", "-", "--", "---"))
+#: Thousands separators, as regular-expression character classes.
+THOUSANDS_SEPARATORS = {"point": "[.]", "comma": "[,]", "space": "[ \u00a0\u202f]", "apostrophe": "['\u2019]"}
+#: Numbers with a Fortran exponent D; a point or a sign is required, because a bare D between digits can be a name.
+_FORTRAN_NUMBER_PATTERN = re.compile(
+    r"\s*[+-]?(?:(?:\d+[.]\d*|[.]\d+)[dD][+-]?\d{1,3}|\d+[dD][+-]\d{1,3})\s*", re.ASCII
+)
+#: Case-folded cell texts that mean a missing value.
+_MISSING_VALUE_TEXTS = frozenset(("", "n/a", "na", "#n/a", "null", "none", "-", "--", "---"))
 
 
 @functools.cache
-def _grouped(mark: str, comma: bool) -> re.Pattern[str]:
-    """A number whose thousands are grouped; its decimals, if any, are a group of the pattern."""
+def _grouped_number_pattern(mark: str, comma: bool) -> re.Pattern[str]:
+    """Pattern of a number with grouped thousands; its decimals are the first group."""
     point = "," if comma else "[.]"
     return re.compile(
-        rf"\s*[+-]?[1-9]\d{{0,2}}(?:{THOUSANDS[mark]}\d{{3}})+({point}\d*)?(?:[eE][+-]?\d{{1,3}})?\s*", re.ASCII
+        rf"\s*[+-]?[1-9]\d{{0,2}}(?:{THOUSANDS_SEPARATORS[mark]}\d{{3}})+({point}\d*)?(?:[eE][+-]?\d{{1,3}})?\s*",
+        re.ASCII,
     )
 
 
-def grouping(cell: str, *, comma: bool) -> str | None:
-    """What groups the thousands of a number, where that can be nothing else: decimals stand behind it."""
+def detect_thousands_separator(cell: str, *, comma: bool) -> str | None:
+    """Return the thousands separator of a number if decimals make it unambiguous; else None."""
     if len(cell) < len("1.234,"):
         return None
-    for mark in THOUSANDS:
-        found = _grouped(mark, comma).fullmatch(cell) if mark != ("comma" if comma else "point") else None
+    for mark in THOUSANDS_SEPARATORS:
+        found = (
+            _grouped_number_pattern(mark, comma).fullmatch(cell) if mark != ("comma" if comma else "point") else None
+        )
         if found and found[1]:
             return mark
     return None
 
 
 def may_group(cell: str, mark: str, *, comma: bool) -> bool:
-    """Whether a cell is a number whose thousands this mark may group, decimals behind it or not."""
-    return _grouped(mark, comma).fullmatch(cell) is not None
+    """Whether a cell is a number with thousands grouped by a given separator."""
+    return _grouped_number_pattern(mark, comma).fullmatch(cell) is not None
 
 
-def number(cell: str, *, comma: bool = False, mark: str | None = None) -> float:
-    """Return the number in a cell; `ValueError` where there is none.
+def parse_number(cell: str, *, comma: bool = False, mark: str | None = None) -> float:
+    """Parse the number in a cell; raise `ValueError` if there is none.
 
-    Python's numbers may have underscores between their digits, those of files have not; where commas are decimal,
-    points may group digits, so that a number with one is none unless `mark` says that they do.
+    Underscores between digits, which Python accepts, are rejected. With decimal commas a point is rejected, too, unless
+    `mark` declares it a thousands separator.
     """
     if mark is not None and may_group(cell, mark, comma=comma):
-        cell = re.sub(THOUSANDS[mark], "", cell)
+        cell = re.sub(THOUSANDS_SEPARATORS[mark], "", cell)
     if "_" in cell or (comma and "." in cell):
         raise ValueError(cell)
     text = cell.replace(",", ".") if comma else cell
     try:
         return float(text)
     except ValueError:
-        if not _FORTRAN.fullmatch(text):
+        if not _FORTRAN_NUMBER_PATTERN.fullmatch(text):
             raise
         return float(text.replace("D", "e").replace("d", "e"))
 
 
 def is_number(cell: str, *, comma: bool = False, mark: str | None = None) -> bool:
-    """Whether a cell holds a number."""
+    """Whether a cell is a number."""
     try:
-        number(cell, comma=comma, mark=mark)
+        parse_number(cell, comma=comma, mark=mark)
     except ValueError:
         return False
     return True
 
 
 def is_gap(cell: str) -> bool:
-    """Whether a cell is empty, or says that there is no number."""
-    return cell.strip().casefold() in _GAPS
+    """Whether a cell means a missing value."""
+    return cell.strip().casefold() in _MISSING_VALUE_TEXTS
 
 
-def split(lines: list[str], separator: str | None, source: str, first: int) -> list[list[str]]:
-    """Cut lines into cells, quoted ones whole."""
+def split_cells(lines: list[str], separator: str | None, source: str, first: int) -> list[list[str]]:
+    """Split lines into cells; quoted cells stay whole."""
     if separator is None:
         return [line.split() for line in lines]
     if not any('"' in line for line in lines):
@@ -99,18 +104,18 @@ def split(lines: list[str], separator: str | None, source: str, first: int) -> l
     return rows
 
 
-def stated_unit(name: str) -> tuple[str, str]:
-    """What a column is called, and the unit that its name states, both as written; "" for none.
+def split_unit(name: str) -> tuple[str, str]:
+    """Split a column name into its bare name and the unit in it; "" if there is no unit.
 
-    Any in brackets; a known one in ``Strom / A``, ``Current, A`` and ``Winkel in Grad``.
+    Any text in brackets counts as a unit; without brackets only known units, as in ``Strom / A`` or ``Current, A``.
     """
-    # Without regular expressions, whose time would grow with the cube of a long name's spaces.
+    # No regular expression here: its time would grow with the cube of the number of spaces.
     text = name.rstrip()
     opening = {"]": "[", ")": "("}.get(text[-1:])
     if opening is None:
         for before in _BEFORE_UNITS:
             bare, mark, unit = text.rpartition(before)
-            if mark and bare.strip() and spelled_unit(unit.strip()) is not None:
+            if mark and bare.strip() and parse_unit(unit.strip()) is not None:
                 return bare.rstrip(), unit.strip()
         return name, ""
     bare, mark, unit = text[:-1].rpartition(opening)
@@ -118,60 +123,62 @@ def stated_unit(name: str) -> tuple[str, str]:
     return (bare, unit) if mark and bare and unit and text[-1] not in unit else (name, "")
 
 
-def behind_a_stroke(name: str) -> tuple[str, str]:
-    """What a column of text is called, and the known unit behind the stroke of ``I/A``, as written; "" for none."""
+def split_slash_unit(name: str) -> tuple[str, str]:
+    """Split a name such as ``I/A`` into bare name and known unit after the slash; "" if there is no unit."""
     bare, stroke, unit = (part.strip() for part in name.partition("/"))
-    known = stroke and bare and unit and spelled_unit(unit) is not None
-    return (bare, unit) if known and spelled_unit(name) is None and not is_gap(name) and unit != "1" else (name, "")
+    known = stroke and bare and unit and parse_unit(unit) is not None
+    return (bare, unit) if known and parse_unit(name) is None and not is_gap(name) and unit != "1" else (name, "")
 
 
-def _bracketed(cell: str) -> str | None:
-    """What stands in the brackets that a cell consists of; None where it does not."""
+def _bracket_content(cell: str) -> str | None:
+    """Return the content of a cell in brackets; None if the cell is not in brackets."""
     text = cell.strip()
     whole = len(text) > 1 and text[0] in "[(" and text[-1] in "])" and not any(c in "[]()" for c in text[1:-1])
     return text[1:-1].strip() if whole else None
 
 
 def is_unit(cell: str) -> bool:
-    """Whether a cell can stand in a row of units."""
-    bracketed = _bracketed(cell)
+    """Whether a cell may belong to a row of units."""
+    bracketed = _bracket_content(cell)
     word = cell.strip() if bracketed is None else bracketed
     short = bracketed is not None and len(word) <= 12
-    return not word or spelled_unit(word) is not None or is_time_unit(word) or short
+    return not word or parse_unit(word) is not None or is_time_unit(word) or short
 
 
 def is_time_unit(word: str) -> bool:
-    """Whether a word is a unit of time in any of its writings."""
-    return bool(word) and header_time(f"t [{word}]")[1] in TIME_UNITS
+    """Whether a word is a spelling of a time unit."""
+    return bool(word) and split_time_header(f"t [{word}]")[1] in TIME_UNITS
 
 
 def unit_of(cell: str) -> str:
-    """The unit that a cell of a row of units holds, without its brackets."""
-    bracketed = _bracketed(cell)
+    """Return the unit in a cell of a row of units, without brackets."""
+    bracketed = _bracket_content(cell)
     return cell.strip() if bracketed is None else bracketed
 
 
-_CLOCK = (
+_TIME_OF_DAY_PATTERN = (
     r"([01]?\d|2[0-4]):([0-5]\d)(?::([0-5]\d|60)(?:[.,](\d{1,9})\d*)?)?(?:\s*([AaPp])\.?[Mm]\.?)?"
     r"\s*(Z|[+-]\d{2}:?[0-5]\d)?"
 )
-_DATE = r"(?=\d{4}[-./]|\d{1,2}[-./]\d{1,2}[-./]\d{2})(\d{4}|\d{1,2})([-./])(\d{1,2})\2(\d{4}|\d{1,2})"
-_MOMENT = re.compile(rf"\s*(?:{_DATE}(?:(?:\s+|T){_CLOCK})?|{_CLOCK})\s*", re.ASCII)
-#: A time that passed, as ISO 8601 writes it in seconds alone: cells of spreadsheets that hold one are told so.
-_PASSED = re.compile(r"\s*(-?)PT(\d{1,9})(?:\.(\d{1,9}))?S\s*", re.ASCII)
-_NS = 1_000_000_000
-_LONGEST = 64
+_DATE_PATTERN = r"(?=\d{4}[-./]|\d{1,2}[-./]\d{1,2}[-./]\d{2})(\d{4}|\d{1,2})([-./])(\d{1,2})\2(\d{4}|\d{1,2})"
+_TIMESTAMP_PATTERN = re.compile(
+    rf"\s*(?:{_DATE_PATTERN}(?:(?:\s+|T){_TIME_OF_DAY_PATTERN})?|{_TIME_OF_DAY_PATTERN})\s*", re.ASCII
+)
+#: ISO 8601 duration in seconds; the isolated reader writes spreadsheet durations in this form.
+_DURATION_PATTERN = re.compile(r"\s*(-?)PT(\d{1,9})(?:\.(\d{1,9}))?S\s*", re.ASCII)
+_NANOSECONDS_PER_SECOND = 1_000_000_000
+_MAX_TIMESTAMP_CHARACTERS = 64
 
 
-def is_moment(cell: str) -> bool:
-    """Whether a cell holds a date, a time of day, both, or a time that passed."""
-    return _match(cell) is not None or _PASSED.fullmatch(cell) is not None
+def is_timestamp(cell: str) -> bool:
+    """Whether a cell is a date, a time of day, both, or a duration."""
+    return _match_timestamp(cell) is not None or _DURATION_PATTERN.fullmatch(cell) is not None
 
 
-def _match(cell: str) -> re.Match[str] | None:
-    """The parts of a moment; None where it is none, as 13:00 AM and 24:30."""
+def _match_timestamp(cell: str) -> re.Match[str] | None:
+    """Match a timestamp; None for an invalid one such as 13:00 AM or 24:30."""
     text = cell.strip()
-    found = _MOMENT.fullmatch(text) if len(text) <= _LONGEST else None
+    found = _TIMESTAMP_PATTERN.fullmatch(text) if len(text) <= _MAX_TIMESTAMP_CHARACTERS else None
     if found is None:
         return None
     groups = found.groups("")
@@ -181,37 +188,37 @@ def _match(cell: str) -> re.Match[str] | None:
 
 
 @dataclass(frozen=True)
-class Moments:
-    """Moments as they were written.
+class Timestamps:
+    """Timestamps of a column, as parsed numbers.
 
     Parameters
     ----------
     parts
-        The three numbers of each date in the order in which they stand, shape (N, 3); zeros of a time of day alone.
+        Three numbers of each date in the order of the text, shape (N, 3); zeros for a time of day alone.
     mark
-        What stands between them; "" where there is no date.
+        Separator of the date; "" without a date.
     clock
-        Time of day [ns], less the offset of its time zone, shape (N,).
+        Time of day [ns] in UTC if it has a time zone, shape (N,).
     first
-        The first cell.
-    way
-        How they are written: what stands between the numbers of a date, whether with a time zone, with halves of days.
+        Text of the first cell.
+    notation
+        Notation: separator of the date, whether with time zone, whether with AM/PM.
     """
 
     parts: npt.NDArray[np.int64]
     mark: str
     clock: npt.NDArray[np.int64]
     first: str
-    way: tuple[object, ...] = ()
+    notation: tuple[object, ...] = ()
 
     @classmethod
-    def read(cls, cells: Sequence[str]) -> Moments | None:
-        """Moments of all cells; None where one is no moment, or written otherwise than the first."""
-        spans = [_PASSED.fullmatch(cell) for cell in cells]
+    def read(cls, cells: Sequence[str]) -> Timestamps | None:
+        """Parse all cells; None if one is not a timestamp or differs in notation from the first."""
+        spans = [_DURATION_PATTERN.fullmatch(cell) for cell in cells]
         if all(span is not None for span in spans) and cells:
-            clock = np.array([_span(*span.groups("")) for span in spans if span is not None], np.int64)
+            clock = np.array([_duration_ns(*span.groups("")) for span in spans if span is not None], np.int64)
             return cls(np.zeros((clock.size, 3), np.int64), "", clock, cells[0].strip(), ("passed",))
-        found = [_match(cell) for cell in cells]
+        found = [_match_timestamp(cell) for cell in cells]
         if not found or any(match is None for match in found):
             return None
         groups = [match.groups("") for match in found if match is not None]
@@ -222,20 +229,20 @@ class Moments:
         if any(row[1] != mark or bool(row[9]) != zoned or bool(row[8]) != halved for row in rows):
             return None
         parts = np.array([(int(r[0] or 0), int(r[2] or 0), int(r[3] or 0)) for r in rows], np.int64)
-        clock = np.array([_clock(*row[4:]) for row in rows], np.int64)
+        clock = np.array([_time_of_day_ns(*row[4:]) for row in rows], np.int64)
         return cls(parts, mark, clock, cells[0].strip(), (mark, zoned, halved))
 
     @classmethod
-    def joined(cls, pieces: Sequence[Moments]) -> Moments | None:
-        """Moments of one column that was read in pieces; None where these are written in several ways."""
-        if len({piece.way for piece in pieces}) > 1:
+    def concatenate(cls, pieces: Sequence[Timestamps]) -> Timestamps | None:
+        """Concatenate the blocks of one column; None if they differ in notation."""
+        if len({piece.notation for piece in pieces}) > 1:
             return None
         return cls(
             np.concatenate([p.parts for p in pieces]),
             pieces[0].mark,
             np.concatenate([p.clock for p in pieces]),
             pieces[0].first,
-            pieces[0].way,
+            pieces[0].notation,
         )
 
     def seconds(self, thing: str, dates: str | None) -> Floats:
@@ -244,21 +251,21 @@ class Moments:
         Parameters
         ----------
         thing
-            What errors call the column.
+            Label of the column in error messages.
         dates
-            Order of day and month, where a person says it.
+            Order of day and month given by the user, or None.
 
         Raises
         ------
         DataError
-            A date that is none, or whose order of day and month is open.
+            An invalid date, or an ambiguous order of day and month.
         """
         since = self.clock
         if not self.mark:
-            return np.asarray((since - since[0]) / _NS)
+            return np.asarray((since - since[0]) / _NANOSECONDS_PER_SECOND)
         year, month, day = (self.parts[:, place] for place in self._order(thing, dates))
         year = np.where(year < 100, year + 2000, year)
-        bad = (month < 1) | (month > 12) | (day < 1) | (day > _lengths(year, np.clip(month, 1, 12)))
+        bad = (month < 1) | (month > 12) | (day < 1) | (day > _days_in_month(year, np.clip(month, 1, 12)))
         if bad.any():
             raise bad_rows(
                 thing,
@@ -269,29 +276,29 @@ class Moments:
             )
         months = (12 * (year - 1970) + month - 1).astype("datetime64[M]")
         days = months.astype("datetime64[D]").astype(np.int64) + day - 1
-        return np.asarray((days - days[0]) * 86400.0 + (since - since[0]) / _NS)
+        return np.asarray((days - days[0]) * 86400.0 + (since - since[0]) / _NANOSECONDS_PER_SECOND)
 
-    def inferred(self, dates: str | None) -> str:
-        """Order of day and month where it was inferred and any number depends on it; "" where not."""
+    def inferred_date_order(self, dates: str | None) -> str:
+        """Return the inferred order of day and month if values depend on it; else ""."""
         if not self.mark or dates is not None or (self.parts == self.parts[0]).all():
             return ""
-        order = self._likely()
+        order = self._detect_date_order()
         return "" if order == "ymd" else order
 
-    def _likely(self) -> str:
-        """The order that the dates themselves tell; "" where they leave it open."""
+    def _detect_date_order(self) -> str:
+        """Detect the order of the dates from their numbers; "" if it is ambiguous."""
         first, second, last = self.parts.max(axis=0)
         if first > 31:
             return "ymd"
         if second > 12 >= first:
             return "mdy"
-        # Dates with points begin with the day; of others the numbers may tell, and one day is the same either way.
+        # Dates with points begin with the day; for others the numbers may decide. Equal dates need no order.
         told = self.mark == "." or (first > 12 and last > 31) or (self.parts == self.parts[0]).all()
         return "dmy" if told else ""
 
     def _order(self, thing: str, dates: str | None) -> tuple[int, int, int]:
-        """Places of year, month and day."""
-        first, likely = self.parts[:, 0].max(), self._likely()
+        """Return the positions of year, month and day."""
+        first, likely = self.parts[:, 0].max(), self._detect_date_order()
         order = likely if likely == "ymd" or dates is None else dates
         if order:
             return {"ymd": (0, 1, 2), "dmy": (2, 1, 0), "mdy": (2, 0, 1)}[order]
@@ -306,8 +313,8 @@ class Moments:
         )
 
 
-def _clock(hour: str, minute: str, second: str, fraction: str, half: str, zone: str) -> int:
-    """Time of day [ns], in universal time where it has a zone."""
+def _time_of_day_ns(hour: str, minute: str, second: str, fraction: str, half: str, zone: str) -> int:
+    """Time of day [ns], in UTC if it has a time zone."""
     hours, offset = int(hour or 0), 0
     if half:
         hours = hours % 12 + (12 if half in "Pp" else 0)
@@ -315,17 +322,17 @@ def _clock(hour: str, minute: str, second: str, fraction: str, half: str, zone: 
         digits = zone[1:].replace(":", "")
         offset = (1 if zone[0] == "+" else -1) * (int(digits[:2]) * 60 + int(digits[2:]))
     minutes = hours * 60 + int(minute or 0) - offset
-    return (minutes * 60 + int(second or 0)) * _NS + int((fraction or "0").ljust(9, "0"))
+    return (minutes * 60 + int(second or 0)) * _NANOSECONDS_PER_SECOND + int((fraction or "0").ljust(9, "0"))
 
 
-def _span(sign: str, whole: str, fraction: str) -> int:
-    """A time that passed [ns]."""
-    nanoseconds = int(whole) * _NS + int(fraction.ljust(9, "0") or 0)
+def _duration_ns(sign: str, whole: str, fraction: str) -> int:
+    """Duration [ns]."""
+    nanoseconds = int(whole) * _NANOSECONDS_PER_SECOND + int(fraction.ljust(9, "0") or 0)
     return -nanoseconds if sign else nanoseconds
 
 
-def _lengths(year: npt.NDArray[np.int64], month: npt.NDArray[np.int64]) -> npt.NDArray[np.int64]:
-    """Days of months."""
+def _days_in_month(year: npt.NDArray[np.int64], month: npt.NDArray[np.int64]) -> npt.NDArray[np.int64]:
+    """Number of days of each month."""
     leap = (year % 4 == 0) & ((year % 100 != 0) | (year % 400 == 0))
     days = np.array([31, 28, 31, 30, 31, 30, 31, 31, 30, 31, 30, 31])[month - 1]
     return np.asarray(days + (leap & (month == 2)))

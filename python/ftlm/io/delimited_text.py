@@ -1,4 +1,4 @@
-"""Reads columns of numbers from text, refusing whatever it cannot be sure of."""
+"""Text files with separated columns: encoding, rows, columns of numbers, and errors with line and column."""
 
 from __future__ import annotations
 
@@ -15,37 +15,37 @@ from typing import BinaryIO
 import numpy as np
 import numpy.typing as npt
 
-from ftlm.data.export import LONGEST_HEADER, header_of_line
+from ftlm.data.export import MAX_HEADER_BYTES, header_of_line
 from ftlm.errors import DataError
 from ftlm.io.cell_parsing import (
     DECIMAL_COMMA,
-    Moments,
-    behind_a_stroke,
-    grouping,
+    Timestamps,
+    detect_thousands_separator,
     is_gap,
-    is_moment,
     is_number,
+    is_timestamp,
     may_group,
-    number,
-    split,
-    stated_unit,
+    parse_number,
+    split_cells,
+    split_slash_unit,
+    split_unit,
 )
-from ftlm.io.dialect import SEPARATOR_WORDS, Assumption, Found, Layout, find_table
+from ftlm.io.dialect import SEPARATOR_WORDS, Assumption, Layout, TableDialect, find_table
 from ftlm.io.table import Column, FileTable
 from ftlm.utils.validation import bad_rows
 
-_BLOCK = 8 << 20
-#: What is looked at before the rest is read in one go: so many characters, and at least so many lines.
-_SAMPLE, _SAMPLE_LINES = 1 << 16, 8
+_BLOCK_BYTES = 8 << 20
+#: Size of the sample for the layout detection: characters, and minimum number of lines.
+_SAMPLE_CHARACTERS, _MIN_SAMPLE_LINES = 1 << 16, 8
 _UTF16 = (codecs.BOM_UTF16_LE, codecs.BOM_UTF16_BE)
 _UTF32 = (codecs.BOM_UTF32_LE, codecs.BOM_UTF32_BE)
-_LARGEST_UNPACKED = 1 << 30
-_FILL = "fill or remove these rows yourself, or let them be missing with missing='weight' or missing='hold'"
+_MAX_UNPACKED_BYTES = 1 << 30
+_FILL_HINT = "fill or remove these rows yourself, or let them be missing with missing='weight' or missing='hold'"
 
 
 @dataclass
-class _Trouble:
-    """Cells of one column that are not numbers."""
+class _BadCells:
+    """Cells of one column that are not numbers, for the error message."""
 
     line: int
     row: int
@@ -64,11 +64,11 @@ class _Trouble:
         way_out = "correct or remove these rows"
         if not text:
             what = "empty cell" + (", or one with an error or a formula that nobody computed" if self.sheet else "")
-            way_out = _FILL
+            way_out = _FILL_HINT
         elif is_gap(text):
             what = f"{shown} stands for no number"
-            way_out = _FILL
-        elif (mark := grouping(text, comma=self.comma)) is not None:
+            way_out = _FILL_HINT
+        elif (mark := detect_thousands_separator(text, comma=self.comma)) is not None:
             what = f"{shown} has marks between thousands"
             way_out = f"say layout=dict(thousands={mark!r}), or write all numbers without"
         elif self.comma and "." in text and is_number(text):
@@ -83,7 +83,9 @@ class _Trouble:
             what = f"{shown} and {self.other!r} are dates or times of day written in two ways"
             way_out = "write all alike"
         elif self.moments:
-            what = f"{shown} stands among numbers" if is_moment(text) else f"{shown} stands among dates or times of day"
+            what = (
+                f"{shown} stands among numbers" if is_timestamp(text) else f"{shown} stands among dates or times of day"
+            )
         else:
             what = f"{shown} is not a number"
         return bad_rows(thing, what, self.row, self.count, way_out)
@@ -91,36 +93,36 @@ class _Trouble:
 
 @dataclass
 class _Rows:
-    """What the blocks of a text hold so far."""
+    """Rows parsed so far, with invalid cells and timestamps by column."""
 
-    found: Found
+    found: TableDialect
     sheet: bool = False
     count: int = 0
     ragged: int = 0
     ragged_line: int = 0
     ragged_cells: list[str] = field(default_factory=list)
     blocks: list[npt.NDArray[np.float64]] = field(default_factory=list)
-    troubles: dict[int, _Trouble] = field(default_factory=dict)
-    moments: dict[int, list[Moments]] = field(default_factory=dict)
+    bad_cells: dict[int, _BadCells] = field(default_factory=dict)
+    moments: dict[int, list[Timestamps]] = field(default_factory=dict)
 
 
 def read_text(path: Path, layout: Layout) -> FileTable:
-    """Read the columns of one text file, packed by gzip or not."""
+    """Read the columns of one text file, optionally compressed by gzip."""
     try:
         with open(path, "rb") as stream:
             if path.suffix.lower() != ".gz" and stream.read(2) != b"\x1f\x8b":
                 stream.seek(0)
                 return parse_text(path, stream, layout)
             stream.seek(0)
-            return _unpacked(path, stream, layout)
+            return _read_gzip(path, stream, layout)
     except OSError as error:
         raise DataError(f"{str(path)!r} cannot be read ({error.strerror}); check its permissions") from None
 
 
-def _unpacked(path: Path, packed: BinaryIO, layout: Layout) -> FileTable:
+def _read_gzip(path: Path, packed: BinaryIO, layout: Layout) -> FileTable:
     try:
         with gzip.GzipFile(fileobj=packed) as stream:
-            table = parse_text(path, _Limited(path, stream), layout)
+            table = parse_text(path, _SizeLimitedStream(path, stream), layout)
     except (OSError, EOFError, zlib.error) as error:
         raise DataError(
             f"{path.name}: damaged file: it cannot be unpacked ({str(error)[:100]}); get an intact copy"
@@ -128,16 +130,16 @@ def _unpacked(path: Path, packed: BinaryIO, layout: Layout) -> FileTable:
     return replace(table, kind=f"{table.kind}, packed by gzip")
 
 
-class _Limited:
-    """A stream that refuses to give more bytes than a file may have."""
+class _SizeLimitedStream:
+    """Stream that raises when it exceeds the size limit."""
 
     def __init__(self, path: Path, stream: gzip.GzipFile) -> None:
         self._path, self._stream = path, stream
 
     def read(self, size: int) -> bytes:
-        if self._stream.tell() > _LARGEST_UNPACKED:
+        if self._stream.tell() > _MAX_UNPACKED_BYTES:
             raise DataError(
-                f"{self._path.name}: unpacked, it has more than {_LARGEST_UNPACKED} bytes; split the record or lower "
+                f"{self._path.name}: unpacked, it has more than {_MAX_UNPACKED_BYTES} bytes; split the record or lower "
                 "its rate"
             )
         return self._stream.read(size)
@@ -149,15 +151,17 @@ class _Limited:
         return self._stream.seek(place)
 
 
-def parse_text(path: Path, stream: BinaryIO | _Limited, layout: Layout, sheet: str | None = None) -> FileTable:
-    """Read the columns of text: of a file, or of a sheet whose rows are lines and whose cells stand between tabs."""
+def parse_text(
+    path: Path, stream: BinaryIO | _SizeLimitedStream, layout: Layout, sheet: str | None = None
+) -> FileTable:
+    """Parse the columns of a text file, or of a sheet given as tab-separated lines."""
     source = path.name if sheet is None else f"{path.name}, sheet {sheet!r}"
-    header = header_of_line(path, stream.readline(LONGEST_HEADER)) if sheet is None else None
+    header = header_of_line(path, stream.readline(MAX_HEADER_BYTES)) if sheet is None else None
     stream.seek(0)
     encoding, guessed = _encoding(stream, layout, path)
     stream.seek(0)
     blocks = _line_blocks(path, stream, encoding)
-    # Of sheets, no cell begins a remark.
+    # Sheets have no comment lines.
     mark = "#" if sheet is None else "\0"
     begun, sample, remark = _sample(blocks, layout, mark)
     if not sample:
@@ -166,7 +170,7 @@ def parse_text(path: Path, stream: BinaryIO | _Limited, layout: Layout, sheet: s
     found = _with_gaps(found, begun, sample, layout, sheet=sheet is not None)
     rows = _Rows(found, sheet is not None)
     for first, lines in itertools.chain(begun, blocks):
-        _take(rows, first, lines, mark, source)
+        _read_block(rows, first, lines, mark, source)
     columns = _columns(rows, path, source)
     what = Layout(sheet=sheet) if sheet is not None else Layout(encoding=encoding)
     if sheet is not None:
@@ -179,9 +183,14 @@ def parse_text(path: Path, stream: BinaryIO | _Limited, layout: Layout, sheet: s
 
 
 def _with_gaps(
-    found: Found, begun: list[tuple[int, list[str]]], sample: list[tuple[int, str]], layout: Layout, *, sheet: bool
-) -> Found:
-    """The table with the rows of empty cells that stand right below its names; a sheet's are said and left out."""
+    found: TableDialect,
+    begun: list[tuple[int, list[str]]],
+    sample: list[tuple[int, str]],
+    layout: Layout,
+    *,
+    sheet: bool,
+) -> TableDialect:
+    """Account for empty rows right below the header: kept in text, skipped with a note in sheets."""
     if found.separator != "\t" or found.names is None:
         return found
     above = max((at for at, _ in sample if at < found.begin), default=0)
@@ -202,7 +211,7 @@ def _with_gaps(
 
 
 def _with_remark(assumption: Assumption, remark: str, width: int) -> Assumption:
-    """What was assumed of names, with a remark above the rows that may hold them, as NumPy writes it."""
+    """Extend the assumption on missing names if a comment above the rows has as many words as columns."""
     words = remark.lstrip("# \t").replace(",", " ").split()
     if assumption.option != "header" or len(words) != width or any(map(is_number, words)):
         return assumption
@@ -212,60 +221,60 @@ def _with_remark(assumption: Assumption, remark: str, width: int) -> Assumption:
 def _sample(
     blocks: Iterator[tuple[int, list[str]]], layout: Layout, mark: str
 ) -> tuple[list[tuple[int, list[str]]], list[tuple[int, str]], str]:
-    """The blocks that have begun, the first lines of the text that hold something, and the remark above them."""
+    """Return the blocks read so far, the first lines with content, and the comment above them."""
     begun: list[tuple[int, list[str]]] = []
     sample: list[tuple[int, str]] = []
     size, remark = 0, ""
     for first, lines in blocks:
         begun.append((first, lines))
         for at, line in enumerate(lines, first):
-            if size > _SAMPLE and len(sample) >= _SAMPLE_LINES:
+            if size > _SAMPLE_CHARACTERS and len(sample) >= _MIN_SAMPLE_LINES:
                 break
             if not sample and line.lstrip()[:1] == mark:
                 remark = line[:400]
-            if _holds(line, mark):
+            if _has_content(line, mark):
                 sample.append((at, line))
                 size += len(line) if at > (layout.skip or 0) else 0
-        if size > _SAMPLE and len(sample) >= _SAMPLE_LINES:
+        if size > _SAMPLE_CHARACTERS and len(sample) >= _MIN_SAMPLE_LINES:
             break
     return begun, sample, remark
 
 
-def _holds(line: str, mark: str) -> bool:
+def _has_content(line: str, mark: str) -> bool:
     begun = line.lstrip()
     return bool(begun) and begun[0] != mark
 
 
-def _take(rows: _Rows, first: int, lines: list[str], mark: str, source: str) -> None:
-    """Read the rows of one block."""
+def _read_block(rows: _Rows, first: int, lines: list[str], mark: str, source: str) -> None:
+    """Parse the rows of one block."""
     found = rows.found
     kept = []
     for at, line in enumerate(lines, first):
-        # Between tabs, a row of empty cells is a gap and no blank line.
+        # With tabs, a line of empty cells is a row of missing values, not a blank line.
         gap = found.separator == "\t" and "\t" in line and not line.strip()
-        if at >= found.begin and (gap or _holds(line, mark)):
+        if at >= found.begin and (gap or _has_content(line, mark)):
             kept.append((at, line))
         elif at >= found.begin and line.lstrip()[:1] == mark:
             _check_remark(line, at, found, source)
     if not kept:
         return
-    cells = split([line for _, line in kept], found.separator, source, kept[0][0])
+    cells = split_cells([line for _, line in kept], found.separator, source, kept[0][0])
     wrong = [index for index, row in enumerate(cells) if len(row) != found.width]
     if wrong:
         if not rows.ragged:
             rows.ragged_line, rows.ragged_cells = kept[wrong[0]][0], cells[wrong[0]]
         rows.ragged += len(wrong)
     if not rows.ragged:
-        # Python's numbers may have underscores between their digits, those of files have not.
+        # float() accepts underscores between digits; numbers in files must not have them.
         plain = not found.comma and found.mark is None and not any("_" in line for _, line in kept)
         rows.blocks.append(_numbers(rows, cells, [at for at, _ in kept], plain=plain))
     rows.count += len(cells)
 
 
-def _check_remark(line: str, at: int, found: Found, source: str) -> None:
-    """Refuse a line among the rows that may be a remark or a row whose first cell is one like #N/A."""
+def _check_remark(line: str, at: int, found: TableDialect, source: str) -> None:
+    """Raise if a line among the rows may be a comment as well as a row that begins with #N/A."""
     cells = line.split(found.separator)
-    numbers = any(is_number(cell, comma=found.comma, mark=found.mark) or is_moment(cell) for cell in cells)
+    numbers = any(is_number(cell, comma=found.comma, mark=found.mark) or is_timestamp(cell) for cell in cells)
     error = len(cells) == 1 and cells[0].strip().endswith(("!", "?", "/A"))
     if len(cells) == found.width and (found.width > 1 or error) and (numbers or error or found.separator is not None):
         raise DataError(
@@ -277,15 +286,15 @@ def _check_remark(line: str, at: int, found: Found, source: str) -> None:
 def _columns(rows: _Rows, path: Path, source: str) -> list[Column]:
     found = rows.found
     if rows.ragged:
-        raise _ragged(rows, source)
+        raise _ragged_rows_error(rows, source)
     if rows.count == 0:
         raise DataError(f"{source}: a header and no rows; choose a file that holds a record")
     values = np.concatenate(rows.blocks).T.copy() if len(rows.blocks) > 1 else rows.blocks[0].T.copy()
     names = found.names if found.names is not None else [f"c{index + 1}" for index in range(found.width)]
     columns = []
     for k, (name, column) in enumerate(zip(names, values, strict=True)):
-        trouble, pieces = rows.troubles.get(k), rows.moments.get(k)
-        moments = None if pieces is None else Moments.joined(pieces)
+        trouble, pieces = rows.bad_cells.get(k), rows.moments.get(k)
+        moments = None if pieces is None else Timestamps.concatenate(pieces)
         problem = None if trouble is None else trouble.error(name, source)
         if pieces is not None and (moments is None or moments.clock.size != rows.count):
             problem = problem or DataError(
@@ -300,13 +309,13 @@ def _columns(rows: _Rows, path: Path, source: str) -> list[Column]:
                 rows.count,
                 "name it with time=, or choose another column",
             )
-        unit = (found.units[k] if found.units is not None else "") or stated_unit(name)[1] or behind_a_stroke(name)[1]
+        unit = (found.units[k] if found.units is not None else "") or split_unit(name)[1] or split_slash_unit(name)[1]
         blank = trouble is not None and trouble.blank
-        columns.append(Column(name, name, path, column, problem, blank=blank, moments=moments, stated=unit))
+        columns.append(Column(name, name, path, column, problem, blank=blank, timestamps=moments, stated=unit))
     return columns
 
 
-def _ragged(rows: _Rows, source: str) -> DataError:
+def _ragged_rows_error(rows: _Rows, source: str) -> DataError:
     found = rows.found
     first = "line of names" if found.names is not None else "first row"
     others = [
@@ -325,11 +334,11 @@ def _ragged(rows: _Rows, source: str) -> DataError:
     )
 
 
-def _encoding(stream: BinaryIO | _Limited, layout: Layout, path: Path) -> tuple[str, tuple[Assumption, ...]]:
-    """How the bytes of a text stand for characters: as told, by its mark, by its zeros, else UTF-8 where they are."""
+def _encoding(stream: BinaryIO | _SizeLimitedStream, layout: Layout, path: Path) -> tuple[str, tuple[Assumption, ...]]:
+    """Return the encoding of a text: given, by byte-order mark, by zero bytes, UTF-8, else cp1252 or latin-1."""
     if layout.encoding is not None:
         return layout.encoding, ()
-    head = stream.read(LONGEST_HEADER)
+    head = stream.read(MAX_HEADER_BYTES)
     if head.startswith(_UTF32):
         return "utf-32", ()
     if head.startswith(_UTF16):
@@ -361,18 +370,18 @@ def _encoding(stream: BinaryIO | _Limited, layout: Layout, path: Path) -> tuple[
     return "utf-8", ()
 
 
-def _line_blocks(path: Path, stream: BinaryIO | _Limited, encoding: str) -> Iterator[tuple[int, list[str]]]:
-    """Yield the number of a first line and the lines from there, a few megabytes at a time."""
+def _line_blocks(path: Path, stream: BinaryIO | _SizeLimitedStream, encoding: str) -> Iterator[tuple[int, list[str]]]:
+    """Yield blocks of lines, a few megabytes each, with the number of their first line."""
     decoder = codecs.getincrementaldecoder("utf-8-sig" if encoding == "utf-8" else encoding)()
     carry, number_, newline = "", 1, ""
     while True:
-        block = stream.read(_BLOCK)
+        block = stream.read(_BLOCK_BYTES)
         try:
             data = carry + decoder.decode(block, final=not block)
         except UnicodeError as error:
             raise _undecodable(path, error, number_ + carry.count("\n"), encoding) from None
         if not block:
-            # What old programs end a text with.
+            # Old programs end a text with Ctrl-Z.
             data = data.removesuffix("\x1a")
         if not newline:
             newline = "\r" if "\r" in data and "\n" not in data else "\n" if data else ""
@@ -383,8 +392,8 @@ def _line_blocks(path: Path, stream: BinaryIO | _Limited, encoding: str) -> Iter
                 "or is damaged; pass a csv, text or .mat file"
             )
         cut = data.rfind(newline) + 1 if block and newline else len(data) if not block else 0
-        if cut == 0 and len(data) > _BLOCK:
-            raise DataError(f"{path.name}: line {number_} is longer than {_BLOCK} bytes; pass a csv or text file")
+        if cut == 0 and len(data) > _BLOCK_BYTES:
+            raise DataError(f"{path.name}: line {number_} is longer than {_BLOCK_BYTES} bytes; pass a csv or text file")
         if cut:
             lines = data[:cut].split(newline)
             yield number_, lines
@@ -406,7 +415,7 @@ def _undecodable(path: Path, error: UnicodeError, line: int, encoding: str) -> D
 
 def _numbers(rows: _Rows, cells: list[list[str]], lines: list[int], *, plain: bool) -> npt.NDArray[np.float64]:
     width = len(cells[0])
-    careful = functools.partial(number, comma=rows.found.comma, mark=rows.found.mark)
+    careful = functools.partial(parse_number, comma=rows.found.comma, mark=rows.found.mark)
     value: Callable[[str], float] = float if plain else careful
     try:
         flat = np.fromiter(map(value, itertools.chain.from_iterable(cells)), dtype=np.float64, count=len(cells) * width)
@@ -425,29 +434,31 @@ def _numbers(rows: _Rows, cells: list[list[str]], lines: list[int], *, plain: bo
 
 
 def _not_numbers(rows: _Rows, index: int, column: list[str], lines: list[int], values: npt.NDArray[np.float64]) -> None:
-    """Keep moments of a column, or which of its cells are none and no numbers."""
+    """Store a column of timestamps, or its cells that are neither numbers nor timestamps."""
     comma, mark = rows.found.comma, rows.found.mark
-    if is_moment(column[0]) and rows.count == sum(m.clock.size for m in rows.moments.get(index, [])):
-        moments = Moments.read(column)
+    if is_timestamp(column[0]) and rows.count == sum(m.clock.size for m in rows.moments.get(index, [])):
+        moments = Timestamps.read(column)
         if moments is not None:
             rows.moments.setdefault(index, []).append(moments)
             return
     bad = [row for row, cell in enumerate(column) if not is_number(cell, comma=comma, mark=mark)]
-    dated = [row for row in bad if is_moment(column[row])]
+    dated = [row for row in bad if is_timestamp(column[row])]
     if dated and 2 * len(dated) > len(column):
-        # Among dates it is the numbers that are wrong.
-        bad = [row for row in range(len(column)) if not is_moment(column[row])] or bad
-    # Where all are moments, the first that is written otherwise than the first of all.
-    ways = [row for row in bad if Moments.read([column[0], column[row]]) is None] if len(dated) == len(column) else []
+        # In a column of mostly dates, the numbers are the invalid cells.
+        bad = [row for row in range(len(column)) if not is_timestamp(column[row])] or bad
+    # If all cells are timestamps, report the first one with another notation.
+    ways = (
+        [row for row in bad if Timestamps.read([column[0], column[row]]) is None] if len(dated) == len(column) else []
+    )
     bad = ways or bad
-    # What says nothing beside what says something wrong is not what is to be told of.
+    # Report invalid texts rather than empty cells.
     bad = [row for row in bad if not is_gap(column[row])] or bad
     blank = all(is_gap(column[row]) for row in bad)
     if blank and not dated:
-        values[:, index] = [np.nan if is_gap(cell) else number(cell, comma=comma, mark=mark) for cell in column]
-    known = rows.troubles.get(index)
+        values[:, index] = [np.nan if is_gap(cell) else parse_number(cell, comma=comma, mark=mark) for cell in column]
+    known = rows.bad_cells.get(index)
     if known is None:
-        rows.troubles[index] = _Trouble(
+        rows.bad_cells[index] = _BadCells(
             lines[bad[0]],
             rows.count + bad[0],
             column[bad[0]],

@@ -1,4 +1,4 @@
-"""How a file is laid out: what a person says of it, what is found, and what is said of what was found."""
+"""Layout of text files: detection of separator, decimal mark and header, and the user's `Layout`."""
 
 from __future__ import annotations
 
@@ -10,50 +10,57 @@ from dataclasses import dataclass, fields, replace
 from typing import Any
 
 from ftlm.errors import DataError
-from ftlm.io.cell_parsing import DECIMAL_COMMA, grouping, is_moment, is_number, is_unit, split, unit_of
-from ftlm.utils.validation import listed, nearest, whole_number
+from ftlm.io.cell_parsing import (
+    DECIMAL_COMMA,
+    detect_thousands_separator,
+    is_number,
+    is_timestamp,
+    is_unit,
+    split_cells,
+    unit_of,
+)
+from ftlm.utils.validation import join_names, nearest, whole_number
 
-#: Words for what separates cells; None is white space.
-SEPARATORS: dict[str, str | None] = {"semicolon": ";", "tab": "\t", "comma": ",", "space": None}
-DECIMALS = {"point": ".", "comma": ","}
-GROUPS: dict[str, str | None] = {"none": "", "point": ".", "comma": ",", "space": None, "apostrophe": "'"}
-DATES = ("ymd", "dmy", "mdy")
-#: What spreadsheets leave open of it, and other files.
-OF_SHEETS, OF_TEXT = (
+#: Cell separators by name; None means any white space.
+SEPARATOR_CHARACTERS: dict[str, str | None] = {"semicolon": ";", "tab": "\t", "comma": ",", "space": None}
+DECIMAL_CHARACTERS = {"point": ".", "comma": ","}
+THOUSANDS_CHARACTERS: dict[str, str | None] = {"none": "", "point": ".", "comma": ",", "space": None, "apostrophe": "'"}
+DATE_ORDERS = ("ymd", "dmy", "mdy")
+#: Layout options that apply to sheets and to text files.
+SHEET_OPTIONS, TEXT_OPTIONS = (
     ("skip", "header", "dates", "sheet"),
     ("encoding", "separator", "decimal", "thousands", "skip", "header", "dates"),
 )
-_MOST_LINES = 1 << 40
+_MAX_SKIPPED_LINES = 1 << 40
 
 
 @dataclass(frozen=True)
 class Layout:
-    """How the cells of a text file or of a sheet are written; what is None is found from the file, and said.
+    """Layout of a text file or sheet; options that are None are detected and reported as assumptions.
 
     Parameters
     ----------
     encoding : str, optional
-        Of text: a name that Python knows, such as ``"utf-8"``, ``"cp1252"``, ``"utf-16"``.
+        Text encoding known to Python, such as ``"utf-8"``, ``"cp1252"``, ``"utf-16"``.
     separator : {"comma", "semicolon", "tab", "space"}, optional
-        What stands between the cells of text; the character itself will do. ``"space"`` is any white space.
+        Separator of cells in text, by name or as the character itself. ``"space"`` means any white space.
     decimal : {"point", "comma"}, optional
-        What stands between whole numbers and their decimals in text.
+        Decimal mark in text.
     thousands : {"none", "point", "comma", "space", "apostrophe"}, optional
-        What groups the thousands of numbers in text; found only where decimals stand behind a group, as in
-        ``1.234,5``.
+        Thousands separator in text; detected only if decimals make it unambiguous, as in ``1.234,5``.
     skip : int, optional
-        Lines (rows of a sheet) above the table, header not counted.
+        Number of lines (rows of a sheet) above the table, without its header.
     header : {0, 1, 2}, optional
-        Lines of the table's header: none, names, names and units.
+        Number of header lines: none, names, names and units.
     dates : {"ymd", "dmy", "mdy"}, optional
-        Order of day and month where dates leave it open.
+        Order of day and month if the dates are ambiguous.
     sheet : str, optional
         Sheet of a workbook.
 
     Raises
     ------
     DataError
-        A value that is none of these.
+        An option with an invalid value.
     """
 
     encoding: str | None = None
@@ -66,7 +73,11 @@ class Layout:
     sheet: str | None = None
 
     def __post_init__(self) -> None:
-        for option, known in (("separator", SEPARATORS), ("decimal", DECIMALS), ("thousands", GROUPS)):
+        for option, known in (
+            ("separator", SEPARATOR_CHARACTERS),
+            ("decimal", DECIMAL_CHARACTERS),
+            ("thousands", THOUSANDS_CHARACTERS),
+        ):
             given = getattr(self, option)
             if given is not None:
                 object.__setattr__(self, option, _word(option, given, known))
@@ -76,9 +87,9 @@ class Layout:
             raise DataError(f"layout=: thousands and decimal are both a {self.decimal}; say which of them it is")
         if self.separator == self.thousands == "space":
             raise DataError("layout=: separator and thousands are both a space; cells could not be told apart")
-        if self.dates is not None and self.dates not in DATES:
-            raise DataError(f"layout=: dates is {self.dates!r}; the known orders are {listed(DATES)}")
-        for option, most in (("skip", _MOST_LINES), ("header", 2)):
+        if self.dates is not None and self.dates not in DATE_ORDERS:
+            raise DataError(f"layout=: dates is {self.dates!r}; the known orders are {join_names(DATE_ORDERS)}")
+        for option, most in (("skip", _MAX_SKIPPED_LINES), ("header", 2)):
             given = getattr(self, option)
             count = None if given is None else whole_number(given)
             if given is not None and (count is None or not 0 <= count <= most):
@@ -92,7 +103,7 @@ class Layout:
 
     @classmethod
     def of(cls, given: object) -> Layout:
-        """Take what a person gave: nothing, a layout, or a mapping of its fields."""
+        """Build a layout from an argument: None, a layout, or a mapping of its fields."""
         if given is None:
             return cls()
         if isinstance(given, Layout):
@@ -102,19 +113,21 @@ class Layout:
         known = [f.name for f in fields(cls)]
         for key in given:
             if key not in known:
-                raise DataError(f"layout=: {key!r} is unknown{nearest(key, known)}; the known keys are {listed(known)}")
+                raise DataError(
+                    f"layout=: {key!r} is unknown{nearest(key, known)}; the known keys are {join_names(known)}"
+                )
         return cls(**given)
 
     def under(self, other: Layout) -> Layout:
-        """Return this layout where the other one says nothing."""
+        """Merge two layouts; options of the other one take precedence."""
         return replace(self, **other.to_dict())
 
     def to_dict(self) -> dict[str, Any]:
-        """What it says, by key."""
+        """Return the options that are set, by name."""
         return {f.name: getattr(self, f.name) for f in fields(self) if getattr(self, f.name) is not None}
 
     def check_used(self, path: str, kind: str, used: tuple[str, ...]) -> None:
-        """Refuse what a kind of file has no use for."""
+        """Raise if an option is set that this file format does not use."""
         unused = [option for option in self.to_dict() if option not in used]
         if unused:
             raise DataError(f"{path}: layout=: {unused[0]!r} is not used with {kind}; leave it out")
@@ -122,20 +135,20 @@ class Layout:
 
 @dataclass(frozen=True)
 class Assumption:
-    """One thing that a file does not say and that was taken for it.
+    """Assumption made on reading a file that does not state an option itself.
 
     Parameters
     ----------
     option : str
-        The option of :class:`ftlm.Layout` or argument of :func:`ftlm.load` that says it.
+        Option of :class:`ftlm.Layout` or argument of :func:`ftlm.load` that sets it explicitly.
     value : str or int
-        What was taken.
+        Value that was assumed.
     words : str
-        What was seen.
+        Evidence in the file, as text.
     otherwise : str
-        How to say something else.
+        How to override the assumption.
     counts : bool
-        Whether numbers, or which rows there are, depend on it and the file decided it: the run says so.
+        Whether values or rows depend on it; the warnings of the run then list it.
     """
 
     option: str
@@ -149,18 +162,18 @@ class Assumption:
 
 
 def _word(option: str, given: object, known: Mapping[str, str | None]) -> str:
-    """The word for what a person gave as a word or as the character itself."""
+    """Return the name of an option value given by name or as the character itself."""
     if isinstance(given, str):
         if given in known:
             return given
         for word, character in known.items():
             if given == (" " if character is None else character) or (character == "\t" and given == "\\t"):
                 return word
-    raise DataError(f"layout=: {option} is {given!r}; the known ones are {listed(known)}")
+    raise DataError(f"layout=: {option} is {given!r}; the known ones are {join_names(known)}")
 
 
 def _encoding(given: object) -> str:
-    """The name of an encoding of text, as Python writes it."""
+    """Return Python's canonical name of a text encoding."""
     try:
         if not isinstance(given, str):
             raise LookupError
@@ -173,35 +186,35 @@ def _encoding(given: object) -> str:
     return name
 
 
-_WORDS = {character: word for word, character in SEPARATORS.items()}
+_WORDS_BY_SEPARATOR = {character: word for word, character in SEPARATOR_CHARACTERS.items()}
 SEPARATOR_WORDS: dict[str | None, str] = {";": "semicolon", "\t": "tab", ",": "comma", None: "white space"}
-_ORDER = (";", "\t", ",", None)
-_THOUSANDS = re.compile(r"[+-]?[1-9]\d{0,2}(?:,\d{3})+")
-_PAIRS = re.compile(r"\s*[+-]?\d+,\d+(?:,\s+[+-]?\d+,\d+)+\s*")
-#: What LabVIEW puts above the cells of remarks that few rows have.
-_REMARKS = "comment"
-#: What oscilloscopes call the unit of a column that counts rows.
-_COUNTED = "sequence"
+_SEPARATOR_CANDIDATES = (";", "\t", ",", None)
+_COMMA_THOUSANDS_PATTERN = re.compile(r"[+-]?[1-9]\d{0,2}(?:,\d{3})+")
+_COMMA_PAIRS_PATTERN = re.compile(r"\s*[+-]?\d+,\d+(?:,\s+[+-]?\d+,\d+)+\s*")
+#: Column name of the sparse comment column in LabVIEW files.
+_COMMENT_COLUMN_NAME = "comment"
+#: Unit of the row counter in oscilloscope files.
+_ROW_INDEX_UNIT = "sequence"
 
 
 @dataclass(frozen=True)
-class Found:
-    """The table of a text.
+class TableDialect:
+    """Dialect and position of a table in a text: separators, header, first row and assumptions.
 
     Parameters
     ----------
     separator, comma, mark
-        Between cells, whether decimals follow a comma, and what groups thousands.
+        Cell separator, whether the decimal mark is a comma, and thousands separator.
     names, units
-        Of its columns; None where it has no header.
+        Names and units of the columns; None without a header.
     begin
-        Number of the line of its first row.
+        Line number of the first row.
     width
-        Cells a row.
+        Number of cells per row.
     layout
-        All of that as a person would say it.
+        The same as a :class:`Layout`.
     assumed
-        What was not said and taken for granted.
+        Assumptions made on detection.
     """
 
     separator: str | None
@@ -218,7 +231,7 @@ class Found:
 
 @dataclass(frozen=True)
 class _Line:
-    """One line of the sample, cut in one way."""
+    """Line of the sample, split by one candidate dialect."""
 
     at: int
     cells: list[str]
@@ -231,43 +244,43 @@ class _Line:
 
     @property
     def count(self) -> int:
-        """Cells that hold a number or a moment."""
+        """Number of cells with a number or a timestamp."""
         return sum(self.numbers)
 
     @property
-    def full(self) -> bool:
+    def has_only_numbers(self) -> bool:
         return self.words == 0 and self.count > 0
 
     @property
-    def good(self) -> bool:
-        """Whether it may be a row: numbers, and not more words than they."""
+    def is_row_candidate(self) -> bool:
+        """Whether the line may be a row: it has numbers, and no more words than numbers."""
         return self.count > 0 and self.count >= self.words
 
     @property
-    def named(self) -> bool:
+    def has_only_words(self) -> bool:
         return self.words > 0 and self.count == 0
 
 
-def find_table(lines: Sequence[tuple[int, str]], given: Layout, source: str, *, own: bool, sheet: bool) -> Found:
-    """Find the table that begins in the first lines of a text.
+def find_table(lines: Sequence[tuple[int, str]], given: Layout, source: str, *, own: bool, sheet: bool) -> TableDialect:
+    """Detect the table in the first lines of a text.
 
     Parameters
     ----------
     lines
-        Numbers of lines and lines, blank ones and comments left out; at least one.
+        Pairs of line number and line, without blank lines and comments; at least one.
     given
-        What a person says; the rest is found.
+        Layout given by the user; other options are detected.
     source
-        What errors call the file.
+        Name of the file in error messages.
     own
-        A file of ftlm's own: commas, decimal points, one line of names.
+        Whether ftlm wrote the file: commas, decimal points, one line of names.
     sheet
-        Rows of a sheet, cells between tabs.
+        Whether the lines are rows of a sheet, with tabs between cells.
 
     Raises
     ------
     DataError
-        Nothing that could be a row, or more than one way to read it.
+        No row of numbers, or an ambiguous layout.
     """
     if own:
         given = Layout(separator="comma", decimal="point", thousands="none", skip=0, header=1).under(given)
@@ -276,12 +289,12 @@ def find_table(lines: Sequence[tuple[int, str]], given: Layout, source: str, *, 
     kept = [(at, line) for at, line in lines if at > (given.skip or 0)]
     if not kept:
         raise DataError(f"{source}: no table below the first {given.skip} lines; say another number with layout=")
-    separator, comma, mark, cut = _chosen(kept, given, source)
+    separator, comma, mark, cut = _choose_separator(kept, given, source)
     width = _width(cut)
     first = 0 if given.skip is not None and given.header is not None else _first_row(cut, width)
     top = first if given.skip is None or given.header is None else min(given.header, len(cut))
     names, units, top = _header(cut, top, width, given, source, own=own)
-    layout, assumed = _said(cut, given, separator, comma, mark, names, units, top, first)
+    layout, assumed = _summarize_layout(cut, given, separator, comma, mark, names, units, top, first)
     if given.skip is None:
         _check_above(cut[: top - (0 if names is None else 1 if units is None else 2)], width, source, (comma, mark))
     if not own and names is None and top < len(cut):
@@ -292,40 +305,40 @@ def find_table(lines: Sequence[tuple[int, str]], given: Layout, source: str, *, 
     begin = cut[top].at if top < len(cut) else cut[-1].at + 1
     if names is not None:
         width = len(names)
-    return Found(separator, comma, names, line, units, begin, width, layout, assumed, mark)
+    return TableDialect(separator, comma, names, line, units, begin, width, layout, assumed, mark)
 
 
-def _cut(
+def _split_lines(
     kept: Sequence[tuple[int, str]], separator: str | None, source: str, given: Layout, *, comma: bool
 ) -> tuple[list[_Line], str | None]:
-    """Lines cut into cells, and what groups thousands in them.
+    """Split lines into cells, and detect the thousands separator.
 
-    A line whose quotes cannot be read is cut as it stands; the rows say so later.
+    Quotes are ignored in a line with unbalanced quotes; reading its row raises later.
     """
     cut, parted = [], []
     for at, line in kept:
         try:
-            (cells,) = split([line], separator, source, at)
+            (cells,) = split_cells([line], separator, source, at)
         except DataError:
             cells = line.split(separator)
         parted.append((at, cells))
     mark = None if given.thousands == "none" else given.thousands
     if given.thousands is None:
-        marks = (grouping(cell, comma=comma) for _, cells in parted for cell in cells)
+        marks = (detect_thousands_separator(cell, comma=comma) for _, cells in parted for cell in cells)
         mark = next((found for found in marks if found is not None), None)
     for at, cells in parted:
         there = [bool(cell.strip()) for cell in cells]
         numbers = [
-            full and (is_number(cell, comma=comma, mark=mark) or is_moment(cell))
+            full and (is_number(cell, comma=comma, mark=mark) or is_timestamp(cell))
             for cell, full in zip(cells, there, strict=True)
         ]
         cut.append(_Line(at, cells, numbers, sum(there) - sum(numbers)))
     return cut, mark
 
 
-def _ways(text: str, given: Layout) -> Iterator[tuple[str | None, bool]]:
-    """Separators and decimals that there may be."""
-    for separator in _ORDER if given.separator is None else (SEPARATORS[given.separator],):
+def _dialect_candidates(text: str, given: Layout) -> Iterator[tuple[str | None, bool]]:
+    """Yield candidate pairs of separator and decimal mark."""
+    for separator in _SEPARATOR_CANDIDATES if given.separator is None else (SEPARATOR_CHARACTERS[given.separator],):
         if given.separator is None and separator is not None and separator not in text:
             continue
         for comma in (False, True) if given.decimal is None else (given.decimal == "comma",):
@@ -334,18 +347,18 @@ def _ways(text: str, given: Layout) -> Iterator[tuple[str | None, bool]]:
             yield separator, comma
 
 
-def _chosen(
+def _choose_separator(
     kept: Sequence[tuple[int, str]], given: Layout, source: str
 ) -> tuple[str | None, bool, str | None, list[_Line]]:
-    """The way of cutting under which most lines are rows of one width."""
+    """Choose separator and decimal mark such that most lines are rows of equal width."""
     text = "".join(line for _, line in kept)
     best: tuple[tuple[int, ...], str | None, bool, str | None, list[_Line]] | None = None
-    for separator, comma in _ways(text, given):
-        cut, mark = _cut(kept, separator, source, given, comma=comma)
+    for separator, comma in _dialect_candidates(text, given):
+        cut, mark = _split_lines(kept, separator, source, given, comma=comma)
         if comma and given.decimal is None and _decimal_comma(cut) is None:
             continue
         width = _width(cut)
-        rows = [line for line in cut[_first_row(cut, width) :] if line.width == width and line.good]
+        rows = [line for line in cut[_first_row(cut, width) :] if line.width == width and line.is_row_candidate]
         half = 2 * sum(line.width > 1 for line in cut[:20]) >= len(cut[:20])
         rank = (len(rows), -sum(line.words for line in rows), half and not rows)
         if best is None or rank > best[0]:
@@ -361,13 +374,13 @@ def _chosen(
 
 
 def _decimal_comma(cut: list[_Line]) -> str | None:
-    """The first number with a decimal comma."""
+    """Return the first number with a decimal comma; None if there is none."""
     return next((c.strip() for line in cut for c in line.cells if DECIMAL_COMMA.fullmatch(c.strip())), None)
 
 
 def _width(cut: list[_Line]) -> int:
-    """Cells a row: of most lines that hold numbers alone, else of most that hold numbers, else of the first."""
-    for rows in ([line for line in cut if line.full], [line for line in cut if line.good]):
+    """Most frequent number of cells: of lines with only numbers, else of lines with numbers, else of the first."""
+    for rows in ([line for line in cut if line.has_only_numbers], [line for line in cut if line.is_row_candidate]):
         counts = Counter(line.width for line in rows)
         if counts:
             most = max(counts.values())
@@ -377,89 +390,96 @@ def _width(cut: list[_Line]) -> int:
 
 
 def _first_row(cut: list[_Line], width: int) -> int:
-    """Where the rows begin: the first one that looks like most of them, and damaged ones right above it."""
-    rows = [line for line in cut if line.width == width and line.good]
+    """Index of the first row: the first typical line, preceded by damaged lines of the same width."""
+    rows = [line for line in cut if line.width == width and line.is_row_candidate]
     if not rows:
-        return 1 if cut[0].named else 0
+        return 1 if cut[0].has_only_words else 0
     most = [2 * sum(line.numbers[k] for line in rows) > len(rows) for k in range(width)]
 
-    def alike(line: _Line) -> bool:
+    def is_typical(line: _Line) -> bool:
         return line.width == width and all(n or not m for n, m in zip(line.numbers, most, strict=True))
 
-    first = next((k for k, line in enumerate(cut) if alike(line) and line.count), None)
+    first = next((k for k, line in enumerate(cut) if is_typical(line) and line.count), None)
     if first is None:
         first = next(k for k, line in enumerate(cut) if line is rows[0])
     while first > 0 and cut[first - 1].width == width and cut[first - 1].count:
-        if _above_units(cut, first) or _settings(cut, first - 1):
+        if _is_above_units(cut, first) or _is_settings_line(cut, first - 1):
             break
         first -= 1
-    # Short rows right below a line of names are rows; what is wrong with them is said when all are read.
+    # Short lines right below a header count as rows; reading them raises a specific error later.
     above = first
-    while above > 0 and cut[above - 1].full:
+    while above > 0 and cut[above - 1].has_only_numbers:
         above -= 1
-    return above if above > 0 and cut[above - 1].named and cut[above - 1].width == width else first
+    return above if above > 0 and cut[above - 1].has_only_words and cut[above - 1].width == width else first
 
 
-def _above_units(cut: list[_Line], first: int) -> bool:
-    """Whether the line above is a header although it holds numbers, as of channels 1 and 2: units stand below it."""
-    return first < len(cut) and _units(cut[first])
+def _is_above_units(cut: list[_Line], first: int) -> bool:
+    """Whether the line above is a header with numbers, such as channels 1 and 2, because a line of units follows."""
+    return first < len(cut) and _is_unit_line(cut[first])
 
 
-def _settings(cut: list[_Line], at: int) -> bool:
-    """Whether a line below one of names holds units and settings, as oscilloscopes write start and increment there."""
+def _is_settings_line(cut: list[_Line], at: int) -> bool:
+    """Whether a line below the names holds units and settings, such as start and increment of oscilloscopes."""
     line = cut[at]
     words = [c.strip() for c, n in zip(line.cells, line.numbers, strict=True) if c.strip() and not n]
     units = [word for word in words if is_unit(word)]
     others = {word.casefold() for word in words if not is_unit(word)}
-    # Settings stand in columns of their own; numbers that the row below has too are a row's.
+    # Settings have columns of their own; numbers in columns that the next line fills, too, belong to a row.
     below = cut[at + 1].numbers if at + 1 < len(cut) else []
     row = any(one and other for one, other in zip(line.numbers, below, strict=False))
-    return at > 0 and cut[at - 1].named and line.count > 0 and _measured(units) and others <= {_COUNTED} and not row
+    return (
+        at > 0
+        and cut[at - 1].has_only_words
+        and line.count > 0
+        and _has_unit(units)
+        and others <= {_ROW_INDEX_UNIT}
+        and not row
+    )
 
 
-def _units(line: _Line) -> bool:
+def _is_unit_line(line: _Line) -> bool:
     cells = [cell for cell in line.cells if cell.strip()]
-    return line.named and all(is_unit(cell) for cell in cells) and _measured(cells)
+    return line.has_only_words and all(is_unit(cell) for cell in cells) and _has_unit(cells)
 
 
-def _measured(units: Sequence[str]) -> bool:
-    """Whether one of them is a unit and no mark that also stands for a missing number."""
+def _has_unit(units: Sequence[str]) -> bool:
+    """Whether one of the texts is a unit that is not also a mark for missing values."""
     return any(unit.strip().casefold() not in ("-", "none", "%") for unit in units)
 
 
 def _header(
     cut: list[_Line], top: int, width: int, given: Layout, source: str, *, own: bool
 ) -> tuple[list[str] | None, list[str] | None, int]:
-    """Names and units above the rows, and where the rows begin."""
+    """Return names and units of the header, and the index of the first row."""
     rows = [line for line in cut[top:] if line.width == width]
     spare = bool(rows) and all(not line.cells[-1].strip() for line in rows)
 
-    def fitted(line: _Line) -> list[str]:
-        """Names without a last one that rows leave out, or with one for a last cell that they leave empty."""
+    def fit_names(line: _Line) -> list[str]:
+        """Return the names, adjusted by one at the end to the width of the rows."""
         names = [cell.strip() for cell in line.cells]
-        if len(names) == width + 1 and names[-1].casefold() in ("", _REMARKS):
+        if len(names) == width + 1 and names[-1].casefold() in ("", _COMMENT_COLUMN_NAME):
             return names[:-1]
         return [*names, ""] if spare and len(names) == width - 1 else names
 
     count = given.header
     if count is None:
         count = 0
-        units_above = top > 1 and (_units(cut[top - 1]) or _settings(cut, top - 1))
-        if top > 0 and (cut[top - 1].named or own or units_above):
+        units_above = top > 1 and (_is_unit_line(cut[top - 1]) or _is_settings_line(cut, top - 1))
+        if top > 0 and (cut[top - 1].has_only_words or own or units_above):
             count = 1
-            if units_above and len(fitted(cut[top - 2])) == width and cut[top - 2].words:
+            if units_above and len(fit_names(cut[top - 2])) == width and cut[top - 2].words:
                 count = 2
-            elif len(fitted(cut[top - 1])) != width and top > 1:
+            elif len(fit_names(cut[top - 1])) != width and top > 1:
                 count = 0
     if count > top and given.skip is None and count < len(cut):
-        # Names that are numbers look like a row.
+        # A header of numbers looks like a row.
         top = count
     if count > top:
         raise DataError(f"{source}: layout= says {count} lines of header, and {top} stand above the rows; say fewer")
     if count == 0:
         return None, None, top
     line = cut[top - count]
-    names = fitted(line)
+    names = fit_names(line)
     if not own and count == 1 and line.count and given.header is None:
         raise _mixed_line(line, source)
     commas = [cell for cell in names if DECIMAL_COMMA.fullmatch(cell)]
@@ -477,7 +497,7 @@ def _header(
 
 
 def check_distinct(names: list[str], at: int, source: str) -> None:
-    """Refuse a name of a header that is there twice."""
+    """Raise if a column name is repeated."""
     times = Counter(names)
     for name in names:
         if name and times[name] > 1:
@@ -487,15 +507,19 @@ def check_distinct(names: list[str], at: int, source: str) -> None:
 
 
 def _check_headless(line: _Line, source: str, given: Layout) -> None:
-    """Refuse words among the numbers of a first row: it could be a header as well."""
+    """Raise if the first row mixes words and numbers and could be a header."""
     if line.words and given.header is None:
         raise _mixed_line(line, source)
 
 
 def _check_above(above: list[_Line], width: int, source: str, marks: tuple[bool, str | None]) -> None:
-    """Refuse to leave out what may be rows: lines of several numbers and nothing else."""
+    """Raise if lines of numbers above the table would be skipped."""
     comma, mark = marks
-    rows = [line for line in above if line.full and sum(is_number(c, comma=comma, mark=mark) for c in line.cells) > 1]
+    rows = [
+        line
+        for line in above
+        if line.has_only_numbers and sum(is_number(c, comma=comma, mark=mark) for c in line.cells) > 1
+    ]
     if rows:
         raise DataError(
             f"{source}: line {rows[0].at} has {rows[0].width} numbers, {len(rows)} such lines in all, and stands above "
@@ -519,12 +543,12 @@ def _mixed_line(line: _Line, source: str) -> DataError:
 
 
 def _check_commas(kept: Sequence[tuple[int, str]], cut: list[_Line], source: str) -> None:
-    """Refuse commas that may be separators or decimals: pairs of them with spaces between, one of whole numbers."""
-    rows = [(line, text) for line, (_, text) in zip(cut, kept, strict=True) if line.full]
+    """Raise if commas may be separators as well as decimal marks."""
+    rows = [(line, text) for line, (_, text) in zip(cut, kept, strict=True) if line.has_only_numbers]
     if not rows:
         return
-    pairs = all(_PAIRS.fullmatch(text) for _, text in rows)
-    single = not any(line.named and line.width == 2 for line in cut) and all(
+    pairs = all(_COMMA_PAIRS_PATTERN.fullmatch(text) for _, text in rows)
+    single = not any(line.has_only_words and line.width == 2 for line in cut) and all(
         line.width == 2 and all(cell.strip().lstrip("+-").isdecimal() for cell in line.cells) for line, _ in rows
     )
     if pairs or single:
@@ -536,14 +560,14 @@ def _check_commas(kept: Sequence[tuple[int, str]], cut: list[_Line], source: str
 
 
 def _check_thousands(cut: list[_Line], source: str) -> None:
-    """Refuse commas that may group thousands: three digits behind every one."""
+    """Raise if every comma is followed by three digits and may be a thousands separator."""
     cells = [
         (line.at, cell.strip())
         for line in cut
         for cell, n in zip(line.cells, line.numbers, strict=True)
-        if n and "," in cell and not is_moment(cell)
+        if n and "," in cell and not is_timestamp(cell)
     ]
-    if cells and all(_THOUSANDS.fullmatch(cell) for _, cell in cells):
+    if cells and all(_COMMA_THOUSANDS_PATTERN.fullmatch(cell) for _, cell in cells):
         at, shown = cells[0]
         raise DataError(
             f"{source}: line {at}: the comma of {shown!r} may stand before decimals or group thousands, as in every "
@@ -552,7 +576,7 @@ def _check_thousands(cut: list[_Line], source: str) -> None:
 
 
 def _check_mixed(cut: list[_Line], top: int, separator: str | None, comma: bool, source: str) -> None:
-    """Refuse a second separator that header and rows share: decimals would not stand in the names, too."""
+    """Raise if header and rows share commas as a second separator, which decimal commas would not explain."""
     if not comma or separator is None:
         return
     header = cut[top - 1]
@@ -560,11 +584,12 @@ def _check_mixed(cut: list[_Line], top: int, separator: str | None, comma: bool,
     if len(both[0]) > header.width and len(both) > 1 and len({len(cells) for cells in both}) == 1:
         raise DataError(
             f"{source}: line {header.at} and the rows below it have commas and {SEPARATOR_WORDS[separator]}s between "
-            f"their cells; write one separator, or say layout=dict(separator={_WORDS[separator]!r}, decimal='comma')"
+            f"their cells; write one separator, or say layout=dict(separator={_WORDS_BY_SEPARATOR[separator]!r}, "
+            "decimal='comma')"
         )
 
 
-def _said(
+def _summarize_layout(
     cut: list[_Line],
     given: Layout,
     separator: str | None,
@@ -575,12 +600,16 @@ def _said(
     top: int,
     first: int,
 ) -> tuple[Layout, tuple[Assumption, ...]]:
-    """The layout, and what of it nobody said."""
+    """Return the detected layout and the assumptions in it."""
     header = 0 if names is None else 2 if units is not None else 1
     start = top - header
     skip = given.skip if given.skip is not None else 0 if start == 0 else cut[start].at - 1 if start < len(cut) else 0
     layout = Layout(
-        separator=_WORDS[separator], decimal="comma" if comma else "point", thousands=mark, skip=skip, header=header
+        separator=_WORDS_BY_SEPARATOR[separator],
+        decimal="comma" if comma else "point",
+        thousands=mark,
+        skip=skip,
+        header=header,
     ).under(given)
     assumed = []
     if given.separator is None:
@@ -591,7 +620,9 @@ def _said(
         words, otherwise = f"decimal commas, as in {shown!r}", "layout=dict(decimal='point')"
         assumed.append(Assumption("decimal", "comma", words, otherwise))
     if given.thousands is None and mark is not None:
-        shown = next(c.strip() for line in cut for c in line.cells if grouping(c, comma=comma) == mark)
+        shown = next(
+            c.strip() for line in cut for c in line.cells if detect_thousands_separator(c, comma=comma) == mark
+        )
         words = f"{mark}s group thousands, as in {shown!r}"
         assumed.append(Assumption("thousands", mark, words, "layout=dict(thousands='none')"))
     if given.skip is None and skip:

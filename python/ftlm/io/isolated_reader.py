@@ -1,4 +1,4 @@
-"""Reads binary files in a process of its own, which they may crash."""
+"""Parent side of the isolated binary reader: runs the binary reader in a separate process and parses its output."""
 
 from __future__ import annotations
 
@@ -17,77 +17,77 @@ import numpy.typing as npt
 
 from ftlm.data.export import Header
 from ftlm.errors import DataError
-from ftlm.io.cell_parsing import Moments
+from ftlm.io.cell_parsing import Timestamps
 from ftlm.io.delimited_text import parse_text
 from ftlm.io.dialect import Assumption, Layout
 from ftlm.io.table import Column, FileTable
 from ftlm.utils.validation import bad_rows
 
-_READER = Path(__file__).with_name("binary_reader.py")
-_READER_SECONDS = 60.0
+_READER_PATH = Path(__file__).with_name("binary_reader.py")
+_READER_TIMEOUT_S = 60.0
 
 
 @dataclass(frozen=True)
-class Apart:
-    """A kind of file that is read in a process of its own.
+class BinaryFormat:
+    """Binary file format that is read in a separate process.
 
     Parameters
     ----------
     kind
-        What the reader calls it.
+        Name of the format in the reader.
     suffixes
-        How its files end.
+        File name extensions.
     package, extra
-        What reads it, and the extra of ftlm that installs that; "" where NumPy does.
-    words, again
-        What errors call it, and how it is saved again.
-    sheets
-        Whether it holds sheets of cells, which are laid out like text.
+        Python package that reads the format, and the extra of ftlm that installs it; "" if NumPy suffices.
+    label, repair_hint
+        Name of the format in error messages, and how to save such a file again.
+    has_sheets
+        Whether the file consists of sheets, whose cells are parsed like delimited text.
     """
 
     kind: str
     suffixes: tuple[str, ...]
     package: str
     extra: str
-    words: str
-    again: str
-    sheets: bool = False
+    label: str
+    repair_hint: str
+    has_sheets: bool = False
 
 
-_SAVE = "save it again with save('FILE.mat', '-v7')"
-MATLAB = Apart("mat", (".mat",), "scipy", "mat", ".mat", _SAVE)
-MATLAB_73 = Apart("hdf5", (), "h5py", "hdf5", ".mat (version 7.3)", _SAVE)
-HDF5 = Apart("hdf5", (".h5", ".hdf5", ".hdf", ".he5"), "h5py", "hdf5", "HDF5", "save it again")
-PARQUET = Apart("parquet", (".parquet", ".pq"), "pyarrow", "parquet", "parquet", "save it again")
-FEATHER = Apart("feather", (".feather", ".arrow"), "pyarrow", "parquet", "feather", "save it again")
-NUMPY = Apart("numpy", (".npz", ".npy"), "numpy", "", "NumPy", "save it again")
-SHEETS = Apart(
+_MATLAB_REPAIR_HINT = "save it again with save('FILE.mat', '-v7')"
+MATLAB_FORMAT = BinaryFormat("mat", (".mat",), "scipy", "mat", ".mat", _MATLAB_REPAIR_HINT)
+MATLAB_73_FORMAT = BinaryFormat("hdf5", (), "h5py", "hdf5", ".mat (version 7.3)", _MATLAB_REPAIR_HINT)
+HDF5_FORMAT = BinaryFormat("hdf5", (".h5", ".hdf5", ".hdf", ".he5"), "h5py", "hdf5", "HDF5", "save it again")
+PARQUET_FORMAT = BinaryFormat("parquet", (".parquet", ".pq"), "pyarrow", "parquet", "parquet", "save it again")
+FEATHER_FORMAT = BinaryFormat("feather", (".feather", ".arrow"), "pyarrow", "parquet", "feather", "save it again")
+NUMPY_FORMAT = BinaryFormat("numpy", (".npz", ".npy"), "numpy", "", "NumPy", "save it again")
+SPREADSHEET_FORMAT = BinaryFormat(
     "sheet",
     (".xlsx", ".xlsm", ".xlsb", ".xls", ".ods"),
     "python_calamine",
     "excel",
     "sheet",
     "save it again",
-    sheets=True,
+    has_sheets=True,
 )
-KINDS = (MATLAB, HDF5, PARQUET, FEATHER, NUMPY, SHEETS)
+BINARY_FORMATS = (MATLAB_FORMAT, HDF5_FORMAT, PARQUET_FORMAT, FEATHER_FORMAT, NUMPY_FORMAT, SPREADSHEET_FORMAT)
 _HDF5_MARK = b"\x89HDF\r\n\x1a\n"
 
 
-def kind_of(path: Path) -> Apart | None:
-    """Which kind of binary file a path is, by its ending; None for text."""
+def binary_format_of(path: Path) -> BinaryFormat | None:
+    """Return the binary format of a path by its extension; None for text."""
     suffixes = [suffix.lower() for suffix in path.suffixes[-2:]]
     if suffixes and suffixes[-1] == ".gz":
-        inner = next((kind for kind in KINDS if suffixes[0] in kind.suffixes), None)
+        inner = next((kind for kind in BINARY_FORMATS if suffixes[0] in kind.suffixes), None)
         if inner is not None:
-            raise DataError(f"{str(path)!r}: {inner.words} files are read unpacked; unpack it with gunzip")
+            raise DataError(f"{str(path)!r}: {inner.label} files are read unpacked; unpack it with gunzip")
         return None
-    found = next((kind for kind in KINDS if suffixes and suffixes[-1] in kind.suffixes), None)
-    return MATLAB_73 if found is MATLAB and _is_hdf5(path) else found
+    found = next((kind for kind in BINARY_FORMATS if suffixes and suffixes[-1] in kind.suffixes), None)
+    return MATLAB_73_FORMAT if found is MATLAB_FORMAT and _is_hdf5(path) else found
 
 
 def _is_hdf5(path: Path) -> bool:
-    """Whether a file holds what MATLAB writes since version 7.3."""
+    """Whether a file is a MATLAB file of version 7.3 (HDF5)."""
     try:
         with open(path, "rb") as stream:
             head = stream.read(520)
@@ -96,44 +96,44 @@ def _is_hdf5(path: Path) -> bool:
     return head.startswith(b"MATLAB 7.3 MAT-file") or _HDF5_MARK in (head[:8], head[512:520])
 
 
-def read_apart(paths: list[Path], kind: Apart, layout: Layout) -> list[FileTable]:
-    """Read files of one kind; a crash of the reader is the fault of the first file that it did not answer for."""
+def read_isolated(paths: list[Path], kind: BinaryFormat, layout: Layout) -> list[FileTable]:
+    """Read files of one format in a separate process; a crash is attributed to the first unanswered file."""
     folders = []
     for package in dict.fromkeys(("numpy", kind.package)):
         spec = importlib.util.find_spec(package)
         if spec is None or not spec.submodule_search_locations:
             raise DataError(
-                f"{str(paths[0])!r}: reading {kind.words} files needs {package.replace('_', '-')}; run: pip install "
+                f"{str(paths[0])!r}: reading {kind.label} files needs {package.replace('_', '-')}; run: pip install "
                 f"'ftlm[{kind.extra}]'"
             )
         folders.append(str(Path(next(iter(spec.submodule_search_locations))).resolve().parent))
     files = [str(path.resolve()) for path in paths]
     told = json.dumps({"folders": folders, "sheet": layout.sheet})
-    command = [sys.executable, "-I", str(_READER), kind.kind, told, *files]
+    command = [sys.executable, "-I", str(_READER_PATH), kind.kind, told, *files]
     try:
         done = subprocess.run(
-            command, stdin=subprocess.DEVNULL, capture_output=True, timeout=_READER_SECONDS, check=False
+            command, stdin=subprocess.DEVNULL, capture_output=True, timeout=_READER_TIMEOUT_S, check=False
         )
     except subprocess.TimeoutExpired as stopped:
-        answers = _Answers(stopped.stdout or b"")
-        path = paths[min(answers.complete(len(paths)), len(paths) - 1)]
-        raise _damaged(path, f"did not finish in {_READER_SECONDS:g} s", kind) from None
+        answers = _ReaderOutput(stopped.stdout or b"")
+        path = paths[min(answers.count_complete(len(paths)), len(paths) - 1)]
+        raise _damaged_file_error(path, f"did not finish in {_READER_TIMEOUT_S:g} s", kind) from None
     except OSError as error:
         raise DataError(
             f"{str(paths[0])!r}: Python could not be started to read it ({error.strerror}); check the installation"
         ) from None
-    answers = _Answers(done.stdout)
+    answers = _ReaderOutput(done.stdout)
     tables = []
     for path in paths:
         table = answers.table(path, layout)
         if table is None:
-            raise _damaged(path, _ending(done.returncode), kind)
-        tables.append(table if table.kind else replace(table, kind=kind.words))
+            raise _damaged_file_error(path, _describe_exit(done.returncode), kind)
+        tables.append(table if table.kind else replace(table, kind=kind.label))
     return tables
 
 
-def _ending(code: int) -> str:
-    """How the reader ended."""
+def _describe_exit(code: int) -> str:
+    """Describe the exit of the reader process."""
     if code >= 0:
         return "ended too early" if code == 0 else f"ended with code {code}"
     try:
@@ -142,19 +142,19 @@ def _ending(code: int) -> str:
         return f"crashed (signal {-code})"
 
 
-def _damaged(path: Path, how: str, kind: Apart) -> DataError:
-    return DataError(f"{str(path)!r}: damaged file: the reader {how}; get an intact copy or {kind.again}")
+def _damaged_file_error(path: Path, how: str, kind: BinaryFormat) -> DataError:
+    return DataError(f"{str(path)!r}: damaged file: the reader {how}; get an intact copy or {kind.repair_hint}")
 
 
-class _Answers:
-    """What the reader wrote, taken apart with care: it may have died at any byte."""
+class _ReaderOutput:
+    """Parser of the reader's output, which may be truncated at any byte."""
 
     def __init__(self, content: bytes) -> None:
         self._content = content
         self._at = 0
 
-    def complete(self, most: int) -> int:
-        """Return how many files were answered for."""
+    def count_complete(self, most: int) -> int:
+        """Count the files with a complete answer."""
         count = 0
         while count < most and self._next() is not None:
             count += 1
@@ -195,7 +195,7 @@ class _Answers:
         return header, arrays, cells
 
     def table(self, path: Path, layout: Layout) -> FileTable | None:
-        """Return the next file's columns, or None when the reader did not get that far."""
+        """Return the table of the next file; None if its answer is missing or incomplete."""
         answer = self._next()
         if answer is None:
             return None
@@ -215,7 +215,7 @@ class _Answers:
 
 
 def _sheet(path: Path, header: dict[str, object], cells: bytes, layout: Layout) -> FileTable:
-    """The table of a sheet, whose cells came as text between tabs."""
+    """Parse the cells of a sheet, sent as tab-separated text."""
     sheet = str(header["sheet"])
     table = parse_text(path, io.BytesIO(cells), layout, sheet)
     others = header.get("others")
@@ -228,7 +228,7 @@ def _sheet(path: Path, header: dict[str, object], cells: bytes, layout: Layout) 
 
 @dataclass(frozen=True)
 class _Array:
-    """One array of a file: numbers by column, or nanoseconds since a moment."""
+    """Array of a file: numbers in columns, or nanoseconds since a reference time."""
 
     name: str
     kind: str
@@ -238,13 +238,13 @@ class _Array:
 
 
 def _columns(path: Path, array: _Array) -> list[Column]:
-    """Return a vector as a column under its name, a matrix as columns under its name and their numbers."""
+    """Return the columns of an array: a vector under its name, a matrix under its name and column numbers."""
     name, matrix = array.name, array.matrix
-    # The time of a single-precision file is exact to its own digits only, which the step must know.
+    # Keep single precision: the step detection needs the true resolution of the times.
     with np.errstate(over="ignore"):  # what overflows is no single; it is refused as infinite
         values = matrix.astype(np.float32) if array.kind == "single" else matrix
     if array.since is not None:
-        return [_moments(path, array)]
+        return [_timestamp_column(path, array)]
     if 1 in matrix.shape:
         return [Column(name, name, path, values.ravel(order="F"), stated=array.unit)]
     rows, count = matrix.shape
@@ -257,8 +257,8 @@ def _columns(path: Path, array: _Array) -> list[Column]:
     return [Column(name, f"{name}.{k + 1}", path, values[:, k], matrix=name) for k in range(count)]
 
 
-def _moments(path: Path, array: _Array) -> Column:
-    """A column of dates."""
+def _timestamp_column(path: Path, array: _Array) -> Column:
+    """Build the column of an array of dates."""
     since, name = array.since or 0, array.name
     values = array.matrix.ravel(order="F")
     thing, gone = f"{path.name}: column {name!r}", np.isnan(values)
@@ -267,8 +267,8 @@ def _moments(path: Path, array: _Array) -> Column:
         problem = bad_rows(thing, "no date", int(rows[0]), rows.size, "remove or fill these rows yourself")
         return Column(name, name, path, None, problem)
     first = str(np.datetime64(since, "ns")) if abs(since) < 1 << 63 else "a date"
-    moments = Moments(np.zeros((values.size, 3), np.int64), "", np.clip(values, -9e18, 9e18).astype(np.int64), first)
+    moments = Timestamps(np.zeros((values.size, 3), np.int64), "", np.clip(values, -9e18, 9e18).astype(np.int64), first)
     problem = bad_rows(
         thing, f"dates, not numbers ({first})", 0, values.size, "name it with time=, or choose another column"
     )
-    return Column(name, name, path, values, problem, moments=moments)
+    return Column(name, name, path, values, problem, timestamps=moments)

@@ -1,4 +1,4 @@
-"""Loads one measured experiment from the files that programs write, refusing whatever it cannot be sure of."""
+"""Loading of runs from files, with column selection; ambiguous files raise an error."""
 
 from __future__ import annotations
 
@@ -10,28 +10,28 @@ from dataclasses import dataclass, replace
 from pathlib import Path
 from typing import TypeAlias, cast
 
-from ftlm.data.construction import Asked
-from ftlm.data.export import LONGEST_HEADER, Header
-from ftlm.data.run import Run, built
-from ftlm.data.sampling import Missing, checked_missing
-from ftlm.data.units import header_time, time_unit_of
+from ftlm.data.construction import RunArguments
+from ftlm.data.export import MAX_HEADER_BYTES, Header
+from ftlm.data.run import Run, build_run
+from ftlm.data.sampling import MissingPolicy, check_missing_policy
+from ftlm.data.units import split_time_header, time_unit_of
 from ftlm.errors import DataError
-from ftlm.io.cell_parsing import stated_unit
+from ftlm.io.cell_parsing import split_unit
 from ftlm.io.delimited_text import read_text
-from ftlm.io.dialect import OF_SHEETS, OF_TEXT, Layout
-from ftlm.io.isolated_reader import kind_of, read_apart
-from ftlm.io.table import Column, FileTable, Pool, order_of_dates
-from ftlm.utils.files import LOG
-from ftlm.utils.validation import CSV_TIME, as_mapping, is_run_name, listed, names_to_columns, nearest
+from ftlm.io.dialect import SHEET_OPTIONS, TEXT_OPTIONS, Layout
+from ftlm.io.isolated_reader import binary_format_of, read_isolated
+from ftlm.io.table import Column, FileTable, Pool, date_order_assumption
+from ftlm.utils.files import PACKAGE_LOGGER
+from ftlm.utils.validation import CSV_TIME, as_mapping, is_run_name, join_names, names_to_columns, nearest
 
 PathLike: TypeAlias = str | os.PathLike[str]
-_SIZE_LIMIT = 1 << 30
+_MAX_FILE_BYTES = 1 << 30
 _COLUMN_KEYS = ("time", "step", "inputs", "outputs", "units", "intersample", "layout")
 
 
 @dataclass
-class Wanted:
-    """Which columns of which layout the caller wants, from the arguments, the columns file and ftlm's own header."""
+class ColumnSelection:
+    """Selection of columns and layout, from the arguments, the columns file and the ftlm header."""
 
     time: Hashable | None
     step: float | None
@@ -59,55 +59,52 @@ def load(
     missing: str | None = None,
     layout: Layout | Mapping[str, object] | None = None,
 ) -> Run:
-    """Load one run from a file of text, a sheet or arrays, or from several files that hold its columns.
+    """Load one run from a text, spreadsheet or array file, or from several files with its columns.
 
     Parameters
     ----------
     path : path or sequence of paths
-        Text, packed by gzip or not; ``.xlsx``, ``.xls``, ``.ods``; ``.mat``, ``.h5``, ``.npz``, ``.npy``; ``.parquet``,
-        ``.feather``. Of text and of sheets, `layout` says what is above the table and how its cells are written, or it
-        is found: comma, semicolon, tab or white space between cells, decimal points or commas, a header of names, a
-        line of units, dates. What could be read in two ways is refused; what was taken for granted and could change
-        numbers stands in the run's `warnings`, with what says otherwise. Lines that begin with ``#`` are skipped.
-        Without a header the columns are c1, c2, …
+        Text, optionally compressed by gzip; ``.xlsx``, ``.xls``, ``.ods``; ``.mat``, ``.h5``, ``.npz``, ``.npy``;
+        ``.parquet``, ``.feather``. The layout of text and sheets is given by `layout` or detected: comma, semicolon,
+        tab or white space between cells, decimal points or commas, a line of names, a line of units, dates. Ambiguous
+        files raise an error. Assumptions that affect values are listed in the `warnings` of the run, with the option
+        that overrides them. Lines that begin with ``#`` are skipped. Without a header the columns are c1, c2, …
         The columns of a matrix V are V.1, V.2, … (or ``V(:,1)``), a vector keeps its name; samples are in rows.
-        Columns of several files are pooled; a name that is in two of them is prefixed by its file, ``STEM/V.3``.
+        Columns of several files are pooled; a name in two files is prefixed by its file, ``STEM/V.3``.
     time : str or int, optional
-        Column of the time, by name or, in a single text file, by position from 0. Without `time` and `step`, a text
-        file's column called t, time or seconds (any case), alone or with a unit as in ``time [ms]``, ``time (ms)``,
-        ``time/ms`` or ``t_ms``, is taken, a .mat file's vector of such a name; else (said in the run's `warnings`) one
-        that other programs call so, such as Timestamp or Zeit, the only one that holds dates, or a first one with a
-        unit of time; or else the first column of every matrix in use, which must all agree. Dates and times of day
-        count from the first row on.
+        Time column, by name or, in a single text file, by position from 0. Without `time` and `step`, the column
+        called t, time or seconds is used (any case, alone or with a unit as in ``time [ms]`` or ``t_ms``). Otherwise,
+        with a warning: a column with a name such as Timestamp or Zeit, the only column of dates, or a first column
+        with a unit of time. Otherwise the first column of every matrix in use; these must be equal. Dates and times of
+        day are converted to seconds since the first row.
     inputs, outputs : mapping of str to column, or list of str, optional
-        Columns by signal name; a list names columns that keep their names. Needed unless `columns` or the file's
-        own ftlm header gives them; at least one output. A column that ends in its unit, ``I (A)``, is found without.
+        Columns by signal name; a list names columns that keep their names. Required unless `columns` or the ftlm
+        header of the file gives them; at least one output. The unit in a name such as ``I (A)`` may be omitted.
     units : mapping of str to str, optional
-        Unit of a signal's numbers, converted to SI. A unit that the file states is not applied by itself:
-        :func:`ftlm.open_file` shows it.
+        Units of signals, converted to SI. Units that the file states are not applied automatically;
+        :func:`ftlm.open_file` shows them.
     columns : mapping or path of a TOML file, optional
         Keys ``time`` or ``step``, tables ``inputs``, ``outputs``, ``units``, ``intersample``, ``layout``; the arguments
         of the same name override or extend it.
     intersample : mapping of str to {"zoh", "foh"}, optional
-        Behaviour of an input between rows; ``"zoh"`` where not given.
+        Intersample behavior of an input; default ``"zoh"``.
     step : float, optional
         Time between rows [s], > 0, in place of `time`.
     slice : pair of float or None, optional
         Use the rows with a ≤ t < b only, [s] since the first row.
     resample : float, optional
-        Put the run on this step [s]: held inputs by the mean of the hold over each new interval, everything else
-        linearly; outputs of irregular rows keep their own times for output error, see `Run.from_arrays`. Recorded in
-        the run's warnings.
+        Resample to this step [s]: interval means of held inputs, linear interpolation of all other signals.
+        Nonuniform outputs keep their own times for the output error, see `Run.from_arrays`. Recorded in the warnings.
     name : str, optional
-        What reports call the run; the first file's name where not given.
+        Name of the run in reports; default the name of the first file.
     time_unit : {"s", "ms", "us", "min", "h"}, optional
-        Unit of the time column; where not given, the one that the column's header states (said in the run's
-        warnings), or else s. A header that states another one is refused; the spacing of the rows is no guess.
+        Unit of the time column; default the unit in its header (with a warning), else s. A contradicting header
+        raises an error. The unit is never guessed from the spacing of the samples.
     missing : {"refuse", "weight", "hold"}, optional
-        What to do about NaN, empty cells and rows that a regular time lacks: see `Run.from_arrays`. Default
-        ``"refuse"``, and ``"weight"`` for a file of ftlm's own that says which outputs were not read throughout.
+        Treatment of NaN, empty cells and missing rows, see `Run.from_arrays`. Default ``"refuse"``, or ``"weight"``
+        for a file written by ftlm with missing outputs.
     layout : Layout or dict, optional
-        How text or a sheet is laid out, as far as it is to be said: see :class:`ftlm.Layout`.
+        Layout of text or sheets, as far as it cannot be detected; see :class:`ftlm.Layout`.
 
     Returns
     -------
@@ -125,16 +122,16 @@ def load(
     >>> run = load("arm.csv", time="t_s", inputs={"I1": "Im1_meas_A"}, outputs={"theta11": "th11_deg"},
     ...            units={"theta11": "deg"})  # doctest: +SKIP
     """
-    wanted = wanted_of(columns, time, step, inputs, outputs, units, intersample, layout)
-    options = Options(slice, resample, name, time_unit, missing)
-    run = run_from(tables_of(path, wanted.layout), wanted, options)
-    LOG.info("read: %s: %d rows, %s", run.name, run.length, ", ".join(run.signals))
+    wanted = select_columns(columns, time, step, inputs, outputs, units, intersample, layout)
+    options = LoadOptions(slice, resample, name, time_unit, missing)
+    run = run_from_tables(read_tables(path, wanted.layout), wanted, options)
+    PACKAGE_LOGGER.info("read: %s: %d rows, %s", run.name, run.length, ", ".join(run.signals))
     return run
 
 
 @dataclass(frozen=True)
-class Options:
-    """What else is asked of a run, as in :func:`load`, `missing` checked."""
+class LoadOptions:
+    """Further arguments of :func:`load`; validates `missing`."""
 
     window: Sequence[float | None] | None = None
     resample: float | None = None
@@ -143,29 +140,29 @@ class Options:
     missing: str | None = None
 
     def __post_init__(self) -> None:
-        checked_missing(self.missing or "refuse")
+        check_missing_policy(self.missing or "refuse")
 
-    def chosen(self, header: Header | None) -> Missing:
-        """What becomes of gaps: as asked, or as a run of ftlm's own says."""
+    def missing_policy(self, header: Header | None) -> MissingPolicy:
+        """Return the treatment of missing samples: as given, else as the ftlm header implies."""
         if self.missing is None and header is not None and header.missing:
             return "weight"
-        return checked_missing(self.missing or "refuse")
+        return check_missing_policy(self.missing or "refuse")
 
 
-def run_from(tables: list[FileTable], wanted: Wanted, options: Options) -> Run:
-    """Make the run that is wanted of files that have been read."""
+def run_from_tables(tables: list[FileTable], wanted: ColumnSelection, options: LoadOptions) -> Run:
+    """Build the run of selected columns from file tables."""
     header = tables[0].header
-    chosen = options.chosen(header)
+    chosen = options.missing_policy(header)
     if header is not None and len(tables) > 1:
         raise DataError(f"{str(tables[0].path)!r} is a whole run of its own; load it alone")
     if header is not None:
-        _take_header(wanted, header)
+        _apply_header(wanted, header)
     pool = Pool(tables)
-    _check_apart(wanted, pool)
+    _check_disjoint_roles(wanted, pool)
     if not wanted.outputs:
         raise DataError(
             f"no output is named; name the signals with inputs={{name: column}} and outputs={{name: column}}, "
-            f"or in a columns file (commands: -u NAME=COLUMN -y NAME=COLUMN, or --columns FILE); {pool.described()}"
+            f"or in a columns file (commands: -u NAME=COLUMN -y NAME=COLUMN, or --columns FILE); {pool.describe()}"
         )
     labels: dict[str, str] = {}
     used: list[Column] = []
@@ -184,14 +181,14 @@ def run_from(tables: list[FileTable], wanted: Wanted, options: Options) -> Run:
     clock = _clock(wanted, pool, used, options)
     name = options.name
     if name is None:
-        stem = stem_of(tables[0].path)
+        stem = base_name(tables[0].path)
         name = header.name if header is not None else stem if is_run_name(stem) else "run"
     several = len(tables) > 1
     facts = tuple(
         f"{table.path.name}: {a}" if several else str(a) for table in tables for a in table.assumed if a.counts
     )
-    facts += clock.facts
-    asked = Asked(
+    facts += clock.notes
+    asked = RunArguments(
         given_inputs,
         given_outputs,
         step=wanted.step,
@@ -203,55 +200,55 @@ def run_from(tables: list[FileTable], wanted: Wanted, options: Options) -> Run:
         window=options.window,
         time_unit=clock.unit,
         labels=labels,
-        facts=facts,
+        notes=facts,
         time_label=clock.label,
         missing=chosen,
     )
     if header is not None:
         stated = header.step if clock.name == CSV_TIME else None
-        asked = replace(asked, known_step=stated, facts=(*header.warnings, *facts), about=header.about)
-    return built(asked)
+        asked = replace(asked, known_step=stated, notes=(*header.warnings, *facts), metadata=header.about)
+    return build_run(asked)
 
 
 @dataclass(frozen=True)
-class _Clock:
-    """The time of the rows: numbers in a unit, the column that they are from, what errors call it, what is said."""
+class _TimeColumn:
+    """Time column: values, unit, label in error messages, column name, and notes."""
 
     times: object = None
     unit: str = "s"
     label: str = "time"
     name: str | None = None
-    facts: tuple[str, ...] = ()
+    notes: tuple[str, ...] = ()
 
 
-def _clock(wanted: Wanted, pool: Pool, used: list[Column], options: Options) -> _Clock:
+def _clock(wanted: ColumnSelection, pool: Pool, used: list[Column], options: LoadOptions) -> _TimeColumn:
     given = options.time_unit
     if wanted.step is not None:
         if given is not None:
             raise DataError(f"time_unit={given!r} is the unit of time=, which is not used; step= is in s")
-        return _Clock()
+        return _TimeColumn()
     column, assumed = pool.time(wanted.time, used)
     label = f"{column.source.name}: column {column.name!r} (time)"
     facts: tuple[str, ...] = () if assumed is None else (str(assumed),)
-    if column.moments is None:
-        unit, said = time_unit_of(header_of(column), label, given)
-        return _Clock(column.numbers(), unit, label, column.name, facts + said)
+    if column.timestamps is None:
+        unit, said = time_unit_of(time_header(column), label, given)
+        return _TimeColumn(column.numbers(), unit, label, column.name, facts + said)
     if given is not None:
         raise DataError(f"time_unit={given!r} is the unit of numbers, and {label} holds dates or times of day")
-    seconds = column.moments.seconds(label, wanted.layout.dates)
-    order = order_of_dates(column, wanted.layout.dates)
+    seconds = column.timestamps.seconds(label, wanted.layout.dates)
+    order = date_order_assumption(column, wanted.layout.dates)
     facts += () if order is None else (str(order),)
-    facts += (f"time counted from {column.moments.first!r} on",)
-    return _Clock(seconds, "s", label, column.name, facts)
+    facts += (f"time counted from {column.timestamps.first!r} on",)
+    return _TimeColumn(seconds, "s", label, column.name, facts)
 
 
-def stem_of(path: Path) -> str:
-    """What a file is called without the endings that say how it is packed and what it is."""
+def base_name(path: Path) -> str:
+    """Return the file name without its extensions, including ``.gz``."""
     return Path(path.stem).stem if path.suffix.lower() == ".gz" else path.stem
 
 
-def _check_apart(wanted: Wanted, pool: Pool) -> None:
-    """Refuse one column as an input and as an output: the model that explains it says nothing."""
+def _check_disjoint_roles(wanted: ColumnSelection, pool: Pool) -> None:
+    """Raise if a column is both an input and an output; its model would be trivial."""
     driven = {id(pool.find(spec, f"signal {name!r}")): (name, spec) for name, spec in wanted.inputs.items()}
     twice = [
         (driven[id(column)], name)
@@ -266,11 +263,11 @@ def _check_apart(wanted: Wanted, pool: Pool) -> None:
         )
 
 
-def header_of(clock: Column) -> str:
-    """Return what stands above a column of times; the first column of a matrix has no words of its own."""
+def time_header(clock: Column) -> str:
+    """Return the header of a time column, with its unit; ``time`` for the first column of a matrix."""
     if clock.matrix is not None:
         return "time"
-    below = clock.stated and header_time(clock.variable)[1] is None and not stated_unit(clock.variable)[1]
+    below = clock.stated and split_time_header(clock.variable)[1] is None and not split_unit(clock.variable)[1]
     return f"{clock.variable} [{clock.stated}]" if below else clock.variable
 
 
@@ -286,9 +283,9 @@ def _paths(given: PathLike | Sequence[PathLike]) -> list[Path]:
         total += _size(path)
         if any(path.resolve() == other.resolve() for other in paths[:index]):
             raise DataError(f"{str(path)!r} is given twice; give every file once")
-    if total > _SIZE_LIMIT:
+    if total > _MAX_FILE_BYTES:
         raise DataError(
-            f"{listed(map(str, paths))}: {total} bytes, more than the limit of {_SIZE_LIMIT}; "
+            f"{join_names(map(str, paths))}: {total} bytes, more than the limit of {_MAX_FILE_BYTES}; "
             "split the record or lower its rate"
         )
     return paths
@@ -310,36 +307,36 @@ def _size(path: Path) -> int:
     return status.st_size
 
 
-def tables_of(path: PathLike | Sequence[PathLike], layout: Layout) -> list[FileTable]:
-    """Read files as they are, whatever is wanted of them."""
+def read_tables(path: PathLike | Sequence[PathLike], layout: Layout) -> list[FileTable]:
+    """Read the tables of files, independent of the column selection."""
     paths = _paths(path)
     read: dict[Path, FileTable] = {}
-    kinds = {path: kind_of(path) for path in paths}
+    kinds = {path: binary_format_of(path) for path in paths}
     for kind in dict.fromkeys(kinds.values()):
         if kind is not None:
             own = [path for path in paths if kinds[path] is kind]
             for name in own:
-                layout.check_used(repr(name.name), kind.words, OF_SHEETS if kind.sheets else ())
-            read |= dict(zip(own, read_apart(own, kind, layout), strict=True))
+                layout.check_used(repr(name.name), kind.label, SHEET_OPTIONS if kind.has_sheets else ())
+            read |= dict(zip(own, read_isolated(own, kind, layout), strict=True))
     for name in paths:
         if kinds[name] is None:
-            layout.check_used(repr(name.name), "text", OF_TEXT)
+            layout.check_used(repr(name.name), "text", TEXT_OPTIONS)
     return [read[path] if path in read else read_text(path, layout) for path in paths]
 
 
 def column_names(path: PathLike) -> tuple[str, ...] | None:
-    """Names of the columns of one file; None for a run that ftlm wrote, which names its own signals.
+    """Return the column names of one file; None for a run written by ftlm.
 
     Raises
     ------
     DataError
         As :func:`load`.
     """
-    (table,) = tables_of(path, Layout())
+    (table,) = read_tables(path, Layout())
     return None if table.header is not None else Pool([table]).names
 
 
-def wanted_of(
+def select_columns(
     columns: object,
     time: Hashable | None,
     step: object,
@@ -348,8 +345,8 @@ def wanted_of(
     units: object,
     intersample: object,
     layout: object,
-) -> Wanted:
-    """What a person wants, by arguments and by a columns file; the arguments go before."""
+) -> ColumnSelection:
+    """Merge the column selection of the arguments and of a columns file; arguments take precedence."""
     told = _columns_file(columns)
     if time is not None and step is not None:
         raise DataError("time= and step=: both are given; pass one of them")
@@ -357,7 +354,7 @@ def wanted_of(
         time, step = told.get("time"), told.get("step")
         if time is not None and step is not None:
             raise DataError("columns=: both time and step are given; keep one of them")
-    return Wanted(
+    return ColumnSelection(
         time,
         cast("float | None", step),
         names_to_columns("inputs", told.get("inputs")) | names_to_columns("inputs", inputs),
@@ -381,7 +378,7 @@ def _columns_file(columns: object) -> Mapping[str, object]:
     elif isinstance(columns, (str, os.PathLike)):
         path = Path(columns)
         source = repr(str(path))
-        if _size(path) > LONGEST_HEADER:
+        if _size(path) > MAX_HEADER_BYTES:
             raise DataError(f"{source} is too large for a columns file; pass the TOML file that names the columns")
         try:
             told = tomllib.loads(path.read_bytes().decode("utf-8-sig").replace("\r\n", "\n"))
@@ -397,13 +394,13 @@ def _columns_file(columns: object) -> Mapping[str, object]:
     if unknown:
         raise DataError(
             f"{source}: the key {unknown[0]!r} is unknown{nearest(unknown[0], _COLUMN_KEYS)}, {len(unknown)} in all; "
-            f"the known keys are {listed(_COLUMN_KEYS)}"
+            f"the known keys are {join_names(_COLUMN_KEYS)}"
         )
     return told
 
 
-def _take_header(wanted: Wanted, header: Header) -> None:
-    """Fill in what was not asked for from ftlm's own header."""
+def _apply_header(wanted: ColumnSelection, header: Header) -> None:
+    """Complete the column selection by the ftlm header of a file."""
     if wanted.time is None and wanted.step is None:
         wanted.time = CSV_TIME
     if not wanted.inputs and not wanted.outputs:

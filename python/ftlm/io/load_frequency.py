@@ -1,4 +1,4 @@
-"""Frequency responses and impedance spectra from the files that analysers, potentiostats and programs write."""
+"""Loading of frequency responses and impedance spectra from analyzer and potentiostat files."""
 
 from __future__ import annotations
 
@@ -10,15 +10,15 @@ import numpy as np
 
 from ftlm.data.frequency_data import FREQUENCY_UNITS, FrequencyData, frequency_factor
 from ftlm.errors import DataError
-from ftlm.io.cell_parsing import stated_unit
+from ftlm.io.cell_parsing import split_unit
 from ftlm.io.dialect import Layout
-from ftlm.io.load import PathLike, stem_of, tables_of
+from ftlm.io.load import PathLike, base_name, read_tables
 from ftlm.io.table import Column, Pool
-from ftlm.utils.files import LOG
-from ftlm.utils.validation import Complex, Floats, listed, nearest
+from ftlm.utils.files import PACKAGE_LOGGER
+from ftlm.utils.validation import Complex, Floats, join_names, nearest
 
-#: What columns are called, without capitals, spaces and underscores; a minus before it turns its sign.
-_NAMES = {
+#: Column names of each part, case-folded, without spaces and underscores; a leading minus inverts the sign.
+_PART_SYNONYMS = {
     "frequency": (
         "f",
         "freq",
@@ -137,12 +137,12 @@ _NAMES = {
     ),
     "deviation": ("std", "sigma", "σ", "deviation", "stddev", "sd", "stdev", "standarddeviation", "standardabweichung"),
 }
-_ANGULAR = frozenset(("w", "omega", "ω", "angularfrequency", "kreisfrequenz", "rad/s"))
-_MINUS = re.compile(r"^(?:-|−|–|neg|minus)")
-#: The sign of the ohm, which looks like the Greek letter.
+_ANGULAR_FREQUENCY_NAMES = frozenset(("w", "omega", "ω", "angularfrequency", "kreisfrequenz", "rad/s"))
+_MINUS_PREFIX_PATTERN = re.compile(r"^(?:-|−|–|neg|minus)")
+#: Ohm sign, a look-alike of the Greek letter.
 _OHM_SIGN = "\u2126"
-_PREFIX = {"": 1.0, "m": 1e-3, "k": 1e3, "M": 1e6, "µ": 1e-6, "u": 1e-6, "G": 1e9}
-_PHASES = {
+_SI_PREFIX_FACTORS = {"": 1.0, "m": 1e-3, "k": 1e3, "M": 1e6, "µ": 1e-6, "u": 1e-6, "G": 1e9}
+_PHASE_UNIT_FACTORS = {
     "deg": np.pi / 180.0,
     "°": np.pi / 180.0,
     "degree": np.pi / 180.0,
@@ -153,21 +153,21 @@ _PHASES = {
     "radians": 1.0,
     "mrad": 1e-3,
 }
-_RATIO = ("", "1", "-", "abs", "lin", "linear")
-#: No name of a part has so many letters.
-_LONGEST = 60
-#: Magnitude and phase beside real and imaginary part may differ by so much of the size.
-_AGREE = 0.02
+_DIMENSIONLESS_UNITS = ("", "1", "-", "abs", "lin", "linear")
+#: Longer column names are not compared with the names of parts.
+_MAX_PART_NAME_CHARACTERS = 60
+#: Relative tolerance between a magnitude column and real and imaginary part in the same file.
+_MAGNITUDE_TOLERANCE = 0.02
 
 
 @dataclass(frozen=True)
-class _Found:
-    """A column with its part, its unit as written, and whether its name turns the sign."""
+class _ResponseColumn:
+    """Column of a frequency response: part, unit in the file, and whether its name inverts the sign."""
 
     column: Column
     part: str
     unit: str
-    turned: bool
+    is_negated: bool
     word: str
 
 
@@ -189,44 +189,44 @@ def load_frequency(
     Parameters
     ----------
     path
-        Any file that :func:`ftlm.load` reads, with decimal points or commas, a line of units or none.
+        Any file that :func:`ftlm.load` reads.
     columns
         Column by part: ``frequency``; ``real`` and ``imag``, or ``magnitude`` and ``phase``; ``deviation``, the
-        standard deviation of the real and of the imaginary part. By default columns are known by their names:
+        standard deviation of the real and of the imaginary part. By default columns are recognized by their names:
         ``freq``, ``f``, ``omega``; ``Re``, ``Zreal``, ``Z'``; ``Im``, ``Zimag``, ``Z''`` and ``-Z''``, ``-Im(Z)`` (the
-        sign turned); ``|Z|``, ``gain``, ``magnitude``, ``dB``; ``phase``, ``deg``; ``sigma``.
+        sign inverted); ``|Z|``, ``gain``, ``magnitude``, ``dB``; ``phase``, ``deg``; ``sigma``.
     frequency_unit
-        ``"Hz"``, ``"kHz"``, ``"MHz"``, ``"mHz"`` or ``"rad/s"``. Default what the column states, as in ``freq/Hz``,
-        ``f [Hz]``, ``f_Hz``; else rad/s of a column called omega, Hz of others, which is said.
+        ``"Hz"``, ``"kHz"``, ``"MHz"``, ``"mHz"`` or ``"rad/s"``. Default the unit in the column name, ``freq/Hz``,
+        ``f [Hz]``, ``f_Hz``; else, with a warning, rad/s for a column called omega and Hz for others.
     magnitude_unit
-        ``"dB"`` or ``"abs"``; default what the column states, else abs, which is said.
+        ``"dB"`` or ``"abs"``; default the unit of the column, else abs with a warning.
     phase_unit
-        ``"deg"`` or ``"rad"``; default what the column states, else deg, which is said.
+        ``"deg"`` or ``"rad"``; default the unit of the column, else deg with a warning.
     negated
-        Whether the imaginary column (or the phase) holds the negative; default where its name begins with a minus.
+        Whether the imaginary part (or the phase) is negated; default if its name begins with a minus.
     output, input
-        What the response is of and from; left out, those of the only equation that is identified.
+        Names of the output and the input; default those of the only equation that is identified.
     name
-        What reports call it; default the file's name.
+        Name of the data in reports; default the name of the file.
     layout
         See :class:`ftlm.Layout`.
 
     Returns
     -------
     FrequencyData
-        In rad/s, impedances in Ω; what was assumed stands in its `warnings`.
+        Frequencies in rad/s, impedances in Ω; `warnings` lists the assumptions.
 
     Raises
     ------
     DataError
-        A file that cannot be read, columns that cannot be told or hold no numbers, units that are not known,
-        frequencies that are not above 0.
+        A file that cannot be read, columns that are not recognized or have no numbers, unknown units, or frequencies
+        that are not above 0.
     """
-    (table,) = tables_of(path, Layout.of(layout))
+    (table,) = read_tables(path, Layout.of(layout))
     pool = Pool([table])
     if table.header is not None:
         raise DataError(f"{table.path.name} is a run over time that ftlm wrote; load it with ftlm.load")
-    found = _asked(pool, columns) if columns is not None else _known(pool)
+    found = _select_parts(pool, columns) if columns is not None else _find_parts(pool)
     notes = [str(a) for a in table.assumed if a.counts]
     omega = _frequencies(found["frequency"], frequency_unit, notes)
     factor, unit = 1.0, ""
@@ -242,25 +242,25 @@ def load_frequency(
     deviation = None
     if "deviation" in found:
         deviation = factor * found["deviation"].column.numbers().astype(np.float64)
-    label = stem_of(table.path) if name is None else name
-    LOG.info("read: %s: %d frequencies", label, omega.size)
+    label = base_name(table.path) if name is None else name
+    PACKAGE_LOGGER.info("read: %s: %d frequencies", label, omega.size)
     return FrequencyData(omega, response, deviation, output, input, unit, label, tuple(notes))
 
 
 def is_response(pool: Pool) -> bool:
-    """Whether names of columns tell the parts of a frequency response."""
+    """Whether the column names are those of a frequency response."""
     try:
-        _known(pool)
+        _find_parts(pool)
     except DataError:
         return False
     return True
 
 
-def _known(pool: Pool) -> dict[str, _Found]:
-    """Columns by what they are called; two of one part are refused."""
-    found: dict[str, _Found] = {}
+def _find_parts(pool: Pool) -> dict[str, _ResponseColumn]:
+    """Find the parts of a frequency response by column names; raise if a part is ambiguous."""
+    found: dict[str, _ResponseColumn] = {}
     for column in pool.columns:
-        item = _recognised(column)
+        item = _recognize_column(column)
         if item is None:
             continue
         if item.part in found:
@@ -273,24 +273,25 @@ def _known(pool: Pool) -> dict[str, _Found]:
     return found
 
 
-def _asked(pool: Pool, columns: Mapping[str, str | int]) -> dict[str, _Found]:
+def _select_parts(pool: Pool, columns: Mapping[str, str | int]) -> dict[str, _ResponseColumn]:
     if not isinstance(columns, Mapping):
         raise DataError(f"columns is a {type(columns).__name__}; pass a dict of part: column")
     found = {}
     for part, spec in columns.items():
-        if part not in _NAMES:
+        if part not in _PART_SYNONYMS:
             raise DataError(
-                f"{part!r} is no part of a frequency response{nearest(part, _NAMES)}; the parts are {listed(_NAMES)}"
+                f"{part!r} is no part of a frequency response{nearest(part, _PART_SYNONYMS)}; the parts are "
+                f"{join_names(_PART_SYNONYMS)}"
             )
         column = pool.find(spec, part)
-        item = _recognised(column)
-        word, unit = (item.word, item.unit) if item is not None else _parted(column)
-        found[part] = _Found(column, part, unit, item is not None and item.turned, word)
+        item = _recognize_column(column)
+        word, unit = (item.word, item.unit) if item is not None else _split_name_and_unit(column)
+        found[part] = _ResponseColumn(column, part, unit, item is not None and item.is_negated, word)
     _check_parts(found, pool)
     return found
 
 
-def _check_parts(found: Mapping[str, _Found], pool: Pool) -> None:
+def _check_parts(found: Mapping[str, _ResponseColumn], pool: Pool) -> None:
     whole = {"real", "imag"} <= found.keys() or {"magnitude", "phase"} <= found.keys()
     if "frequency" in found and whole:
         return
@@ -299,13 +300,13 @@ def _check_parts(found: Mapping[str, _Found], pool: Pool) -> None:
     raise DataError(
         f"{missing} cannot be told from the names of the columns (known are: {known}); name them with "
         f"columns={{part: column}}, parts frequency, real and imag, or frequency, magnitude and phase; "
-        f"{pool.described()}"
+        f"{pool.describe()}"
     )
 
 
-def _parted(column: Column) -> tuple[str, str]:
-    """A column's name without its unit, and the unit as written: ``freq/Hz``, ``f_Hz``, ``f (Hz)``."""
-    bare, unit = stated_unit(column.written)
+def _split_name_and_unit(column: Column) -> tuple[str, str]:
+    """Split a column name such as ``freq/Hz``, ``f_Hz`` or ``f (Hz)`` into bare name and unit."""
+    bare, unit = split_unit(column.name_with_unit)
     if unit:
         return bare, unit
     bare, unit = column.name.strip(), column.stated
@@ -321,32 +322,34 @@ def _parted(column: Column) -> tuple[str, str]:
 
 
 def _unit_kind(unit: str) -> str | None:
-    """Of what a word is a unit: frequency, phase, size; None where it is none."""
+    """Return the quantity of a unit: ``frequency``, ``phase`` or ``size``; None if unknown."""
     if unit in FREQUENCY_UNITS or unit.casefold() in ("hz", "rad/s", "khz", "rad/sec", "1/s"):
         return "frequency"
-    if unit.casefold() in _PHASES:
+    if unit.casefold() in _PHASE_UNIT_FACTORS:
         return "phase"
     if unit.casefold() in ("db", "abs") or _ohms(unit) is not None:
         return "size"
     return None
 
 
-def _recognised(column: Column) -> _Found | None:
-    """A column by its whole name, as ``Re(Z)`` and ``dB``, or by its name without its unit; None for another one."""
+def _recognize_column(column: Column) -> _ResponseColumn | None:
+    """Recognize a column by its name, with or without unit, such as ``Re(Z)`` or ``dB``; None if unknown."""
     whole, stated = column.name.strip(), column.stated
     own = whole if _unit_kind(whole) else stated if _unit_kind(stated) else ""
-    for text, unit in ((whole, own), _parted(column)):
-        word = re.sub(r"[\s_]", "", text.replace(_OHM_SIGN, "Ω") if len(text) < _LONGEST else "").casefold()
+    for text, unit in ((whole, own), _split_name_and_unit(column)):
+        word = re.sub(
+            r"[\s_]", "", text.replace(_OHM_SIGN, "Ω") if len(text) < _MAX_PART_NAME_CHARACTERS else ""
+        ).casefold()
         word = word.replace('"', "''")
-        bare = _MINUS.sub("", word)
+        bare = _MINUS_PREFIX_PATTERN.sub("", word)
         for name, turned in ((word, False), (bare, True)):
-            part = next((p for p, names in _NAMES.items() if name in names), None)
+            part = next((p for p, names in _PART_SYNONYMS.items() if name in names), None)
             if part is not None:
-                return _Found(column, part, unit, turned, name)
+                return _ResponseColumn(column, part, unit, turned, name)
     return None
 
 
-def _frequencies(item: _Found, asked: str | None, notes: list[str]) -> Floats:
+def _frequencies(item: _ResponseColumn, asked: str | None, notes: list[str]) -> Floats:
     values = item.column.numbers().astype(np.float64)
     stated = item.unit if _unit_kind(item.unit) == "frequency" else ""
     if stated and stated not in FREQUENCY_UNITS:
@@ -366,39 +369,41 @@ def _frequencies(item: _Found, asked: str | None, notes: list[str]) -> Floats:
                 f"column {item.column.name!r} states the unit {item.unit!r}, which is no unit of frequency; say "
                 f"frequency_unit=, one of {', '.join(FREQUENCY_UNITS)}"
             )
-        unit = "rad/s" if item.word in _ANGULAR else "Hz"
+        unit = "rad/s" if item.word in _ANGULAR_FREQUENCY_NAMES else "Hz"
         notes.append(f"frequencies {item.column.name!r} taken for {unit}; otherwise frequency_unit=")
     return values * FREQUENCY_UNITS[unit]
 
 
 def _ohms(unit: str) -> float | None:
-    """Ohms of one unit of an impedance, such as mΩ; None for what is none, and for squares of area."""
+    """Conversion factor of an impedance unit to ohm, such as mΩ; None for other units."""
     text = unit.replace(_OHM_SIGN, "Ω")
     for ending in ("ohm", "Ohm", "OHM", "ohms", "Ohms", "Ω", "ω"):
-        if text.endswith(ending) and text[: -len(ending)] in _PREFIX:
-            return _PREFIX[text[: -len(ending)]]
+        if text.endswith(ending) and text[: -len(ending)] in _SI_PREFIX_FACTORS:
+            return _SI_PREFIX_FACTORS[text[: -len(ending)]]
     return None
 
 
-def _sized(item: _Found) -> tuple[float, str]:
-    """Factor to SI and unit of a size."""
-    if not item.unit or item.unit.casefold() in _RATIO:
+def _magnitude_scale(item: _ResponseColumn) -> tuple[float, str]:
+    """Return the SI factor and unit of a magnitude."""
+    if not item.unit or item.unit.casefold() in _DIMENSIONLESS_UNITS:
         return 1.0, ""
     factor = _ohms(item.unit)
     return (factor, "Ω") if factor is not None else (1.0, item.unit)
 
 
-def _cartesian(found: Mapping[str, _Found], negated: bool | None, notes: list[str]) -> tuple[Complex, float, str]:
+def _cartesian(
+    found: Mapping[str, _ResponseColumn], negated: bool | None, notes: list[str]
+) -> tuple[Complex, float, str]:
     real, imag = found["real"], found["imag"]
-    factor, unit = _sized(real)
-    other, _ = _sized(imag)
-    if (factor, unit) != _sized(imag) and imag.unit and real.unit:
+    factor, unit = _magnitude_scale(real)
+    other, _ = _magnitude_scale(imag)
+    if (factor, unit) != _magnitude_scale(imag) and imag.unit and real.unit:
         raise DataError(
             f"columns {real.column.name!r} and {imag.column.name!r} have the units {real.unit!r} and {imag.unit!r}; "
             "give both in one unit"
         )
     factor = factor if real.unit else other
-    turned = imag.turned if negated is None else _truth("negated", negated)
+    turned = imag.is_negated if negated is None else _truth("negated", negated)
     x, y = (i.column.numbers().astype(np.float64) for i in (real, imag))
     if turned and negated is None:
         notes.append(f"column {imag.column.name!r} holds the negative imaginary part, by its name; otherwise negated=")
@@ -408,11 +413,11 @@ def _cartesian(found: Mapping[str, _Found], negated: bool | None, notes: list[st
             "inductance; if it holds -Z'', say negated=True"
         )
     response: Complex = np.asarray(factor * (x - 1j * y if turned else x + 1j * y), dtype=np.complex128)
-    return response, factor, unit or _sized(imag)[1]
+    return response, factor, unit or _magnitude_scale(imag)[1]
 
 
 def _polar(
-    found: Mapping[str, _Found],
+    found: Mapping[str, _ResponseColumn],
     magnitude_unit: str | None,
     phase_unit: str | None,
     negated: bool | None,
@@ -420,7 +425,7 @@ def _polar(
 ) -> tuple[Complex, float, str]:
     size, angle = found["magnitude"], found["phase"]
     values, phase = (i.column.numbers().astype(np.float64) for i in (size, angle))
-    decibels = _chosen(
+    decibels = _resolve_unit(
         "magnitude",
         size,
         magnitude_unit,
@@ -434,10 +439,10 @@ def _polar(
             "imaginary part, and sizes in dB have another; "
             "give real and imaginary part, or name the others with columns={part: column}"
         )
-    written = _PHASES.get(angle.unit.casefold())
+    written = _PHASE_UNIT_FACTORS.get(angle.unit.casefold())
     stated = None if written is None else "rad" if written == 1.0 else "mrad" if written == 1e-3 else "deg"
-    radians = _PHASES[_chosen("phase", angle, phase_unit, ("deg", "rad", "mrad"), stated, notes)]
-    factor, unit = (1.0, "") if decibels == "dB" else _sized(size)
+    radians = _PHASE_UNIT_FACTORS[_resolve_unit("phase", angle, phase_unit, ("deg", "rad", "mrad"), stated, notes)]
+    factor, unit = (1.0, "") if decibels == "dB" else _magnitude_scale(size)
     if decibels == "dB":
         values = 10.0 ** (values / 20.0)
     elif np.any(values < 0):
@@ -446,21 +451,21 @@ def _polar(
             f"column {size.column.name!r}: a size is negative, first at row {int(np.argmax(bad))}, {int(bad.sum())} in "
             "all; say magnitude_unit='dB' if these are decibels"
         )
-    turned = angle.turned if negated is None else _truth("negated", negated)
+    turned = angle.is_negated if negated is None else _truth("negated", negated)
     if turned and negated is None:
         notes.append(f"column {angle.column.name!r} holds the negative phase, by its name; otherwise negated=")
     response: Complex = factor * values * np.exp((-1j if turned else 1j) * radians * phase)
     return response, factor, unit
 
 
-def _chosen(
-    what: str, item: _Found, asked: str | None, known: tuple[str, ...], stated: str | None, notes: list[str]
+def _resolve_unit(
+    what: str, item: _ResponseColumn, asked: str | None, known: tuple[str, ...], stated: str | None, notes: list[str]
 ) -> str:
-    """The unit that is asked for, stated, or assumed, which is said."""
+    """Return the unit: given by the user, stated by the file, or assumed with a note."""
     if asked is not None:
         if asked not in known:
             hint = nearest(asked, known)
-            raise DataError(f"{what}_unit={asked!r} is unknown{hint}; the known ones are {listed(known)}")
+            raise DataError(f"{what}_unit={asked!r} is unknown{hint}; the known ones are {join_names(known)}")
         if stated is not None and stated != asked:
             raise DataError(
                 f"column {item.column.name!r} states {stated}, and {what}_unit={asked!r} is asked for; leave "
@@ -480,14 +485,14 @@ def _truth(name: str, value: object) -> bool:
     return value
 
 
-def _compare(found: Mapping[str, _Found], response: Complex, notes: list[str]) -> None:
-    """Say that sizes beside real and imaginary part are not used, and refuse those of something else."""
+def _compare(found: Mapping[str, _ResponseColumn], response: Complex, notes: list[str]) -> None:
+    """Compare a redundant magnitude column with real and imaginary part; note a mismatch."""
     item = found["magnitude"]
     if item.unit.casefold() == "db" or item.column.problem is not None:
         return
     own, units = item.column.numbers(), _ohms(item.unit) or 1.0
     scale = (_ohms(found["real"].unit) or 1.0) / units
-    off = np.abs(np.abs(response) * scale - own) > _AGREE * np.abs(own)
+    off = np.abs(np.abs(response) * scale - own) > _MAGNITUDE_TOLERANCE * np.abs(own)
     if np.any(off):
         notes.append(
             f"column {item.column.name!r} is not the size of real and imaginary part, first at row "
@@ -495,6 +500,6 @@ def _compare(found: Mapping[str, _Found], response: Complex, notes: list[str]) -
         )
 
 
-def named(data: FrequencyData, output: str, source: str) -> FrequencyData:
-    """The same record with what it is of and from, where it does not say so itself."""
+def fill_signal_names(data: FrequencyData, output: str, source: str) -> FrequencyData:
+    """Fill in output and input names of frequency data that has none."""
     return replace(data, output=data.output or output, input=data.input or source)

@@ -1,4 +1,4 @@
-"""What the names of columns say of them: inputs, outputs, units, and names that equations can hold."""
+"""Preview of unknown files: columns, units, roles, assumptions and the next command."""
 
 from __future__ import annotations
 
@@ -12,16 +12,25 @@ from typing import Any
 import numpy as np
 
 from ftlm.data.run import Run
-from ftlm.data.units import header_time, spelled_unit
+from ftlm.data.units import parse_unit, split_time_header
 from ftlm.errors import DataError
-from ftlm.io.cell_parsing import stated_unit
+from ftlm.io.cell_parsing import split_unit
 from ftlm.io.dialect import Assumption, Layout
-from ftlm.io.load import Options, PathLike, Wanted, header_of, load, run_from, tables_of, wanted_of
+from ftlm.io.load import (
+    ColumnSelection,
+    LoadOptions,
+    PathLike,
+    load,
+    read_tables,
+    run_from_tables,
+    select_columns,
+    time_header,
+)
 from ftlm.io.load_frequency import is_response
-from ftlm.io.table import Column, FileTable, Pool, order_of_dates
-from ftlm.utils.validation import CSV_TIME, listed
+from ftlm.io.table import Column, FileTable, Pool, date_order_assumption
+from ftlm.utils.validation import CSV_TIME, join_names
 
-_DRIVES = frozenset(
+_INPUT_WORDS = frozenset(
     (
         "u",
         "in",
@@ -53,7 +62,7 @@ _DRIVES = frozenset(
         "throttle",
     )
 )
-_FOLLOWS = frozenset(
+_OUTPUT_WORDS = frozenset(
     (
         "y",
         "out",
@@ -89,24 +98,24 @@ _FOLLOWS = frozenset(
         "tip",
     )
 )
-#: A motor is driven by its voltage, a cell answers with it.
-_EITHER = frozenset(["voltage", "volt", "volts", "spannung", "v"])
-#: Degrees of these are no angles.
-_WARM = frozenset(("temp", "temperature", "temperatur", "heat", "heater", "heating", "thermo"))
+#: Voltage is an input of motors and an output of cells.
+_AMBIGUOUS_WORDS = frozenset(["voltage", "volt", "volts", "spannung", "v"])
+#: Words of temperature columns, whose degrees are no angles.
+_TEMPERATURE_WORDS = frozenset(("temp", "temperature", "temperatur", "heat", "heater", "heating", "thermo"))
 
 
 def _words(column: str) -> set[str]:
-    """The words of a column's name, without its unit, digits and capitals."""
-    bare = re.sub(r"(?<=[a-zäöüß])(?=[A-Z])", " ", stated_unit(column)[0])
+    """Case-folded words of a column name, without unit and digits."""
+    bare = re.sub(r"(?<=[a-zäöüß])(?=[A-Z])", " ", split_unit(column)[0])
     return set(re.split(r"[\W\d_]+", bare.casefold())) - {""}
 
 
-def guessed_roles(columns: Sequence[str]) -> tuple[list[str], list[str]]:
-    """Inputs and outputs among columns by their names; both empty where that leaves anything open."""
+def guess_roles(columns: Sequence[str]) -> tuple[list[str], list[str]]:
+    """Guess inputs and outputs from column names; both are empty if the names are ambiguous."""
     told = {column: _words(column) for column in columns}
-    drives = [c for c, words in told.items() if words & _DRIVES and not words & _FOLLOWS]
-    follows = [c for c, words in told.items() if words & _FOLLOWS and not words & _DRIVES]
-    either = [c for c, words in told.items() if words & _EITHER and c not in drives and c not in follows]
+    drives = [c for c, words in told.items() if words & _INPUT_WORDS and not words & _OUTPUT_WORDS]
+    follows = [c for c, words in told.items() if words & _OUTPUT_WORDS and not words & _INPUT_WORDS]
+    either = [c for c, words in told.items() if words & _AMBIGUOUS_WORDS and c not in drives and c not in follows]
     if either and not drives:
         drives, either = either, []
     rest = [c for c in columns if c not in drives and c not in follows]
@@ -119,17 +128,17 @@ def guessed_roles(columns: Sequence[str]) -> tuple[list[str], list[str]]:
 
 
 def known_unit(stated: str, column: str = "") -> str:
-    """The unit of ftlm that a file's unit is; "" where it is none, or degrees of what may be a temperature."""
-    unit = spelled_unit(stated) or ""
-    return "" if unit in ("deg", "°") and _words(column) & _WARM else unit
+    """Return the ftlm unit of a unit in a file; "" if unknown, or if degrees may mean a temperature."""
+    unit = parse_unit(stated) or ""
+    return "" if unit in ("deg", "°") and _words(column) & _TEMPERATURE_WORDS else unit
 
 
 def signal_names(columns: Mapping[str, str]) -> dict[str, str]:
-    """Names of signals by column, given whether each is an input ("u") or an output ("y")."""
+    """Return valid, unique signal names by column; fallback names are "u" for inputs and "y" for outputs."""
     names: dict[str, str] = {}
     for column, role in columns.items():
-        bare = re.sub(r"\W+", "_", stated_unit(column)[0].rpartition("/")[2]).strip("_")
-        usable = re.fullmatch(r"[^\W\d]\w*", bare) and len(bare) <= 30 and bare.casefold() not in _TAKEN
+        bare = re.sub(r"\W+", "_", split_unit(column)[0].rpartition("/")[2]).strip("_")
+        usable = re.fullmatch(r"[^\W\d]\w*", bare) and len(bare) <= 30 and bare.casefold() not in _RESERVED_NAMES
         name = bare if usable else role
         taken, count = set(names.values()), 1
         while name in taken:
@@ -139,35 +148,35 @@ def signal_names(columns: Mapping[str, str]) -> dict[str, str]:
     return names
 
 
-#: What equations in words use themselves.
-_TAKEN = frozenset(("d", "sign", "sat", "dead", "delay", "alpha", "a0", "b0", "c", CSV_TIME))
+#: Names with a meaning in equation texts.
+_RESERVED_NAMES = frozenset(("d", "sign", "sat", "dead", "delay", "alpha", "a0", "b0", "c", CSV_TIME))
 
 
-_SHOWN = 40
-#: Names of a time that state its unit by themselves.
-_SECONDS = frozenset(("seconds", "second", "sec", "secs", "sekunden"))
-#: What the error of a column says of its first bad cell.
+_MAX_LISTED_COLUMNS = 40
+#: Names of time columns that imply seconds.
+_SECONDS_COLUMN_NAMES = frozenset(("seconds", "second", "sec", "secs", "sekunden"))
+#: Part of a column's error message about its first bad cell.
 _IN_LINE = re.compile(r"line \d+: .*?(?=, first at)")
 
 
 @dataclass(frozen=True)
 class FileColumn:
-    """One column of a file.
+    """Summary of one column of a file.
 
     Parameters
     ----------
     name : str
-        As the file has it.
+        Name in the file.
     role : str
         ``"time"``, ``"input"``, ``"output"``, or "" for none.
     signal : str
-        What a run calls it, where it is an input or an output.
+        Signal name, if the column is an input or an output.
     unit : str
-        As the file states it; "" for none.
+        Unit in the file; "" if there is none.
     first, low, high : float or None
-        First, lowest and highest number; None where it holds no numbers.
+        First, lowest and highest value; None if the column has no numbers.
     words : str
-        What it holds where that is no numbers.
+        Description of the content if the column has no numbers.
     """
 
     name: str
@@ -182,30 +191,30 @@ class FileColumn:
 
 @dataclass(frozen=True)
 class OpenedFile:
-    """A file as :func:`ftlm.open_file` reads it.
+    """Preview of a file by :func:`ftlm.open_file`: columns, roles, layout and assumptions.
 
     Parameters
     ----------
     path : str
-        Of the file.
+        Path of the file.
     kind : str
-        What it is, in words.
+        File format, as text.
     rows : int
-        How many rows its table has.
+        Number of rows of the table.
     columns : tuple of FileColumn
-        What they hold.
+        Summaries of the columns.
     layout : Layout
-        How it is laid out, nothing left open.
+        Complete layout.
     assumed : tuple of Assumption
-        What nobody said and was taken for granted, each with the option that says it.
+        Assumptions, each with the option that sets it explicitly.
     options : dict
-        Arguments of :func:`ftlm.load` that say all of it: the run is the same.
+        Arguments of :func:`ftlm.load` that give the same run without assumptions.
     step : float or None
-        Time between rows [s]; None where `problem` stands in the way.
+        Sampling interval [s]; None if `problem` is set.
     problem : str
-        Why it is no run yet, and what to do; "" for a run.
+        Reason why the file is not a run yet, and remedy; "" for a run.
     notes : tuple of str
-        What the run says of itself.
+        Warnings of the run.
     """
 
     path: str
@@ -220,11 +229,11 @@ class OpenedFile:
     notes: tuple[str, ...] = ()
 
     def load(self) -> Run:
-        """Load it as a run, everything said that was assumed."""
+        """Load the file as a run, with all assumptions as explicit arguments."""
         return load(self.path, **self.options)
 
     def command(self, verb: str = "identify") -> str:
-        """What to type next, quoted for a shell; "" where inputs or outputs are not known yet.
+        """Return the next shell command; "" if inputs or outputs are still unknown.
 
         Parameters
         ----------
@@ -244,37 +253,37 @@ class OpenedFile:
         return " ".join(map(shlex.quote, words))
 
     def to_dict(self) -> dict[str, Any]:
-        """For JSON."""
+        """Return the preview as a JSON-compatible dictionary."""
         said = {**asdict(self), "layout": self.layout.to_dict(), "commands": self._commands()}
         return {**said, "options": {k: v.to_dict() if isinstance(v, Layout) else v for k, v in self.options.items()}}
 
     def __str__(self) -> str:
         heads = ("column", "role", "unit", "first", "low", "high")
-        shown = self.columns[:_SHOWN]
-        cells = [heads, *((_printed(c.name), _role(c), _printed(c.unit), *_figures(c)) for c in shown)]
+        shown = self.columns[:_MAX_LISTED_COLUMNS]
+        cells = [heads, *((_truncate_text(c.name), _role(c), _truncate_text(c.unit), *_figures(c)) for c in shown)]
         widths = [max(len(row[k]) for row in cells) for k in range(6)]
         counts = f"{self.rows} row{'s' * (self.rows != 1)}, {len(self.columns)} column{'s' * (len(self.columns) != 1)}"
-        lines = [f"{_printed(self.path)}: {self.kind}; {counts}"]
+        lines = [f"{_truncate_text(self.path)}: {self.kind}; {counts}"]
         lines += ["  ".join(cell.ljust(w) for cell, w in zip(row, widths, strict=True)).rstrip() for row in cells]
-        if len(self.columns) > _SHOWN:
-            lines.append(f"… and {len(self.columns) - _SHOWN} more")
+        if len(self.columns) > _MAX_LISTED_COLUMNS:
+            lines.append(f"… and {len(self.columns) - _MAX_LISTED_COLUMNS} more")
         if self.step is not None:
             lines.append(f"step {self.step:.6g} s, {self.step * (self.rows - 1):.6g} s in all")
         lines += [f"assumed: {assumption}" for assumption in self.assumed]
         lines += [f"note: {note}" for note in self.notes]
         if self.problem:
             lines.append(f"to do: {self.problem}")
-        # What cannot be printed cannot be copied from a terminal either.
+        # A command with unprintable characters could not be copied from a terminal.
         lines += [f"next: {line}" for line in self._commands() if line.isprintable()]
-        return "\n".join(map(_escaped, lines))
+        return "\n".join(map(_escape_nonprintable, lines))
 
     def _commands(self) -> list[str]:
         return [] if self.problem else [self.command("inspect"), self.command("identify")]
 
     def _flags(self) -> list[str]:
-        """Options of the command line."""
+        """Return the options of the command line that correspond to `options`."""
         told = self.options
-        # What every reader finds by itself and what is so by default may stay unsaid.
+        # Options that are detected reliably or equal the default are omitted.
         plain = {a.option for a in self.assumed if not a.counts and a.option != "time"}
         words = []
         for key, option in (
@@ -313,51 +322,50 @@ def open_file(
     missing: str | None = None,
     layout: Layout | Mapping[str, object] | None = None,
 ) -> OpenedFile:
-    """Say what a file is and how it is read: columns, units, roles, what was assumed, what to type next.
+    """Preview a file: columns, units, roles, assumptions and the next command.
 
-    What is not asked for is taken from the file: the time and roles from names, units from names or a line of them. All
-    of it stands in the result, with the arguments of :func:`ftlm.load` that say it. Nothing is guessed from numbers.
+    Time and roles are taken from column names, units from names or a line of units, unless given. The result lists
+    them with the corresponding arguments of :func:`ftlm.load`. Nothing is guessed from the values.
 
     Parameters
     ----------
     path : path
         One file of any kind that :func:`ftlm.load` reads.
     time, inputs, outputs, units, columns, intersample, step, slice, resample, time_unit, missing, layout
-        As of :func:`ftlm.load`.
+        As in :func:`ftlm.load`.
 
     Returns
     -------
     OpenedFile
-        Prints as a table; ``.load()`` is the run.
+        Preview that prints as a table; ``.load()`` returns the run.
 
     Raises
     ------
     DataError
-        The file is missing, damaged, or can be read in more than one way; what only keeps it from being a run is its
-        `problem`.
+        The file is missing, damaged or ambiguous. Anything else that prevents a run is reported in `problem`.
     """
     if not isinstance(path, (str, os.PathLike)):
         raise DataError(f"path is a {type(path).__name__}; pass the path of one file")
-    wanted = wanted_of(columns, time, step, inputs, outputs, units, intersample, layout)
-    options = Options(slice, resample, None, time_unit, missing)
-    (table,) = tables_of(path, wanted.layout)
-    return _Opening(table, Pool([table]), wanted, options).result(os.fspath(path))
+    wanted = select_columns(columns, time, step, inputs, outputs, units, intersample, layout)
+    options = LoadOptions(slice, resample, None, time_unit, missing)
+    (table,) = read_tables(path, wanted.layout)
+    return _FilePreview(table, Pool([table]), wanted, options).result(os.fspath(path))
 
 
 @dataclass
-class _Opening:
-    """A file on its way to being understood."""
+class _FilePreview:
+    """Builder of the preview of a file."""
 
     table: FileTable
     pool: Pool
-    wanted: Wanted
-    asked: Options
+    wanted: ColumnSelection
+    asked: LoadOptions
 
     def result(self, path: str) -> OpenedFile:
         table, wanted = self.table, self.wanted
         every = self.pool.columns
         clock, assumed, problem = self._time(every)
-        of_clock = () if clock is None else self._of_clock(clock)
+        of_clock = () if clock is None else self._time_assumptions(clock)
         roles, said, open_roles = self._roles(every, clock)
         assumed = (*table.assumed, *assumed, *of_clock, *said)
         step, notes = None, tuple[str, ...]()
@@ -366,16 +374,16 @@ class _Opening:
         options = self._options(clock, of_clock)
         if not problem:
             try:
-                run = run_from([table], wanted, self.asked)
+                run = run_from_tables([table], wanted, self.asked)
                 step, notes = run.step, tuple(n for n in run.warnings if n not in {str(a) for a in assumed})
             except DataError as error:
                 problem = str(error)
-        shown = tuple(_shown(column, roles) for column in every)
+        shown = tuple(_summarize_column(column, roles) for column in every)
         rows = max((0 if c.values is None else c.values.size for c in every), default=0)
         return OpenedFile(path, table.kind, rows, shown, table.layout, assumed, options, step, problem, notes)
 
     def _time(self, every: list[Column]) -> tuple[Column | None, tuple[Assumption, ...], str]:
-        """The time, what was assumed of it, and why there is none."""
+        """Return the time column, assumptions about it, and the problem if there is none."""
         wanted, header = self.wanted, self.table.header
         if header is not None and wanted.time is None and wanted.step is None:
             wanted.time = CSV_TIME
@@ -406,14 +414,14 @@ class _Opening:
     def _roles(
         self, every: list[Column], clock: Column | None
     ) -> tuple[dict[str, tuple[str, str]], tuple[Assumption, ...], str]:
-        """Role and signal by column, what was guessed, and what is still open."""
+        """Return role and signal by column, assumptions, and the problem if roles are unknown."""
         wanted, header, guessed = self.wanted, self.table.header, False
         if header is not None and not wanted.inputs and not wanted.outputs:
             wanted.inputs, wanted.outputs = {n: n for n in header.inputs}, {n: n for n in header.outputs}
         elif not wanted.inputs and not wanted.outputs:
-            free = [c for c in every if c is not clock and _holds(c) and c.name and c.name.isprintable()]
-            own = {c.written: c.name for c in free}
-            drives, follows = guessed_roles(list(own))
+            free = [c for c in every if c is not clock and _has_numbers(c) and c.name and c.name.isprintable()]
+            own = {c.name_with_unit: c.name for c in free}
+            drives, follows = guess_roles(list(own))
             names = signal_names({**dict.fromkeys(drives, "u"), **dict.fromkeys(follows, "y")})
             wanted.inputs, wanted.outputs = {names[c]: own[c] for c in drives}, {names[c]: own[c] for c in follows}
             guessed = bool(drives)
@@ -422,44 +430,44 @@ class _Opening:
             for name, spec in asked.items():
                 column = self.pool.find(spec, f"signal {name!r}")
                 roles[column.name] = (role, name)
-                unit = known_unit(column.stated, column.written)
+                unit = known_unit(column.stated, column.name_with_unit)
                 if unit and name not in wanted.units and header is None:
                     wanted.units[name] = unit
         said = []
         if guessed:
-            inputs, outputs = listed(wanted.inputs.values(), 10), listed(wanted.outputs.values(), 10)
+            inputs, outputs = join_names(wanted.inputs.values(), 10), join_names(wanted.outputs.values(), 10)
             words = f"{inputs} {'drives' if len(wanted.inputs) == 1 else 'drive'} {outputs}, by their names"
             said.append(Assumption("inputs", inputs, words, "inputs={name: column}, outputs={name: column}"))
         left = ""
         if not wanted.outputs:
-            choice = listed((c.name for c in every if c is not clock and _holds(c)), 20)
+            choice = join_names((c.name for c in every if c is not clock and _has_numbers(c)), 20)
             left = (
                 "which columns are inputs and which are outputs, their names do not say; name them with "
                 f"inputs={{name: column}} and outputs={{name: column}}; there are {choice or 'none'}"
             )
-            wordy = (c for c in every if c is not clock and not _holds(c) and c.moments is None)
-            others = [f"{c.name!r} ({_why(c)})" for c in wordy]
+            wordy = (c for c in every if c is not clock and not _has_numbers(c) and c.timestamps is None)
+            others = [f"{c.name!r} ({_first_bad_cell(c)})" for c in wordy]
             if others:
-                more = f" and {len(others) - _SHOWN} more" * (len(others) > _SHOWN)
-                left += f"; no column of numbers is {', '.join(others[:_SHOWN])}{more}"
+                more = f" and {len(others) - _MAX_LISTED_COLUMNS} more" * (len(others) > _MAX_LISTED_COLUMNS)
+                left += f"; no column of numbers is {', '.join(others[:_MAX_LISTED_COLUMNS])}{more}"
         return roles, tuple(said), left
 
-    def _of_clock(self, clock: Column) -> tuple[Assumption, ...]:
-        """What was assumed of the numbers or dates of the time."""
+    def _time_assumptions(self, clock: Column) -> tuple[Assumption, ...]:
+        """Return the assumptions about unit or date order of the time column."""
         if self.table.header is not None:
             return ()
-        if clock.moments is not None:
-            order = order_of_dates(clock, self.wanted.layout.dates)
+        if clock.timestamps is not None:
+            order = date_order_assumption(clock, self.wanted.layout.dates)
             return () if order is None else (order,)
-        name = header_of(clock)
-        known = header_time(name)[1] is not None or name.casefold() in _SECONDS
+        name = time_header(clock)
+        known = split_time_header(name)[1] is not None or name.casefold() in _SECONDS_COLUMN_NAMES
         if self.asked.time_unit is not None or known or clock.problem is not None:
             return ()
         words = f"the numbers of {clock.name!r} are seconds, as no unit is stated"
         return (Assumption("time_unit", "s", words, "time_unit=UNIT", False),)
 
     def _options(self, clock: Column | None, of_clock: tuple[Assumption, ...]) -> dict[str, Any]:
-        """What says all of it to `load`."""
+        """Return the arguments of `load` that give the same run."""
         wanted = self.wanted
         options: dict[str, Any] = {"step": wanted.step} if wanted.step is not None else {}
         if clock is not None and self.table.header is None:
@@ -485,24 +493,24 @@ class _Opening:
         return options | ({"layout": layout} if layout != Layout() else {})
 
 
-def _holds(column: Column) -> bool:
-    """Whether a column holds numbers, gaps or not."""
+def _has_numbers(column: Column) -> bool:
+    """Whether a column has numbers, possibly with gaps."""
     return column.problem is None or column.blank
 
 
-def _why(column: Column) -> str:
-    """Its first cell that is no number, and in which line."""
+def _first_bad_cell(column: Column) -> str:
+    """Return the first cell that is not a number, with its line."""
     found = _IN_LINE.search(str(column.problem))
     return "" if found is None else found[0]
 
 
-def _shown(column: Column, roles: Mapping[str, tuple[str, str]]) -> FileColumn:
+def _summarize_column(column: Column, roles: Mapping[str, tuple[str, str]]) -> FileColumn:
     role, signal = roles.get(column.name, ("", ""))
     unit, values = column.stated, column.values
-    if column.moments is not None:
-        return FileColumn(column.name, role, signal, unit, None, None, None, f"from {column.moments.first}")
-    if values is None or not values.size or not _holds(column):
-        why = _why(column)
+    if column.timestamps is not None:
+        return FileColumn(column.name, role, signal, unit, None, None, None, f"from {column.timestamps.first}")
+    if values is None or not values.size or not _has_numbers(column):
+        why = _first_bad_cell(column)
         words = "no numbers" if not why else f"no numbers ({why})"
         return FileColumn(column.name, role, signal, unit, None, None, None, words)
     there = values[~np.isnan(values)]
@@ -517,14 +525,14 @@ def _role(column: FileColumn) -> str:
 
 def _figures(column: FileColumn) -> tuple[str, str, str]:
     if column.first is None or column.low is None or column.high is None:
-        return _printed(column.words), "", ""
+        return _truncate_text(column.words), "", ""
     return f"{column.first:.5g}", f"{column.low:.5g}", f"{column.high:.5g}"
 
 
-def _printed(text: str) -> str:
-    """Text without what a terminal would obey, and not too long."""
-    return _escaped(text[:60]) + ("…" if len(text) > 60 else "")
+def _truncate_text(text: str) -> str:
+    """Truncate a text and escape its control characters."""
+    return _escape_nonprintable(text[:60]) + ("…" if len(text) > 60 else "")
 
 
-def _escaped(text: str) -> str:
+def _escape_nonprintable(text: str) -> str:
     return "".join(c if c.isprintable() else repr(c)[1:-1] for c in text)

@@ -1,4 +1,4 @@
-"""Columns of one or several files under the names that a person uses."""
+"""Columns of one or several files under unique names, and detection of the time column."""
 
 from __future__ import annotations
 
@@ -11,14 +11,14 @@ import numpy as np
 import numpy.typing as npt
 
 from ftlm.data.export import Header
-from ftlm.data.units import header_time, is_time_name
+from ftlm.data.units import is_time_name, split_time_header
 from ftlm.errors import DataError
-from ftlm.io.cell_parsing import Moments, behind_a_stroke, is_time_unit, stated_unit
+from ftlm.io.cell_parsing import Timestamps, is_time_unit, split_slash_unit, split_unit
 from ftlm.io.dialect import Assumption, Layout
-from ftlm.utils.validation import bad_rows, listed, nearest
+from ftlm.utils.validation import bad_rows, join_names, nearest
 
-_AGREE = 1e-9
-#: What the time is called beside t, time and seconds, without capitals and what joins words.
+_RELATIVE_TIME_TOLERANCE = 1e-9
+#: Further names of time columns besides t, time and seconds, case-folded and without word separators.
 _OTHER_TIMES = frozenset(
     (
         "timestamp",
@@ -41,15 +41,15 @@ _OTHER_TIMES = frozenset(
         "sekunden",
     )
 )
-_JOINED = str.maketrans("", "", " _-/.")
+_JOINER_REMOVAL = str.maketrans("", "", " _-/.")
 _MATLAB_COLUMN = re.compile(r"(.+)\(:,\s*(\d+)\)")
 
 
 @dataclass(frozen=True)
 class Column:
-    """One column of numbers, or the reason why it is not one.
+    """Column of numbers, or the reason why it cannot be used as one.
 
-    `blank` where that is empty cells alone (NaN); `moments` where it holds dates; `stated` is its unit in the file.
+    `blank`: all problems are empty cells (NaN); `timestamps`: the column holds dates; `stated`: its unit in the file.
     """
 
     variable: str
@@ -59,17 +59,17 @@ class Column:
     problem: DataError | None = None
     matrix: str | None = None
     blank: bool = False
-    moments: Moments | None = None
+    timestamps: Timestamps | None = None
     stated: str = ""
 
     @property
-    def written(self) -> str:
-        """Its name, the unit behind a stroke in it, as in ``I/A``, in brackets."""
-        bare, unit = behind_a_stroke(self.name)
+    def name_with_unit(self) -> str:
+        """Name with the unit after a slash, as in ``I/A``, rewritten in brackets."""
+        bare, unit = split_slash_unit(self.name)
         return f"{bare} [{unit}]" if unit and unit == self.stated else self.name
 
     def numbers(self, *, blank: bool = False) -> npt.NDArray[np.float64] | npt.NDArray[np.float32]:
-        """Return its numbers, or raise why there are none; empty cells may be let pass."""
+        """Return the numbers, or raise the problem of the column; `blank` accepts empty cells."""
         if blank and self.blank and self.values is not None:
             return self.values
         if self.problem is not None or self.values is None:
@@ -79,7 +79,7 @@ class Column:
 
 @dataclass(frozen=True)
 class FileTable:
-    """The columns of one file, what kind of file it is, how it is laid out, and what of that was assumed."""
+    """Columns of one file, with file format, layout and the assumptions made."""
 
     path: Path
     columns: list[Column]
@@ -92,7 +92,7 @@ class FileTable:
 
 
 class Pool:
-    """The columns of all files under the names a person uses."""
+    """Columns of all files under unique names."""
 
     def __init__(self, tables: list[FileTable]) -> None:
         self._tables = tables
@@ -112,24 +112,24 @@ class Pool:
 
     @property
     def columns(self) -> list[Column]:
-        """All of them, in the order of the files."""
+        """All columns, in the order of the files."""
         return list(self._columns.values())
 
     @property
     def names(self) -> tuple[str, ...]:
-        """What can be asked for by name."""
+        """Names of the columns that have one."""
         return tuple(name for name in self._columns if name)
 
-    def described(self) -> str:
-        """Return what there is to choose from, in words."""
+    def describe(self) -> str:
+        """Describe the available columns for error messages."""
         skipped = {name: why for table in self._tables for name, why in table.skipped.items()}
-        text = f"the columns are {listed(self.names)}"
+        text = f"the columns are {join_names(self.names)}"
         if skipped:
             text += "; not read: " + ", ".join(f"{name!r} ({why})" for name, why in list(skipped.items())[:10])
         return text
 
     def find(self, spec: object, thing: str) -> Column:
-        """Return the column that a person names."""
+        """Return the column of a name or position given by the user."""
         if isinstance(spec, int) and not isinstance(spec, bool):
             return self._at(spec, thing)
         if not isinstance(spec, str):
@@ -140,29 +140,29 @@ class Pool:
             name = f"{written[1]}.{int(written[2])}" if len(written[2]) < 10 else spec
         column = self._columns.get(name)
         if column is None:
-            # Without the unit in brackets that it ends in, where that leaves one.
-            bare = [c for c in self._columns.values() if stated_unit(c.written) == (spec, c.stated) and c.stated]
+            # Accept a name without its unit in brackets, if it is unique.
+            bare = [c for c in self._columns.values() if split_unit(c.name_with_unit) == (spec, c.stated) and c.stated]
             column = bare[0] if len(bare) == 1 else None
         if column is None:
             raise DataError(
-                f"column {spec!r} ({thing}) is not in {listed(table.path.name for table in self._tables)}"
-                f"{nearest(spec, self._columns)}; {self.described()}"
+                f"column {spec!r} ({thing}) is not in {join_names(table.path.name for table in self._tables)}"
+                f"{nearest(spec, self._columns)}; {self.describe()}"
             )
         return column
 
     def _at(self, position: int, thing: str) -> Column:
         if len(self._tables) > 1 or not self._tables[0].text:
-            raise DataError(f"column {position} ({thing}): positions are for single text files; {self.described()}")
+            raise DataError(f"column {position} ({thing}): positions are for single text files; {self.describe()}")
         columns = self._tables[0].columns
         if not 0 <= position < len(columns):
             raise DataError(
                 f"column {position} ({thing}) is out of range, positions go from 0 to {len(columns) - 1}; "
-                f"{self.described()}"
+                f"{self.describe()}"
             )
         return columns[position]
 
     def time(self, spec: object, used: list[Column]) -> tuple[Column, Assumption | None]:
-        """Return the time: the column asked for, or the one that names or places itself, and what was assumed of it."""
+        """Return the time column, given by the user or detected by name and position, and the assumption made."""
         if spec is not None:
             return self.find(spec, "time"), None
         clocks, assumed = [], None
@@ -170,7 +170,8 @@ class Pool:
             named, why = self._clocks(table)
             if len(named) > 1:
                 raise DataError(
-                    f"{table.path.name}: the columns {listed(column.name for column in named)} may all be the time; "
+                    f"{table.path.name}: the columns {join_names(column.name for column in named)} may all be the "
+                    "time; "
                     "name one with time="
                 )
             if named and why:
@@ -182,22 +183,22 @@ class Pool:
         if not clocks:
             raise DataError(
                 "time: no column is called t, time or seconds, alone or with a unit as in time [ms], time_ms or t (s); "
-                f"name it with time=, or give the time between rows with step=; {self.described()}"
+                f"name it with time=, or give the time between rows with step=; {self.describe()}"
             )
         for other in clocks[1:]:
             _check_agreement(clocks[0], other)
         return clocks[0], assumed
 
     def _clocks(self, table: FileTable) -> tuple[list[Column], str]:
-        """Columns of a file that may be the time, the surest kind that there is, and why where that is to be said."""
+        """Candidate time columns of a file by the most reliable criterion, and the reason if it is an assumption."""
         own = [c for c in self._columns.values() if c.source == table.path and c.matrix is None]
         sure = [c for c in own if is_time_name(c.variable)]
         if sure:
             return sure, ""
-        named = [c for c in own if header_time(c.variable)[0].translate(_JOINED) in _OTHER_TIMES]
+        named = [c for c in own if split_time_header(c.variable)[0].translate(_JOINER_REMOVAL) in _OTHER_TIMES]
         if named:
             return named, f"the time is column {named[0].name!r}, by its name"
-        dated = [c for c in own if c.moments is not None]
+        dated = [c for c in own if c.timestamps is not None]
         if dated:
             return dated, f"the time is column {dated[0].name!r}, which holds dates or times of day"
         if own and own[0].stated and is_time_unit(own[0].stated):
@@ -205,21 +206,21 @@ class Pool:
         return [], ""
 
 
-def order_of_dates(clock: Column, dates: str | None) -> Assumption | None:
-    """What was assumed of the order of day and month in a column of dates."""
-    order = "" if clock.moments is None else clock.moments.inferred(dates)
-    if clock.moments is None or not order:
+def date_order_assumption(clock: Column, dates: str | None) -> Assumption | None:
+    """Return the assumption on the order of day and month in a date column; None if there is none."""
+    order = "" if clock.timestamps is None else clock.timestamps.inferred_date_order(dates)
+    if clock.timestamps is None or not order:
         return None
     first = "day" if order == "dmy" else "month"
-    words = f"dates begin with the {first}, as in {clock.moments.first!r}"
+    words = f"dates begin with the {first}, as in {clock.timestamps.first!r}"
     return Assumption("dates", order, words, "layout=dict(dates=ORDER)")
 
 
 def _check_agreement(one: Column, other: Column) -> None:
     names = f"time: the columns {one.name!r} of {one.source.name} and {other.name!r} of {other.source.name}"
-    if one.moments is not None and other.moments is not None:
-        own, its = (np.column_stack([c.parts, c.clock]) for c in (one.moments, other.moments))
-        if one.moments.mark != other.moments.mark or not np.array_equal(own, its):
+    if one.timestamps is not None and other.timestamps is not None:
+        own, its = (np.column_stack([c.parts, c.clock]) for c in (one.timestamps, other.timestamps))
+        if one.timestamps.mark != other.timestamps.mark or not np.array_equal(own, its):
             raise DataError(f"{names} differ; give files of one record, or name the time to use with time=")
         return
     a, b = one.numbers(), other.numbers()
@@ -228,7 +229,9 @@ def _check_agreement(one: Column, other: Column) -> None:
             f"{names} have {a.size} and {b.size} rows; give files of one record, or name the time with time="
         )
     with np.errstate(invalid="ignore", over="ignore"):
-        same = np.abs(np.subtract(a, b, dtype=np.float64)) <= _AGREE * max(1.0, float(np.abs(a[[0, -1]]).max()))
+        same = np.abs(np.subtract(a, b, dtype=np.float64)) <= _RELATIVE_TIME_TOLERANCE * max(
+            1.0, float(np.abs(a[[0, -1]]).max())
+        )
     rows = np.flatnonzero(~same & ~(np.isnan(a) & np.isnan(b)))
     if rows.size:
         raise bad_rows(

@@ -1,4 +1,4 @@
-"""The record of a model: a structure whose orders and coefficients are numbers, and how they were found."""
+"""Data of an identified model: structure with fixed parameters, and details of its estimation."""
 
 from __future__ import annotations
 
@@ -16,7 +16,7 @@ from numpy.typing import ArrayLike
 from ftlm.data.run import Run
 from ftlm.errors import ModelError
 from ftlm.structure.equation import Equation
-from ftlm.structure.structure import Structure, check_decided
+from ftlm.structure.structure import Structure, check_offset_resolved
 from ftlm.utils.validation import Complex, Floats, check_pulses
 
 if TYPE_CHECKING:
@@ -26,23 +26,23 @@ if TYPE_CHECKING:
     from ftlm.validation.residual_tests import Residuals
 
 
-class Freedom(msgspec.Struct, frozen=True, forbid_unknown_fields=True):
-    """What was free in a joint fit and how well it was told, so that another experiment can be laid out from a file.
+class FitParameters(msgspec.Struct, frozen=True, forbid_unknown_fields=True):
+    """Free parameters of an output-error fit with their covariance, for the design of the next experiment.
 
     Parameters
     ----------
     names
         Free orders, free coefficients, then delays and limits of inputs.
     orders
-        Every order of the model as it depends on free ones, in words: equation by equation alpha, then each term's.
+        Every order of the model as an expression of free orders: for each equation alpha, then each term's order.
     products
-        Coefficients that follow from others by a law: sign and factors by name.
+        Coefficients that a law derives from others: sign and factors by name.
     covariance
-        Of the free numbers in the order of their names; None where it is not finite.
+        Covariance of the free parameters in the order of `names`; None if it is not finite.
     noise
-        Standard deviation of what the free run left of each output, as it was measured, by name.
+        Standard deviation of the output error of each measured output, by name.
     refinement
-        Pulses a sample interval of the fit's finest grid.
+        Block pulses per sampling interval of the finest simulation grid.
     """
 
     names: tuple[str, ...]
@@ -53,17 +53,17 @@ class Freedom(msgspec.Struct, frozen=True, forbid_unknown_fields=True):
     refinement: int = 1
 
 
-class Against(msgspec.Struct, frozen=True, forbid_unknown_fields=True):
-    """What speaks against a model.
+class ModelFinding(msgspec.Struct, frozen=True, forbid_unknown_fields=True):
+    """Finding against a model, with severity and remedy.
 
     Parameters
     ----------
     level
-        What it makes of the model: ``"do not use"`` or ``"with care"``.
+        Severity: ``"do not use"`` or ``"with care"``.
     reason
-        In a sentence.
+        The finding as a sentence.
     remedy
-        What to do about it.
+        Recommended action.
     """
 
     level: Literal["do not use", "with care"]
@@ -72,34 +72,33 @@ class Against(msgspec.Struct, frozen=True, forbid_unknown_fields=True):
 
 
 class Estimate(msgspec.Struct, frozen=True, forbid_unknown_fields=True):
-    """What is known about how a model was identified, kept with it so that a report needs no other file.
+    """Details of the estimation of a model, stored with it so that a report needs no other file.
 
     Parameters
     ----------
     method
-        Estimator.
+        Name of the estimator.
     runs
         Names of the runs.
     values, standard_errors
-        Orders and coefficients by name as they were estimated, and their standard errors where there are any.
+        Estimated orders and coefficients by name, and their standard errors where available.
     covariance
-        Of every number of the model in the order of its equations (alpha, then order and coefficient of each term, then
-        the coefficient of friction where there is some, with those of Stribeck's term fc, fs and vs); None where the
-        estimator gives none. It may be singular: laws tie numbers.
+        Covariance of all parameters in the order of the equations: alpha, then order and coefficient of each term, then
+        friction coefficients (fc, fs, vs). None if the estimator gives none. It is singular if laws relate parameters.
     fit
-        Fit of the free run on these runs in percent, by output.
+        Fit of the simulated outputs on these runs [%], by output.
     information
-        Information criteria, where known.
+        Information criteria, where available.
     warnings
-        What makes the model doubtful, in words.
+        Warnings about the model, as sentences.
     intervals
-        95 % intervals by profile likelihood, of the values that have one; None for an end that is infinite. Those of
-        the others are ± 1.96 standard errors. Not set where no value has one.
+        95 % profile-likelihood intervals of the values that have one; None for an unbounded end. Other values have
+        Wald intervals of ± 1.96 standard errors. Unset if no value has one.
     free
-        What a joint fit found together, from which the next experiment is laid out. Not set for other methods.
+        Free parameters of the output-error fit, for the design of the next experiment. Unset for other methods.
     against
-        What spoke against the model when it was identified, as its verdict weighs it; not set where nothing did, and in
-        files of earlier versions, which are judged by their warnings.
+        Findings against the model at identification, used by its verdict. Unset if there are none, and in files of
+        earlier versions, whose verdict uses the warnings.
     """
 
     method: str
@@ -111,13 +110,13 @@ class Estimate(msgspec.Struct, frozen=True, forbid_unknown_fields=True):
     information: dict[str, float | None] = {}
     warnings: tuple[str, ...] = ()
     intervals: dict[str, tuple[float | None, float | None]] | UnsetType = UNSET
-    free: Freedom | UnsetType = UNSET
-    against: tuple[Against, ...] | UnsetType = UNSET
+    free: FitParameters | UnsetType = UNSET
+    against: tuple[ModelFinding, ...] | UnsetType = UNSET
 
 
 @dataclass(frozen=True)
-class Solved:
-    """A structure whose orders and coefficients are numbers; its fields are those of :class:`ftlm.Model`."""
+class ModelData:
+    """Structure with fixed orders and coefficients; base class of :class:`ftlm.Model`."""
 
     structure: Structure
     orders: Mapping[str, float] = field(default_factory=dict)
@@ -129,7 +128,7 @@ class Solved:
     def __post_init__(self) -> None:
         if self.m is not None:
             check_pulses(self.m)
-        check_decided(self.structure.offset)
+        check_offset_resolved(self.structure.offset)
         if self.structure.free_inputs:
             numbers = ", ".join(item.words for item in self.structure.free_inputs)
             way = "with_delays" if self.structure.free_delays else "with_limits"
@@ -144,30 +143,30 @@ class Solved:
 
     @property
     def coefficients(self) -> dict[str, float]:
-        """Coefficients by name."""
+        """Values of the coefficients by name."""
         named = {t.name: float(t.coefficient) for e in self.equations for t in e.terms if t.name is not None}
         for item in self.equations:
-            named |= {} if item.friction is None else item.friction.found
+            named |= {} if item.friction is None else item.friction.identified_coefficients
         return named
 
     @property
     def equations(self) -> tuple[Equation, ...]:
-        """The equations, all numbers."""
+        """Equations with fixed orders and coefficients."""
         return self.structure.equations
 
     @property
     def outputs(self) -> tuple[str, ...]:
-        """Modelled outputs."""
+        """Names of the modeled outputs."""
         return self.structure.outputs
 
 
-def check_solved(model: object) -> None:
-    """Refuse what is no model."""
-    if not isinstance(model, Solved):
+def check_model(model: object) -> None:
+    """Raise if an object is not a model."""
+    if not isinstance(model, ModelData):
         raise ModelError(f"model is {type(model).__name__}, not a Model; identify a structure or load a model first")
 
 
-class Model(Solved):
+class Model(ModelData):
     """Structure with numerical orders and coefficients.
 
     Parameters
@@ -360,7 +359,7 @@ class Model(Solved):
         return write_model(self, path, force=force)
 
     def __str__(self) -> str:
-        return "\n".join(map(self.structure.written, self.equations))
+        return "\n".join(map(self.structure.equation_text, self.equations))
 
     def _repr_html_(self) -> str:
         from ftlm.report.typesetting import model_html

@@ -11,18 +11,26 @@ import msgspec
 from msgspec import UNSET, UnsetType
 
 from ftlm.errors import DataError, ModelError
-from ftlm.model.model import Estimate, Solved
+from ftlm.model.model import Estimate, ModelData
 from ftlm.structure.equation import Equation, Friction, Stribeck, Term
-from ftlm.structure.input_nonlinearity import Limit, LimitLaw
+from ftlm.structure.input_nonlinearity import InputNonlinearity, NonlinearityKind
 from ftlm.structure.order import Order
 from ftlm.structure.sensor_filter import SensorFilter
 from ftlm.structure.structure import Offset, Structure, check_initial
-from ftlm.utils.files import Saved, write_atomically
-from ftlm.utils.validation import words_of
+from ftlm.utils.files import JsonFormat, write_atomically
+from ftlm.utils.validation import error_text
 
 #: Schema versions: base, offset, profile likelihood intervals or sensor filters of signals that are no outputs,
 #: friction, input nonlinearities, Stribeck friction, free parameters and findings of the fit.
-SCHEMA, OFFSET_SCHEMA, PROFILE_SCHEMA, FRICTION_SCHEMA, LIMIT_SCHEMA, STRIBECK_SCHEMA, FIT_SCHEMA = 2, 3, 4, 5, 6, 7, 8
+BASE_SCHEMA, OFFSET_SCHEMA, PROFILE_SCHEMA, FRICTION_SCHEMA, LIMIT_SCHEMA, STRIBECK_SCHEMA, FIT_SCHEMA = (
+    2,
+    3,
+    4,
+    5,
+    6,
+    7,
+    8,
+)
 
 
 class TermFile(msgspec.Struct, forbid_unknown_fields=True):
@@ -78,7 +86,7 @@ class LimitFile(msgspec.Struct, forbid_unknown_fields=True):
     """Saturation or dead zone of an input, in its unit."""
 
     signal: str
-    law: LimitLaw
+    law: NonlinearityKind
     value: float
 
 
@@ -112,7 +120,7 @@ class EquationFile(msgspec.Struct, forbid_unknown_fields=True):
     def friction_schema(self) -> int:
         """Schema version that the friction needs."""
         if self.friction is UNSET:
-            return SCHEMA
+            return BASE_SCHEMA
         return FRICTION_SCHEMA if self.friction.stribeck is UNSET else STRIBECK_SCHEMA
 
 
@@ -169,7 +177,7 @@ class ModelFile(msgspec.Struct, forbid_unknown_fields=True):
     limits: list[LimitFile] | UnsetType = UNSET
 
     @classmethod
-    def of(cls, model: Solved) -> ModelFile:
+    def of(cls, model: ModelData) -> ModelFile:
         """Convert a model to its file form."""
         s = model.structure
         # Absent fields are omitted, so that files of older structures do not change.
@@ -196,7 +204,7 @@ class ModelFile(msgspec.Struct, forbid_unknown_fields=True):
             limits,
         )
 
-    def solved(self) -> Solved:
+    def restore_model(self) -> ModelData:
         """Return the model record.
 
         Raises
@@ -214,18 +222,20 @@ class ModelFile(msgspec.Struct, forbid_unknown_fields=True):
             sensor_filter=sensor,
             name=self.name,
             offset="none" if self.offset is UNSET else self.offset,
-            limited=UNSET if self.limits is UNSET else tuple(Limit(x.signal, x.law, x.value) for x in self.limits),
+            input_nonlinearities=UNSET
+            if self.limits is UNSET
+            else tuple(InputNonlinearity(x.signal, x.law, x.value) for x in self.limits),
         )
         if self.estimate is not None and self.estimate.covariance is not None:
             count = sum(e.count for e in self.equations)
             rows = self.estimate.covariance
             if len(rows) != count or any(len(row) != count for row in rows):
                 raise ModelError(f"its covariance is not of {count} by {count} numbers, as its equations need")
-        return Solved(structure, self.orders, self.units, self.m, self.about, self.estimate)
+        return ModelData(structure, self.orders, self.units, self.m, self.about, self.estimate)
 
 
 #: Model files have a few kilobytes; the default size limit suffices.
-MODEL = Saved("model", "a file written by save()", ModelFile, FIT_SCHEMA)
+MODEL_FORMAT = JsonFormat("model", "a file written by save()", ModelFile, FIT_SCHEMA)
 
 
 def schema_of(
@@ -241,26 +251,26 @@ def schema_of(
     named = sensor is not None and not isinstance(sensor.signals, UnsetType)
     known = estimate is not None and estimate.free is not UNSET
     return max(
-        SCHEMA if isinstance(offset, UnsetType) else OFFSET_SCHEMA,
-        PROFILE_SCHEMA if profiled or named else SCHEMA,
-        SCHEMA if isinstance(limits, UnsetType) else LIMIT_SCHEMA,
+        BASE_SCHEMA if isinstance(offset, UnsetType) else OFFSET_SCHEMA,
+        PROFILE_SCHEMA if profiled or named else BASE_SCHEMA,
+        BASE_SCHEMA if isinstance(limits, UnsetType) else LIMIT_SCHEMA,
         *(e.friction_schema for e in equations),
-        FIT_SCHEMA if known or doubted else SCHEMA,
+        FIT_SCHEMA if known or doubted else BASE_SCHEMA,
     )
 
 
-def write_model(model: Solved, path: str | os.PathLike[str], *, force: bool) -> Path:
+def write_model(model: ModelData, path: str | os.PathLike[str], *, force: bool) -> Path:
     """Write a model as JSON, atomically."""
     data = msgspec.json.format(msgspec.json.encode(ModelFile.of(model)), indent=2)
     return write_atomically(path, data + b"\n", force=force)
 
 
-def read_model(path: str | os.PathLike[str]) -> Solved:
+def read_model(path: str | os.PathLike[str]) -> ModelData:
     """Read a model record; raises as :func:`ftlm.load_model`."""
-    read = MODEL.read(path)
+    read = MODEL_FORMAT.read(path)
     of = schema_of(read.equations, read.limits, read.offset, read.sensor_filter, read.estimate)
-    MODEL.check_schema(path, read, of)
+    MODEL_FORMAT.check_schema(path, read, of)
     try:
-        return read.solved()
+        return read.restore_model()
     except ModelError as error:
-        raise DataError(f"{path} holds no usable model: {words_of(error)}") from error
+        raise DataError(f"{path} holds no usable model: {error_text(error)}") from error

@@ -13,18 +13,18 @@ from ftlm.order_search.result import OrderCertificate
 from ftlm.order_search.search import Job, make_job
 from ftlm.simulation.discretization import named_signals
 from ftlm.structure.equation import Equation
-from ftlm.structure.order_grid import STEP, Lattice
+from ftlm.structure.order_grid import DEFAULT_INCREMENT, OrderGrid
 from ftlm.structure.structure import Structure
 from ftlm.utils.resources import memory_limit
 from ftlm.utils.validation import check_threads, real_number, whole_number
 
 #: Default tolerance of the certificate relative to the best equation error found, and maximum number of boxes.
-WITHIN = 0.05
-CELLS = 20_000_000
+DEFAULT_TOLERANCE = 0.05
+DEFAULT_MAX_CELLS = 20_000_000
 #: Default maximum RMS size of an equation's terms relative to the output. Larger terms cancel to within a hundredth.
-LARGEST = 100.0
+DEFAULT_MAX_TERM_RATIO = 100.0
 #: Settings of an order search for which a certificate exists.
-PROVED: dict[str, Any] = {"criterion": "equation-error", "norm": "l2", "coefficients": "least-squares"}
+CERTIFIED_SETTINGS: dict[str, Any] = {"criterion": "equation-error", "norm": "l2", "coefficients": "least-squares"}
 _WAY_OUT = (
     "rank by squared equation errors with least-squares coefficients (criterion='equation-error', norm='l2', "
     "coefficients='least-squares'), or ask for none"
@@ -34,12 +34,12 @@ _WAY_OUT = (
 def certify_orders(
     runs: Run | Sequence[Run],
     equation: Structure,
-    lattice: Lattice | None = None,
+    lattice: OrderGrid | None = None,
     *,
-    within: float = WITHIN,
+    within: float = DEFAULT_TOLERANCE,
     apart: float | None = None,
-    largest: float = LARGEST,
-    cells: int = CELLS,
+    largest: float = DEFAULT_MAX_TERM_RATIO,
+    cells: int = DEFAULT_MAX_CELLS,
     m: int | None = None,
     threads: int | None = None,
     progress: Callable[[int, int], None] | None = None,
@@ -91,24 +91,27 @@ def certify_orders(
     KeyboardInterrupt
         Ctrl-C, within half a second.
     """
-    share = _check_within(within)
+    share = _check_tolerance(within)
     most = whole_number(cells)
     if most is None or not 1 <= most < 1 << 62:
-        raise ModelError(f"cells = {cells!r} is no whole number from 1; the default is {CELLS}")
-    gap = real_number("apart", (lattice.step if isinstance(lattice, Lattice) else STEP) if apart is None else apart)
+        raise ModelError(f"cells = {cells!r} is no whole number from 1; the default is {DEFAULT_MAX_CELLS}")
+    gap = real_number(
+        "apart",
+        (lattice.increment if isinstance(lattice, OrderGrid) else DEFAULT_INCREMENT) if apart is None else apart,
+    )
     if not 0 < gap <= 1:
         raise ModelError(f"apart = {apart!r} is outside (0, 1]; the step of the lattice is usual")
     size = real_number("largest", largest)
     if not 1 <= size <= 1e9:
-        raise ModelError(f"largest = {largest!r} is outside [1, 1e9]; the default is {LARGEST:g}")
-    job = make_job(runs, equation, lattice, Settings.check(**PROVED, threads=check_threads(threads)), m=m)
+        raise ModelError(f"largest = {largest!r} is outside [1, 1e9]; the default is {DEFAULT_MAX_TERM_RATIO:g}")
+    job = make_job(runs, equation, lattice, Settings.check(**CERTIFIED_SETTINGS, threads=check_threads(threads)), m=m)
     return certify_job(job, within=share, apart=gap, largest=size, cells=most, progress=progress)
 
 
 def check_certifiable(job: Job, within: float) -> None:
     """Raise ModelError if no certificate exists for a search, or the tolerance is out of range."""
-    _check_within(within)
-    for name, value in PROVED.items():
+    _check_tolerance(within)
+    for name, value in CERTIFIED_SETTINGS.items():
         given = getattr(job.settings, name)
         if given != value:
             raise ModelError(f"there is no certificate over all orders for {name} = {given!r}; {_WAY_OUT}")
@@ -127,7 +130,7 @@ def check_certifiable(job: Job, within: float) -> None:
         )
 
 
-def _check_within(within: float) -> float:
+def _check_tolerance(within: float) -> float:
     share = real_number("within", within)
     if not 0 < share < 1:
         raise ModelError(
@@ -141,15 +144,15 @@ def certify_job(
     *,
     within: float,
     apart: float,
-    largest: float = LARGEST,
-    cells: int = CELLS,
+    largest: float = DEFAULT_MAX_TERM_RATIO,
+    cells: int = DEFAULT_MAX_CELLS,
     progress: Callable[[int, int], None] | None = None,
 ) -> OrderCertificate:
     """Certify a prepared search; see :func:`certify_orders`."""
     check_certifiable(job, within)
     record, item = job.records[0], job.structure.equations[0]
     intervals = {name: (min(values), max(values)) for name, values in job.values.items()}
-    region = _region(item, intervals, record.signals)
+    region = _search_region(item, intervals, record.signals)
     try:
         found = _core.certify(
             [r.core() for r in job.records],
@@ -176,7 +179,7 @@ def certify_job(
     )
 
 
-def _region(
+def _search_region(
     item: Equation, intervals: dict[str, tuple[float, float]], signals: Sequence[str]
 ) -> tuple[int, tuple[float, float], list[tuple[int, float, float]]]:
     """Output, interval of its order, and signal and interval of each term, as arguments of the core."""

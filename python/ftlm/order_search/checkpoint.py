@@ -27,16 +27,16 @@ from ftlm.simulation.discretization import Record
 from ftlm.structure.structure import Offset, Structure, check_initial
 from ftlm.utils.files import write_atomically
 
-MAGIC = b"ftlm search store 1\n"
-HEAD = struct.Struct("<II")
-DIGEST = 16
+FILE_SIGNATURE = b"ftlm search store 1\n"
+HEADER_FORMAT = struct.Struct("<II")
+DIGEST_BYTES = 16
 #: Version of the search algorithm. Rounds of different versions must not be joined.
-ALGORITHM = 5
+ALGORITHM_VERSION = 5
 #: Earlier versions whose partial searches can be resumed if the rounds of the search are the same in both versions.
 #: Version 2 excludes boxes on grids of 2²⁵ candidates or more, with longer rounds. Version 3 has sharper boxes, also
 #: for squared equation errors. Version 4 has tighter bounds of simulations from 2¹⁸ candidates on. Version 5 bounds
 #: simulations by coefficients that cancel, and constructs boxes by the coefficients of all of their candidates.
-CONTINUED = (1, 2, 3, 4)
+RESUMABLE_ALGORITHMS = (1, 2, 3, 4)
 #: Maximum payload [bytes]; a table of 100 000 rows with many coefficients is far smaller.
 MAX_PAYLOAD = 1 << 30
 Natural = Annotated[int, msgspec.Meta(ge=0, le=(1 << 63) - 1)]
@@ -57,7 +57,7 @@ Outcomes = tuple[bytes, bytes]
 
 
 #: Maximum number of initial states of a sensor filter in a record.
-MAX_STATES = 10
+MAX_FILTER_STATES = 10
 
 
 class RecordFile(msgspec.Struct, frozen=True, forbid_unknown_fields=True, omit_defaults=True):
@@ -97,7 +97,7 @@ class RecordFile(msgspec.Struct, frozen=True, forbid_unknown_fields=True, omit_d
         sizes = (len(self.signals), len(self.inputs), len(self.means))
         if rows < 1 or m < 1 or sizes != (rows, rows, 8 * rows * m) or len(self.sensor or b"") % 8:
             raise ModelError("the sizes of a record do not fit one another")
-        if not 0 <= self.states <= (0 if self.sensor is None else MAX_STATES):
+        if not 0 <= self.states <= (0 if self.sensor is None else MAX_FILTER_STATES):
             raise ModelError(f"a record with {self.states} states of its sensor filter")
         means = np.frombuffer(self.means, "<f8").astype(np.float64).reshape(rows, m)
         sensor = None if self.sensor is None else np.frombuffer(self.sensor, "<f8").astype(np.float64)
@@ -141,7 +141,7 @@ class Requests(msgspec.Struct, frozen=True, forbid_unknown_fields=True, tag="req
     requests: tuple[Request, ...]
 
 
-class Begun(msgspec.Struct, frozen=True, forbid_unknown_fields=True, tag="progress"):
+class PartialRounds(msgspec.Struct, frozen=True, forbid_unknown_fields=True, tag="progress"):
     """Partly evaluated block of rounds; rows are those found since the previous frame, failures None if unchanged.
 
     If the block was restarted, earlier frames are void. ``order`` is the digest of the visiting order; 0, in older
@@ -189,7 +189,7 @@ StageRow = tuple[Natural, float, tuple[float, ...], tuple[StagePart, ...]]
 StageFailure = tuple[Natural, tuple[float, ...], Literal["singular", "diverged"]]
 
 
-class Joined(msgspec.Struct, frozen=True, forbid_unknown_fields=True, tag="joined"):
+class CoupledTable(msgspec.Struct, frozen=True, forbid_unknown_fields=True, tag="joined"):
     """Final table of a search under an order law: rows, counts by reason, first failures."""
 
     search: Natural
@@ -198,53 +198,53 @@ class Joined(msgspec.Struct, frozen=True, forbid_unknown_fields=True, tag="joine
     failures: tuple[StageFailure, ...]
 
 
-Frame = Begun | Rounds | Verdicts | Joined
-DECODER = msgspec.msgpack.Decoder(Requests | Frame)
-ENCODER = msgspec.msgpack.Encoder()
+Frame = PartialRounds | Rounds | Verdicts | CoupledTable
+FRAME_DECODER = msgspec.msgpack.Decoder(Requests | Frame)
+FRAME_ENCODER = msgspec.msgpack.Encoder()
 
 
-def _check(length: bytes, offset: int) -> int:
+def _length_checksum(length: bytes, offset: int) -> int:
     return zlib.crc32(length + struct.pack("<Q", offset))
 
 
 def _digest(before: bytes, length: bytes, payload: bytes) -> bytes:
-    return hashlib.blake2b(before + length + payload, digest_size=DIGEST).digest()
+    return hashlib.blake2b(before + length + payload, digest_size=DIGEST_BYTES).digest()
 
 
-def framed(payload: bytes, offset: int, before: bytes) -> tuple[bytes, bytes]:
+def encode_frame(payload: bytes, offset: int, before: bytes) -> tuple[bytes, bytes]:
     """Return the bytes of a frame and its digest."""
     length = struct.pack("<I", len(payload))
     digest = _digest(before, length, payload)
-    return length + struct.pack("<I", _check(length, offset)) + payload + digest, digest
+    return length + struct.pack("<I", _length_checksum(length, offset)) + payload + digest, digest
 
 
 def next_frame(data: memoryview, offset: int, before: bytes) -> tuple[bytes, bytes, int] | str:
     """Return payload, digest and end of the frame at an offset, or the error: "torn" or a message."""
     rest = len(data) - offset
-    if rest < HEAD.size:
+    if rest < HEADER_FORMAT.size:
         return "torn"
-    length, check = HEAD.unpack_from(data, offset)
-    if check != _check(bytes(data[offset : offset + 4]), offset):
+    length, check = HEADER_FORMAT.unpack_from(data, offset)
+    if check != _length_checksum(bytes(data[offset : offset + 4]), offset):
         # Blocks that were set aside and never written read as zeros.
         return "torn" if not any(data[offset:]) else f"the frame at byte {offset} has a damaged length"
-    end = offset + HEAD.size + length + DIGEST
+    end = offset + HEADER_FORMAT.size + length + DIGEST_BYTES
     if length > MAX_PAYLOAD:
         return f"the frame at byte {offset} has a length of {length} bytes"
     if end > len(data):
         return "torn"
-    payload = bytes(data[offset + HEAD.size : end - DIGEST])
-    digest = bytes(data[end - DIGEST : end])
+    payload = bytes(data[offset + HEADER_FORMAT.size : end - DIGEST_BYTES])
+    digest = bytes(data[end - DIGEST_BYTES : end])
     if digest != _digest(before, bytes(data[offset : offset + 4]), payload):
         return "torn" if end == len(data) else f"the frame at byte {offset} does not match its digest"
     return payload, digest, end
 
 
 #: Maximum size of a checkpoint file. The largest search under an order law needs less than a tenth.
-LARGEST = 4 << 30
+MAX_FILE_BYTES = 4 << 30
 
 
 @dataclass(frozen=True)
-class Kind:
+class FileKind:
     """Name of a kind of checkpoint file, and its file signature."""
 
     name: str
@@ -252,40 +252,44 @@ class Kind:
 
 
 #: Checkpoint files of an order search and of a structure selection.
-SEARCH, SELECTION = KINDS = (Kind("search", MAGIC), Kind("selection", b"ftlm selection store 1\n"))
+SEARCH_FILE, SELECTION_FILE = FILE_KINDS = (
+    FileKind("search", FILE_SIGNATURE),
+    FileKind("selection", b"ftlm selection store 1\n"),
+)
 
 
-def check(path: str | os.PathLike[str], handle: int, kind: Kind) -> None:
+def check_file(path: str | os.PathLike[str], handle: int, kind: FileKind) -> None:
     """Raise DataError for a path that is no regular file, another format, or too large, before it is read."""
     status = os.fstat(handle)
     if not stat.S_ISREG(status.st_mode):
         raise DataError(f"store {path} is no regular file; choose another file")
-    begins = os.read(handle, max(len(k.magic) for k in KINDS))
-    other = next((k.name for k in KINDS if k != kind and begins.startswith(k.magic)), None)
+    begins = os.read(handle, max(len(k.magic) for k in FILE_KINDS))
+    other = next((k.name for k in FILE_KINDS if k != kind and begins.startswith(k.magic)), None)
     if other is not None:
         raise DataError(
             f"{path} is the store of a {other}, not of a {kind.name}; go on with it by the call that began it"
         )
     if not kind.magic.startswith(begins[: len(kind.magic)]):
         raise DataError(f"{path} is no ftlm {kind.name} store; give a file written with store= (--store)")
-    if status.st_size > LARGEST:
+    if status.st_size > MAX_FILE_BYTES:
         raise DataError(
-            f"{path} has {status.st_size} bytes, more than the {LARGEST} of the largest store; start the {kind.name} "
+            f"{path} has {status.st_size} bytes, more than the {MAX_FILE_BYTES} of the largest store; start the "
+            f"{kind.name} "
             "again in another file"
         )
     os.lseek(handle, 0, os.SEEK_SET)
 
 
-class Log:
+class FrameFile:
     """Checkpoint file, locked until closed; without `create` it must exist.
 
     New frames are appended at `end` and chained to the `digest` of the previous frame. The reader of the file sets both
     to the end of the last intact frame.
     """
 
-    def __init__(self, path: str | os.PathLike[str], kind: Kind, *, create: bool) -> None:
+    def __init__(self, path: str | os.PathLike[str], kind: FileKind, *, create: bool) -> None:
         self.path, self.kind = Path(path), kind
-        self.end, self.digest = 0, bytes(DIGEST)
+        self.end, self.digest = 0, bytes(DIGEST_BYTES)
         # A pipe that nobody reads would keep the open waiting.
         flags = os.O_RDWR | getattr(os, "O_NONBLOCK", 0) | (os.O_CREAT if create else 0) | getattr(os, "O_BINARY", 0)
         try:
@@ -294,7 +298,7 @@ class Log:
             why = error.strerror if isinstance(error, OSError) else None
             raise DataError(f"store {self.path} cannot be opened: {why or error}; choose another file") from error
         try:
-            check(self.path, self.handle, kind)
+            check_file(self.path, self.handle, kind)
             self._lock()
         except BaseException:
             self.close()
@@ -322,16 +326,16 @@ class Log:
         os.lseek(self.handle, 0, os.SEEK_SET)
         return b"".join(iter(lambda: os.read(self.handle, 1 << 20), b""))
 
-    def unbegun(self, data: bytes) -> bool:
+    def has_no_frame(self, data: bytes) -> bool:
         """Whether a file is empty, or has an incomplete first frame only."""
         magic = self.kind.magic
         if not data.startswith(magic):
             return magic.startswith(data)
-        return next_frame(memoryview(data), len(magic), bytes(DIGEST)) == "torn"
+        return next_frame(memoryview(data), len(magic), bytes(DIGEST_BYTES)) == "torn"
 
     def begin(self, payload: bytes) -> bytes:
         """Write the first frame and return the bytes of the file."""
-        frame, digest = framed(payload, len(self.kind.magic), bytes(DIGEST))
+        frame, digest = encode_frame(payload, len(self.kind.magic), bytes(DIGEST_BYTES))
         self.end = 0
         self._write(self.kind.magic + frame)
         self.digest = digest
@@ -342,20 +346,20 @@ class Log:
         """Append frames and flush them to disk."""
         data, digest, offset = [], self.digest, self.end
         for payload in payloads:
-            piece, digest = framed(payload, offset, digest)
+            piece, digest = encode_frame(payload, offset, digest)
             data.append(piece)
             offset += len(piece)
         self._write(b"".join(data))
         self.digest = digest
 
-    def cut(self) -> None:
+    def truncate(self) -> None:
         """Truncate the file at the end of the last intact frame."""
-        with self._writing():
+        with self._rollback_on_error():
             os.ftruncate(self.handle, self.end)
             os.fsync(self.handle)
 
     @contextlib.contextmanager
-    def _writing(self) -> Iterator[None]:
+    def _rollback_on_error(self) -> Iterator[None]:
         """Truncate the file to its previous end if writing fails, and raise DataError."""
         try:
             yield
@@ -377,7 +381,7 @@ class Log:
                 os.close(folder)
 
     def _write(self, data: bytes) -> None:
-        with self._writing():
+        with self._rollback_on_error():
             os.lseek(self.handle, self.end, os.SEEK_SET)
             left = memoryview(data)
             while left:
@@ -391,7 +395,7 @@ class Log:
 
 
 @dataclass
-class Half:
+class PartialBlock:
     """Partly evaluated block of rounds, with all rows found since its start."""
 
     last: int
@@ -416,15 +420,15 @@ class Section:
 
     law: bool = False
     done: dict[int, Rounds | Verdicts] = field(default_factory=dict)
-    open: dict[int, Half] = field(default_factory=dict)
-    joined: Joined | None = None
+    open: dict[int, PartialBlock] = field(default_factory=dict)
+    joined: CoupledTable | None = None
     _firsts: list[int] = field(default_factory=list)
 
-    def take(self, frame: Frame) -> None:
+    def add_frame(self, frame: Frame) -> None:
         """Add a frame; raise ModelError for a duplicate, an empty block, or another kind of search."""
-        if self.joined is not None or (isinstance(frame, Joined) and not self.law):
+        if self.joined is not None or (isinstance(frame, CoupledTable) and not self.law):
             raise ModelError("a table stands where none belongs")
-        if isinstance(frame, Joined):
+        if isinstance(frame, CoupledTable):
             self.joined = frame
             return
         if frame.first >= frame.last or isinstance(frame, Verdicts) != self.law:
@@ -432,8 +436,8 @@ class Section:
         place = bisect.bisect_left(self._firsts, frame.last)
         if place and self.done[self._firsts[place - 1]].last > frame.first:
             raise ModelError(f"rounds {frame.first} to {frame.last} are there twice")
-        if isinstance(frame, Begun):
-            self._take_begun(frame)
+        if isinstance(frame, PartialRounds):
+            self._add_partial_rounds(frame)
             return
         count = frame.last - frame.first
         if isinstance(frame, Verdicts) and (len(frame.values), len(frame.kinds)) != (8 * count, count):
@@ -442,7 +446,7 @@ class Section:
         self.done[frame.first] = frame
         self._firsts.insert(place, frame.first)
 
-    def _take_begun(self, frame: Begun) -> None:
+    def _add_partial_rounds(self, frame: PartialRounds) -> None:
         half = self.open.get(frame.first)
         if not frame.first <= frame.place[0] < frame.last or (half is not None and half.last != frame.last):
             raise ModelError(f"rounds {frame.first} to {frame.last} are continued as something else")
@@ -450,13 +454,13 @@ class Section:
         if not (followed <= end and size >= (end > 0) and not math.isnan(limit)):
             raise ModelError(f"rounds {frame.first} to {frame.last} stand nowhere")
         if half is None or frame.anew:
-            half = self.open[frame.first] = Half(frame.last, frame.place, frame.order, [], frame.counts, ())
+            half = self.open[frame.first] = PartialBlock(frame.last, frame.place, frame.order, [], frame.counts, ())
         half.place, half.order, half.counts = frame.place, frame.order, frame.counts
         half.rows.extend(frame.rows)
         half.failures = half.failures if frame.failures is None else frame.failures
 
     @property
-    def dealt(self) -> int:
+    def processed_count(self) -> int:
         """Number of candidates evaluated or excluded."""
         done = (len(f.kinds) if isinstance(f, Verdicts) else sum(f.part[1][1:7]) for f in self.done.values())
         return sum(done) + sum(sum(half.counts[1:7]) for half in self.open.values())
@@ -480,9 +484,9 @@ class Contents:
     end: int
     digest: bytes
     #: Number of bytes after it, left by a power cut or a kill, or being written.
-    torn: int = 0
+    truncated_bytes: int = 0
     #: Description of corrupt data with its offset; None for an intact file.
-    damage: str | None = None
+    corruption: str | None = None
 
 
 def read_store(path: str | os.PathLike[str]) -> Contents:
@@ -491,7 +495,7 @@ def read_store(path: str | os.PathLike[str]) -> Contents:
         # A pipe that nobody writes to would keep the open waiting.
         handle = os.open(path, os.O_RDONLY | getattr(os, "O_NONBLOCK", 0) | getattr(os, "O_BINARY", 0))
         with os.fdopen(handle, "rb") as stream:
-            check(path, handle, SEARCH)
+            check_file(path, handle, SEARCH_FILE)
             data = stream.read()
     except DataError:
         raise
@@ -503,25 +507,25 @@ def read_store(path: str | os.PathLike[str]) -> Contents:
 
 def contents_of(path: str | os.PathLike[str], data: memoryview) -> Contents:
     """Parse the bytes of a checkpoint file; raise DataError for another file, no first frame, or a later version."""
-    start = bytes(data[: len(MAGIC)])
-    if not MAGIC.startswith(start):
+    start = bytes(data[: len(FILE_SIGNATURE)])
+    if not FILE_SIGNATURE.startswith(start):
         raise DataError(f"{path} is no ftlm search store; give a file written with store= (--store)")
     contents: Contents | None = None
-    offset, digest = len(MAGIC), bytes(DIGEST)
+    offset, digest = len(FILE_SIGNATURE), bytes(DIGEST_BYTES)
     while offset < len(data):
         got = next_frame(data, offset, digest)
         if isinstance(got, str):
             if contents is None:
                 why = "it ends before its first frame does" if got == "torn" else got
                 raise DataError(f"{path} cannot be used: {why}; start the search again in another file")
-            contents.torn = len(data) - offset if got == "torn" else 0
-            contents.damage = None if got == "torn" else got
+            contents.truncated_bytes = len(data) - offset if got == "torn" else 0
+            contents.corruption = None if got == "torn" else got
             break
         payload, digest, end = got
         try:
-            frame = DECODER.decode(payload)
+            frame = FRAME_DECODER.decode(payload)
             if contents is None:
-                contents = _opened(frame, end, digest)
+                contents = _contents_of_requests(frame, end, digest)
             elif isinstance(frame, Requests):
                 raise ModelError("requests stand twice")
             else:
@@ -539,7 +543,7 @@ def contents_of(path: str | os.PathLike[str], data: memoryview) -> Contents:
     return contents
 
 
-def _opened(frame: Requests | Frame, end: int, digest: bytes) -> Contents:
+def _contents_of_requests(frame: Requests | Frame, end: int, digest: bytes) -> Contents:
     if not isinstance(frame, Requests) or not frame.requests:
         raise ModelError("the first frame holds no request")
     sections = [Section(law=r.structure.has_order_law) for r in frame.requests]
@@ -547,7 +551,7 @@ def _opened(frame: Requests | Frame, end: int, digest: bytes) -> Contents:
 
 
 #: Maximum time between two writes, each flushed to disk. Less than a second of work is lost on a crash.
-INTERVAL = 0.3
+FLUSH_INTERVAL_S = 0.3
 
 
 class Store:
@@ -565,9 +569,9 @@ class Store:
         self.notes: list[str] = []
         self._last = time.monotonic()
         #: By search and first round: frames not written yet, and the failures written last.
-        self._waiting: dict[tuple[int, int], Begun] = {}
+        self._waiting: dict[tuple[int, int], PartialRounds] = {}
         self._failures: dict[tuple[int, int], Failures | None] = {}
-        self._log = Log(path, SEARCH, create=requests is not None)
+        self._log = FrameFile(path, SEARCH_FILE, create=requests is not None)
         try:
             self._begin(requests, salvage=salvage)
         except BaseException:
@@ -576,20 +580,20 @@ class Store:
 
     def _begin(self, requests: Sequence[Request] | None, *, salvage: bool) -> None:
         data = self._log.read()
-        if requests is not None and self._log.unbegun(data):
+        if requests is not None and self._log.has_no_frame(data):
             # A payload read back must be the one asked for: what would not survive is found before any work.
-            payload = ENCODER.encode(Requests(ALGORITHM, __version__, tuple(requests)))
+            payload = FRAME_ENCODER.encode(Requests(ALGORITHM_VERSION, __version__, tuple(requests)))
             data = self._log.begin(payload)
         self.contents = held = contents_of(self.path, memoryview(data))
         if requests is not None:
             self._check_same(requests, held.requests)
         self._log.end, self._log.digest = held.end, held.digest
-        if held.damage is not None:
-            self._salvage(data, salvage=salvage)
-        elif held.torn:
-            self.notes.append(f"{held.torn} bytes of an unfinished write at byte {held.end} were dropped")
+        if held.corruption is not None:
+            self._recover(data, salvage=salvage)
+        elif held.truncated_bytes:
+            self.notes.append(f"{held.truncated_bytes} bytes of an unfinished write at byte {held.end} were dropped")
         if held.end < len(data):
-            self._log.cut()
+            self._log.truncate()
 
     def _check_same(self, asked: Sequence[Request], held: Sequence[Request]) -> None:
         if [r.name for r in asked] != [r.name for r in held]:
@@ -602,36 +606,37 @@ class Store:
                     f"store {self.path} holds another search of {one.name} (asked is {difference}); choose another file"
                 )
 
-    def _salvage(self, data: bytes, *, salvage: bool) -> None:
+    def _recover(self, data: bytes, *, salvage: bool) -> None:
         lost = len(data) - self.contents.end
         if not salvage:
             raise DataError(
-                f"store {self.path} is damaged: {self.contents.damage}; {lost} bytes from there on cannot be trusted: "
+                f"store {self.path} is damaged: {self.contents.corruption}; {lost} bytes from there on cannot be "
+                "trusted: "
                 "resume with salvage=True (--salvage) to keep what stands before and compute the rest again"
             )
         copy = self.path.with_name(self.path.name + ".damaged")
         write_atomically(copy, data, force=False)
         self.notes.append(f"{lost} damaged bytes from byte {self.contents.end} on were dropped; {copy} keeps them")
-        self.contents.damage = None
+        self.contents.corruption = None
 
-    def outdated(self) -> DataError:
+    def outdated_error(self) -> DataError:
         """Return the error of a search that another version began and this one cannot resume."""
         held = self.contents
         return DataError(
             f"store {self.path} is of ftlm {held.version}, whose rounds follow algorithm {held.algorithm}; this "
-            f"version's is {ALGORITHM}: finish the search with that version, or start it again in another "
+            f"version's is {ALGORITHM_VERSION}: finish the search with that version, or start it again in another "
             "file"
         )
 
     def _append(self, added: Sequence[Frame]) -> None:
         held = self.contents
-        if held.algorithm not in (ALGORITHM, *CONTINUED):
+        if held.algorithm not in (ALGORITHM_VERSION, *RESUMABLE_ALGORITHMS):
             # A finished search is only read, whatever made it.
-            raise self.outdated()
-        self._log.append([ENCODER.encode(frame) for frame in added])
+            raise self.outdated_error()
+        self._log.append([FRAME_ENCODER.encode(frame) for frame in added])
         self._last = time.monotonic()
         for frame in added:
-            self.contents.sections[frame.search].take(frame)
+            self.contents.sections[frame.search].add_frame(frame)
 
     def save(self, search: int, first: int, last: int, checkpoint: Checkpoint | None) -> None:
         """Note the progress of a block of rounds; it is written with others, or when the flush interval ends."""
@@ -641,8 +646,8 @@ class Store:
             rows = (*(before.rows if before else ()), *rows)
             anew = anew or (before is not None and before.anew)
             told = cast("Place", tuple(place))
-            self._waiting[search, first] = Begun(search, first, last, told, rows, counts, failures, order, anew)
-        if time.monotonic() - self._last >= INTERVAL:
+            self._waiting[search, first] = PartialRounds(search, first, last, told, rows, counts, failures, order, anew)
+        if time.monotonic() - self._last >= FLUSH_INTERVAL_S:
             self.flush()
 
     def flush(self) -> None:
@@ -656,16 +661,16 @@ class Store:
         if due:
             self._append(due)
 
-    def done(self, frame: Rounds | Verdicts) -> None:
+    def append_block(self, frame: Rounds | Verdicts) -> None:
         """Append a complete block."""
         self._waiting.pop((frame.search, frame.first), None)
         self._failures.pop((frame.search, frame.first), None)
         self._append([frame])
 
-    def joined(self, search: int, table: _core._FoundStage) -> None:
+    def append_table(self, search: int, table: _core._FoundStage) -> None:
         """Append the final table of a search under an order law."""
         frame = {"type": "joined", "search": search, **{k: table[k] for k in ("rows", "counts", "failures")}}
-        self._append([msgspec.convert(frame, Joined)])
+        self._append([msgspec.convert(frame, CoupledTable)])
 
     def close(self) -> None:
         """Write pending frames and release the lock."""

@@ -1,4 +1,4 @@
-"""Checked settings of an estimator and of an order search."""
+"""Options of estimators and order searches, validated."""
 
 from __future__ import annotations
 
@@ -15,55 +15,57 @@ Criterion = Literal["output-error", "equation-error"]
 Coefficients = Literal["multi-innovation", "least-squares", "instrumental-variables"]
 Loss = Literal["squares", "huber"]
 Intervals = Literal["auto", "quadratic", "profile"]
-LOSSES = ("squares", "huber")
-INTERVALS = ("auto", "quadratic", "profile")
-METHODS = ("output-error", "instrumental-variables", "multi-innovation", "least-squares", "genetic")
-_LATTICE = METHODS[1:4]
-#: The methods of `identify` that use an option; one that is not here (runs, structure, m, threads, progress) is of all.
-USED_BY: dict[str, tuple[str, ...]] = {
-    "lattice": METHODS[1:],
-    "criterion": _LATTICE,
-    "norm": METHODS[1:],
-    "keep": _LATTICE,
+LOSS_CHOICES = ("squares", "huber")
+INTERVAL_CHOICES = ("auto", "quadratic", "profile")
+METHOD_CHOICES = ("output-error", "instrumental-variables", "multi-innovation", "least-squares", "genetic")
+_GRID_SEARCH_METHODS = METHOD_CHOICES[1:4]
+#: Methods of `identify` that use an option; options that are not listed (runs, structure, m, …) apply to all methods.
+METHODS_BY_OPTION: dict[str, tuple[str, ...]] = {
+    "lattice": METHOD_CHOICES[1:],
+    "criterion": _GRID_SEARCH_METHODS,
+    "norm": METHOD_CHOICES[1:],
+    "keep": _GRID_SEARCH_METHODS,
     "innovation_length": ("multi-innovation",),
     "prior_covariance": ("multi-innovation",),
     "rows": ("multi-innovation",),
     "genetic": ("genetic",),
-    "loss": METHODS[:1],
-    "reference": METHODS[:1],
-    "intervals": METHODS[:1],
-    "start": METHODS[:1],
-    "store": _LATTICE,
-    "executor": _LATTICE,
+    "loss": METHOD_CHOICES[:1],
+    "reference": METHOD_CHOICES[:1],
+    "intervals": METHOD_CHOICES[:1],
+    "start": METHOD_CHOICES[:1],
+    "store": _GRID_SEARCH_METHODS,
+    "executor": _GRID_SEARCH_METHODS,
 }
-#: What belongs to the search of orders: lattice methods use it only where an order is free.
-OF_SEARCHES = ("lattice", "criterion", "norm", "keep", "store", "executor")
-#: Innovation lengths that are laid side by side: those of the paper's tables.
-COMPARED_LENGTHS = (1, 3, 5, 7)
-#: Steps of refined instrumental variables a candidate; most stand still before.
-REFINEMENTS = 5
+#: Options of the order search; grid methods use them only if an order is free.
+SEARCH_OPTIONS = ("lattice", "criterion", "norm", "keep", "store", "executor")
+#: Innovation lengths of the paper's tables.
+COMPARED_INNOVATION_LENGTHS = (1, 3, 5, 7)
+#: Bound on the refined-instrumental-variables iterations per candidate; most converge earlier.
+MAX_IV_ITERATIONS = 5
 
 
-def check_used(method: str, given: Iterable[str], *, free: bool = True, argument: str = "method") -> None:
-    """Refuse options that a method does not use with a `ModelError` that names the first and how many they are.
+def check_options_used(method: str, given: Iterable[str], *, free: bool = True, argument: str = "method") -> None:
+    """Raise a `ModelError` if options are given that a method does not use.
 
     Parameters
     ----------
     method
         One of :data:`METHODS`.
     given
-        Names of the options that somebody gave, whatever their values.
+        Names of the options that were given.
     free
         Whether an order is free.
     argument
-        What the caller calls the method.
+        Name of the method argument in the error message.
     """
-    useless = [n for n in given if method not in USED_BY.get(n, METHODS)]
-    fixed = [n for n in given if not free and method in _LATTICE and n in OF_SEARCHES and n not in useless]
+    useless = [n for n in given if method not in METHODS_BY_OPTION.get(n, METHOD_CHOICES)]
+    fixed = [
+        n for n in given if not free and method in _GRID_SEARCH_METHODS and n in SEARCH_OPTIONS and n not in useless
+    ]
     count = len(useless) + len(fixed)
     others = f", nor {count - 1} other{'s' if count > 2 else ''} given here" if count > 1 else ""
     if useless:
-        users = " or ".join(f"{argument}={m!r}" for m in USED_BY[useless[0]])
+        users = " or ".join(f"{argument}={m!r}" for m in METHODS_BY_OPTION[useless[0]])
         raise ModelError(f"{useless[0]}= is not used by {argument}={method!r}{others}; leave it out, or use {users}")
     if fixed:
         raise ModelError(
@@ -74,7 +76,7 @@ def check_used(method: str, given: Iterable[str], *, free: bool = True, argument
 
 @dataclass(frozen=True)
 class Settings:
-    """Checked settings of an estimator of coefficients, and of the order search that ranks by it."""
+    """Settings of a coefficient estimator and of the order search that ranks by it, validated."""
 
     criterion: str = "output-error"
     norm: str = "l1"
@@ -99,7 +101,7 @@ class Settings:
         threads: int | None = None,
         early_stopping: bool = True,
     ) -> Settings:
-        """Refuse words and numbers that mean nothing with a `ModelError` that names the argument."""
+        """Validate the arguments; raise a `ModelError` that names the invalid one."""
         for name, value, known in (
             ("criterion", criterion, ("output-error", "equation-error")),
             ("norm", norm, ("l1", "l2")),
@@ -125,16 +127,16 @@ class Settings:
         """Whether m must be a power of two."""
         return self.coefficients == "multi-innovation" and self.rows == "haar"
 
-    def core(self, memory: int | None = None) -> tuple[str, str, int, float, bool, int, int, bool, int, int]:
-        """As the core takes them; memory that is not given is asked for here and now, where the search runs."""
+    def core_arguments(self, memory: int | None = None) -> tuple[str, str, int, float, bool, int, int, bool, int, int]:
+        """Return the settings as arguments of the core; the default memory limit is that of this machine."""
         p = self.innovation_length if self.coefficients == "multi-innovation" else 0
-        steps = REFINEMENTS if self.coefficients == "instrumental-variables" else 0
+        steps = MAX_IV_ITERATIONS if self.coefficients == "instrumental-variables" else 0
         ranked = (self.criterion, self.norm, p, self.prior_covariance, self.rows == "haar")
         most = memory_limit() if memory is None else memory
         return *ranked, self.keep, self.threads, self.early_stopping, steps, most
 
     def to_dict(self) -> dict[str, Any]:
-        """For results and reports."""
+        """Return the settings that results and reports show."""
         out: dict[str, Any] = {"criterion": self.criterion, "norm": self.norm, "coefficients": self.coefficients}
         if self.coefficients == "multi-innovation":
             out |= {"innovation_length": self.innovation_length, "prior_covariance": self.prior_covariance}

@@ -42,57 +42,63 @@ class OrderCertificate:
         Block pulses per run.
     """
 
-    at_least: float
+    lower_bound: float
     best: float
     orders: dict[str, float]
-    asked: float
+    requested_tolerance: float
     intervals: dict[str, tuple[float, float]]
-    apart: float
-    largest: float
+    min_separation: float
+    max_term_ratio: float
     cells: int
-    open: int
+    open_cells: int
     m: int
 
     @property
-    def within(self) -> float:
+    def proved_tolerance(self) -> float:
         """Tolerance achieved: by what fraction other orders may be better; 1 if nothing is proved."""
-        return max(0.0, 1 - self.at_least / self.best)
+        return max(0.0, 1 - self.lower_bound / self.best)
 
     def to_dict(self) -> dict[str, Any]:
         """For JSON."""
         return {
-            "at_least": self.at_least,
+            "at_least": self.lower_bound,
             "best": self.best if self.orders else None,
-            "within": self.within,
-            "asked": self.asked,
+            "within": self.proved_tolerance,
+            "asked": self.requested_tolerance,
             "orders": self.orders,
             "intervals": {name: list(interval) for name, interval in self.intervals.items()},
-            "apart": self.apart,
-            "largest": self.largest,
+            "apart": self.min_separation,
+            "largest": self.max_term_ratio,
             "cells": self.cells,
-            "open": self.open,
+            "open": self.open_cells,
             "m": self.m,
         }
 
     def __str__(self) -> str:
         intervals = ", ".join(f"{n} from {low:g} to {high:g}" for n, (low, high) in self.intervals.items())
-        apart = f"orders of the output {self.apart:g} below its highest, of one signal {self.apart:g} apart"
+        separation = f"{self.min_separation:g}"
+        apart = f"orders of the output {separation} below its highest, of one signal {separation} apart"
         found = ", ".join(f"{name} {value:.5g}" for name, value in self.orders.items())
         cells = f"{self.cells} boxes of orders"
-        if self.at_least == 0:
+        if self.lower_bound == 0:
             return (
-                f"certificate: nothing is proved of all orders with {intervals} ({apart}): {self.open} of {cells} are "
+                f"certificate: nothing is proved of all orders with {intervals} ({apart}): {self.open_cells} of "
+                f"{cells} are "
                 "left; narrow the intervals, keep orders farther apart, or allow more boxes"
             )
         # Rounded up: a share that is said must be true.
-        share = math.ceil(1000 * self.within - 1e-4) / 10
+        share = math.ceil(1000 * self.proved_tolerance - 1e-4) / 10
         text = (
             f"certificate: no orders with {intervals} ({apart}), on a lattice or between, leave an RMS equation error "
-            f"below {self.at_least:.5g} with coefficients whose terms are together at most {self.largest:g} times the "
+            f"below {self.lower_bound:.5g} with coefficients whose terms are together at most "
+            f"{self.max_term_ratio:g} times the "
             f"output; {found} leave {self.best:.5g}, so nothing is better by more than {share:g} % ({cells})"
         )
-        if self.open:
-            text += f"; {100 * self.asked:g} % was asked for, and {self.open} boxes were too small to halve or too many"
+        if self.open_cells:
+            text += (
+                f"; {100 * self.requested_tolerance:g} % was asked for, and {self.open_cells} boxes were too small to "
+                "halve or too many"
+            )
         return text
 
 
@@ -155,12 +161,12 @@ class SearchResult:
     table: list[SearchRow]
     model: Model
     candidates: int
-    pruned: dict[str, int]
+    exclusion_counts: dict[str, int]
     failures: list[tuple[dict[str, float], str]]
     m: int
     settings: dict[str, Any]
-    edges: dict[str, float]
-    boxed: int = 0
+    at_grid_edge: dict[str, float]
+    excluded_by_box: int = 0
     certificate: OrderCertificate | None = None
 
     @property
@@ -182,11 +188,11 @@ class SearchResult:
         return search_html(self)
 
     @property
-    def left_out(self) -> str:
+    def excluded_summary(self) -> str:
         """Text with the counts of the excluded candidates, by reason."""
-        told = {reason: f"{count} {reason}" for reason, count in self.pruned.items() if count}
-        if self.boxed:
-            told["bound"] += f" ({self.boxed} of them in boxes excluded whole)"
+        told = {reason: f"{count} {reason}" for reason, count in self.exclusion_counts.items() if count}
+        if self.excluded_by_box:
+            told["bound"] += f" ({self.excluded_by_box} of them in boxes excluded whole)"
         return "".join(f", {words}" for words in told.values())
 
     def to_frame(self) -> Any:
@@ -198,13 +204,13 @@ class SearchResult:
         """For JSON."""
         return {
             "candidates": self.candidates,
-            "pruned": self.pruned,
-            "boxed": self.boxed,
+            "pruned": self.exclusion_counts,
+            "boxed": self.excluded_by_box,
             "m": self.m,
             "settings": self.settings,
             "table": [dict(vars(row)) for row in self.table],
             "failures": [{"orders": o, "reason": reason} for o, reason in self.failures],
-            "edges": self.edges,
+            "edges": self.at_grid_edge,
         } | ({} if self.certificate is None else {"certificate": self.certificate.to_dict()})
 
     def __str__(self) -> str:
@@ -216,8 +222,10 @@ class SearchResult:
             orders = "".join(f"{row.orders[n]:>9.5g}" for n in names)
             values = "".join(f"{row.coefficients[n]:>12.5g}" for n in coefficients)
             lines.append(f"{row.rank:>4}{row.score:>12.5g}{orders}{values}")
-        lines.append(f"{self.candidates} candidates: {len(self.table)} kept{self.left_out}")
-        lines += [f"warning: order {n} = {v:g} is on the edge of its interval; widen it" for n, v in self.edges.items()]
+        lines.append(f"{self.candidates} candidates: {len(self.table)} kept{self.excluded_summary}")
+        lines += [
+            f"warning: order {n} = {v:g} is on the edge of its interval; widen it" for n, v in self.at_grid_edge.items()
+        ]
         if self.certificate is not None:
             lines.append(str(self.certificate))
         return "\n".join(lines)
@@ -257,8 +265,8 @@ class StoreStatus:
     settings: dict[str, Any]
     runs: tuple[str, ...]
     version: str
-    torn: int
-    damage: str | None
+    truncated: int
+    corruption: str | None
 
     @property
     def complete(self) -> bool:
@@ -274,23 +282,25 @@ class StoreStatus:
         text = f"{self.name}: {self.done} of {self.candidates} candidates done ({share:.1f} %)"
         text += "" if self.best is None else f", best score {self.best:.6g}"
         text += f", runs {', '.join(self.runs)}"
-        if self.torn:
-            text += f"\n{self.torn} bytes of an unfinished write at its end: being written now, or dropped on resuming"
-        if self.damage is not None:
-            text += f"\ndamaged: {self.damage}; resume with --salvage to keep what stands before"
+        if self.truncated:
+            text += (
+                f"\n{self.truncated} bytes of an unfinished write at its end: being written now, or dropped on resuming"
+            )
+        if self.corruption is not None:
+            text += f"\ndamaged: {self.corruption}; resume with --salvage to keep what stands before"
         return text
 
 
 def search_summary(searches: Mapping[str, SearchResult], *, title: str = "What became of the candidates") -> Table:
     """Return a table of kept and excluded candidates, by reason; together they are all candidates."""
-    reasons = list(dict.fromkeys(reason for s in searches.values() for reason in s.pruned))
+    reasons = list(dict.fromkeys(reason for s in searches.values() for reason in s.exclusion_counts))
     rows: list[list[Cell]] = [
         [
             _search_name(name),
             s.settings["criterion"],
             s.candidates,
             len(s.table),
-            *(s.pruned.get(reason, 0) for reason in reasons),
+            *(s.exclusion_counts.get(reason, 0) for reason in reasons),
         ]
         for name, s in searches.items()
     ]
@@ -302,10 +312,11 @@ def search_summary(searches: Mapping[str, SearchResult], *, title: str = "What b
         note="Every candidate of the lattice is kept or counted under a reason. “beaten” and “stopped early” were "
         "worse than the last row kept."
         + "".join(
-            f" Of the {number(s.pruned['bound'])} under “bound” of {_search_name(name)}, {number(s.boxed)} are in "
+            f" Of the {number(s.exclusion_counts['bound'])} under “bound” of {_search_name(name)}, "
+            f"{number(s.excluded_by_box)} are in "
             "boxes of orders that one bound excludes whole."
             for name, s in searches.items()
-            if s.boxed
+            if s.excluded_by_box
         ),
     )
 
@@ -349,10 +360,10 @@ def _search_name(name: str) -> str:
 def search_html(found: SearchResult) -> str:
     """Return the best rows of an order search and the counts of the excluded candidates."""
     rows: list[list[Cell]] = [["kept", len(found.table)]]
-    for reason, count in found.pruned.items():
+    for reason, count in found.exclusion_counts.items():
         rows.append([reason, count])
-        if reason == "bound" and found.boxed:
-            rows.append(["of these in boxes excluded whole", found.boxed])
+        if reason == "bound" and found.excluded_by_box:
+            rows.append(["of these in boxes excluded whole", found.excluded_by_box])
     name = found.model.outputs[0] if len(found.model.outputs) == 1 else "stage"
     note = "" if found.certificate is None else str(found.certificate)
     rest = Table(f"{found.candidates} candidates", ("became of them", "count"), rows, note=note)

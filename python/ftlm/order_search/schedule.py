@@ -21,21 +21,31 @@ import numpy as np
 
 from ftlm import _core
 from ftlm.errors import ConvergenceError, FtlmError, ModelError
-from ftlm.order_search.checkpoint import Checkpoint, Joined, Outcomes, Part, Rounds, Section, Span, Store, Verdicts
+from ftlm.order_search.checkpoint import (
+    Checkpoint,
+    CoupledTable,
+    Outcomes,
+    Part,
+    Rounds,
+    Section,
+    Span,
+    Store,
+    Verdicts,
+)
 from ftlm.order_search.options import Settings
 from ftlm.simulation.discretization import InitialTuple
 from ftlm.utils.validation import Floats
 
 #: Maximum number of search evaluators that a worker caches.
-READY = 2
+MAX_CACHED_SEARCHES = 2
 Table = TypeVar("Table")
 Piece = TypeVar("Piece")
 CoreRecord = tuple[float, Floats, Floats | None]
-Told = Callable[[int, int, int], None]
+ProgressCallback = Callable[[int, int, int], None]
 
 
 @dataclass(frozen=True)
-class Work(ABC, Generic[Table]):
+class SearchProblem(ABC, Generic[Table]):
     """Search problem: data shared by all rounds of a search, and its reduction to a table."""
 
     runs: tuple[CoreRecord, ...]
@@ -45,19 +55,19 @@ class Work(ABC, Generic[Table]):
 
     @property
     @abstractmethod
-    def asked(self) -> tuple[Any, ...]:
+    def core_arguments(self) -> tuple[Any, ...]:
         """Arguments of the core after the runs."""
 
     def core(self, *more: Any) -> tuple[Any, ...]:
         """Return all arguments of the core, with further ones appended."""
-        return list(self.runs), *self.asked, *more
+        return list(self.runs), *self.core_arguments, *more
 
     @abstractmethod
-    def search(self, progress: Told | None) -> Table:
+    def search(self, progress: ProgressCallback | None) -> Table:
         """Run the whole search in this process."""
 
     @abstractmethod
-    def ready(self) -> _core.OrderSearch | _core.StageSearch:
+    def build_evaluator(self) -> _core.OrderSearch | _core.StageSearch:
         """Build the evaluator shared by all blocks of the search."""
 
     @property
@@ -68,33 +78,33 @@ class Work(ABC, Generic[Table]):
             digest.update(msgspec.msgpack.encode((step, means.shape, sensor is None)))
             digest.update(np.ascontiguousarray(means).tobytes())
             digest.update(b"" if sensor is None else np.ascontiguousarray(sensor).tobytes())
-        digest.update(msgspec.msgpack.encode(self.asked))
+        digest.update(msgspec.msgpack.encode(self.core_arguments))
         return digest.hexdigest()
 
 
 @dataclass(frozen=True)
-class EquationWork(Work["_core._Found"]):
+class EquationProblem(SearchProblem["_core._Found"]):
     """Search problem of one equation: output, values of its order, and signal, values and freedom of each term."""
 
     orders: tuple[int, list[float], list[tuple[int, list[float], bool]]]
     fixed: list[float | None]
 
     @property
-    def asked(self) -> tuple[Any, ...]:
+    def core_arguments(self) -> tuple[Any, ...]:
         """Arguments of the core after the runs."""
-        return self.orders, self.inputs, self.fixed, self.initial, self.settings.core()
+        return self.orders, self.inputs, self.fixed, self.initial, self.settings.core_arguments()
 
-    def search(self, progress: Told | None) -> _core._Found:
+    def search(self, progress: ProgressCallback | None) -> _core._Found:
         """Run the whole search in this process."""
         return _core.search(*self.core(progress))
 
-    def ready(self) -> _core.OrderSearch:
+    def build_evaluator(self) -> _core.OrderSearch:
         """Build the evaluator shared by all rounds."""
         return _core.OrderSearch(*self.core())
 
     def plan(self, algorithm: int | None = None) -> tuple[int, list[int], int]:
         """Return number of candidates, ends of the batches by this or an earlier algorithm, and algorithm version."""
-        return _core.search_plan(self.orders, self.inputs, self.initial, self.settings.core(), algorithm)
+        return _core.search_plan(self.orders, self.inputs, self.initial, self.settings.core_arguments(), algorithm)
 
     @property
     def samples(self) -> int:
@@ -103,12 +113,12 @@ class EquationWork(Work["_core._Found"]):
 
     def join(self, parts: list[Part]) -> _core._Found:
         """Join the parts of all rounds."""
-        settings = self.settings.core()
+        settings = self.settings.core_arguments()
         return _core.search_join(self.orders, self.inputs, self.initial, settings, self.samples, parts)
 
 
 @dataclass(frozen=True)
-class StageWork(Work["_core._FoundStage"]):
+class CoupledProblem(SearchProblem["_core._FoundStage"]):
     """Search problem of coupled equations: values of the free orders, order law, and a scale of each score."""
 
     axes: list[list[float]]
@@ -117,20 +127,20 @@ class StageWork(Work["_core._FoundStage"]):
     scales: list[float]
 
     @property
-    def asked(self) -> tuple[Any, ...]:
+    def core_arguments(self) -> tuple[Any, ...]:
         """Arguments of the core after the runs."""
-        return self.axes, self.laws, self.inputs, self.fixed, self.scales, self.initial, self.settings.core()
+        return self.axes, self.laws, self.inputs, self.fixed, self.scales, self.initial, self.settings.core_arguments()
 
-    def search(self, progress: Told | None) -> _core._FoundStage:
+    def search(self, progress: ProgressCallback | None) -> _core._FoundStage:
         """Run the whole search in this process."""
         return _core.search_stage(*self.core(progress))
 
-    def ready(self, *, keeps_course: bool = False) -> _core.StageSearch:
+    def build_evaluator(self, *, keeps_course: bool = False) -> _core.StageSearch:
         """Build the evaluator shared by all candidates, and optionally the state of the search."""
         return _core.StageSearch(*self.core(keeps_course))
 
 
-_ready: OrderedDict[str, _core.OrderSearch | _core.StageSearch] = OrderedDict()
+_cached_searches: OrderedDict[str, _core.OrderSearch | _core.StageSearch] = OrderedDict()
 _lock = threading.Lock()
 
 
@@ -144,44 +154,54 @@ if hasattr(os, "register_at_fork"):
     os.register_at_fork(after_in_child=_new_lock)
 
 
-def some_rounds(
-    key: str, work: EquationWork | None, first: int, last: int, seed: list[tuple[int, float]], start: Any, threads: int
+def evaluate_rounds(
+    key: str,
+    work: EquationProblem | None,
+    first: int,
+    last: int,
+    seed: list[tuple[int, float]],
+    start: Any,
+    threads: int,
 ) -> tuple[float, Part] | None:
     """Evaluate rounds in a worker: return seconds and part, or None if the search is neither cached nor given."""
-    return _timed(key, work, lambda search: cast("Part", search.rounds(first, last, seed, start, threads, None, None)))
+    return _run_cached(
+        key, work, lambda search: cast("Part", search.rounds(first, last, seed, start, threads, None, None))
+    )
 
 
-def some_candidates(key: str, work: StageWork | None, spans: list[Span], threads: int) -> tuple[float, Outcomes] | None:
+def evaluate_candidates(
+    key: str, work: CoupledProblem | None, spans: list[Span], threads: int
+) -> tuple[float, Outcomes] | None:
     """Evaluate candidates in a worker: return seconds and verdicts, or None if the search is unavailable."""
-    return _timed(key, work, lambda search: cast("Outcomes", search.follow(spans, threads, None)))
+    return _run_cached(key, work, lambda search: cast("Outcomes", search.follow(spans, threads, None)))
 
 
-def _timed(key: str, work: Work[Any] | None, do: Callable[[Any], Piece]) -> tuple[float, Piece] | None:
+def _run_cached(key: str, work: SearchProblem[Any] | None, do: Callable[[Any], Piece]) -> tuple[float, Piece] | None:
     with _lock:
-        search = _ready.get(key) or (None if work is None else work.ready())
+        search = _cached_searches.get(key) or (None if work is None else work.build_evaluator())
         if search is None:
             return None
-        _ready[key] = search
-        _ready.move_to_end(key)
-        while len(_ready) > READY:
-            _ready.popitem(last=False)
+        _cached_searches[key] = search
+        _cached_searches.move_to_end(key)
+        while len(_cached_searches) > MAX_CACHED_SEARCHES:
+            _cached_searches.popitem(last=False)
     began = time.monotonic()
     piece = do(search)
     return time.monotonic() - began, piece
 
 
 #: Target duration of a task: long compared with its transfer, short enough to lose little.
-TASK = 2.0
+TASK_DURATION_S = 2.0
 #: Number of submitted tasks per worker, so that no worker idles.
-AHEAD = 2
+TASKS_PER_WORKER = 2
 #: Maximum number of attempts at a task before the search fails.
-ATTEMPTS = 3
+MAX_ATTEMPTS = 3
 #: Interval at which signals and the checkpoint file are serviced while tasks run.
-LOOK = 0.05
+POLL_INTERVAL_S = 0.05
 
 
 @dataclass
-class Stretch:
+class CandidateBlock:
     """Contiguous block of rounds or candidates to evaluate, from a checkpoint or from its start."""
 
     first: int
@@ -191,7 +211,7 @@ class Stretch:
     attempts: int = 0
 
 
-def workers(executor: Executor) -> int:
+def worker_count(executor: Executor) -> int:
     """Number of tasks that an executor runs concurrently, as far as it is known."""
     count = getattr(executor, "_max_workers", None)
     client = getattr(executor, "_client", None)
@@ -202,45 +222,45 @@ def workers(executor: Executor) -> int:
 
 
 @dataclass
-class Pace:
+class Throughput:
     """Throughput: seconds per round or candidate, once known, and the minimum number in a task."""
 
-    each: float = 0.0
-    fewest: int = 1
+    seconds_each: float = 0.0
+    min_count: int = 1
 
-    def size(self, seconds: float) -> int:
+    def count_for(self, seconds: float) -> int:
         """Number of rounds or candidates that take about the given time."""
-        return self.fewest if self.each == 0 else max(self.fewest, int(seconds / self.each))
+        return self.min_count if self.seconds_each == 0 else max(self.min_count, int(seconds / self.seconds_each))
 
-    def took(self, seconds: float, count: int) -> None:
+    def update(self, seconds: float, count: int) -> None:
         """Update the throughput by a measured time."""
         each = max(seconds, 1e-9) / count
-        self.each = each if self.each == 0 else 0.7 * self.each + 0.3 * each
+        self.seconds_each = each if self.seconds_each == 0 else 0.7 * self.seconds_each + 0.3 * each
 
 
-def shipped(
-    send: Callable[[Stretch], tuple[Any, ...]], left: list[Stretch], executor: Executor, pace: Pace
-) -> Iterator[tuple[Stretch, Any]]:
+def run_on_executor(
+    send: Callable[[CandidateBlock], tuple[Any, ...]], left: list[CandidateBlock], executor: Executor, pace: Throughput
+) -> Iterator[tuple[CandidateBlock, Any]]:
     """Submit blocks in tasks of about :data:`TASK_DURATION_S` seconds each, and yield their results."""
-    count = workers(executor)
-    ahead = AHEAD * count + 2
+    count = worker_count(executor)
+    ahead = TASKS_PER_WORKER * count + 2
     # Of a short wave every worker gets its share.
-    share = max(pace.fewest, -(-sum(s.last - s.first for s in left) // count))
-    pending: dict[Future[Any], Stretch] = {}
+    share = max(pace.min_count, -(-sum(s.last - s.first for s in left) // count))
+    pending: dict[Future[Any], CandidateBlock] = {}
     waiting = left[::-1]
     try:
         while waiting or pending:
             while waiting and len(pending) < ahead:
                 stretch = waiting.pop()
-                size = min(pace.size(TASK), share)
+                size = min(pace.count_for(TASK_DURATION_S), share)
                 if stretch.start is None and stretch.attempts == 0 and stretch.last - stretch.first > size:
-                    waiting.append(Stretch(stretch.first + size, stretch.last))
-                    stretch = Stretch(stretch.first, stretch.first + size)
+                    waiting.append(CandidateBlock(stretch.first + size, stretch.last))
+                    stretch = CandidateBlock(stretch.first, stretch.first + size)
                 try:
                     pending[executor.submit(*send(stretch))] = stretch
                 except (BrokenExecutor, RuntimeError) as error:
-                    raise _lost(error) from error
-            done, _ = wait(pending, timeout=LOOK, return_when=FIRST_COMPLETED)
+                    raise _executor_error(error) from error
+            done, _ = wait(pending, timeout=POLL_INTERVAL_S, return_when=FIRST_COMPLETED)
             for future in done:
                 stretch = pending.pop(future)
                 timed = _result(future, stretch)
@@ -248,36 +268,36 @@ def shipped(
                     waiting.append(stretch)
                     continue
                 seconds, piece = timed
-                pace.took(seconds, stretch.last - stretch.first)
+                pace.update(seconds, stretch.last - stretch.first)
                 yield stretch, piece
     finally:
         for future in pending:
             future.cancel()
 
 
-def _result(future: Future[Any], stretch: Stretch) -> tuple[float, Any] | None:
+def _result(future: Future[Any], stretch: CandidateBlock) -> tuple[float, Any] | None:
     """Return seconds and result of a task, or None if it must be sent again."""
     try:
         timed = cast("tuple[float, Any] | None", future.result())
     except FtlmError:
         raise
     except BrokenExecutor as error:
-        raise _lost(error) from error
+        raise _executor_error(error) from error
     except (Exception, CancelledError) as error:
         stretch.attempts += 1
-        if stretch.attempts >= ATTEMPTS:
-            raise _lost(error) from error
+        if stretch.attempts >= MAX_ATTEMPTS:
+            raise _executor_error(error) from error
         return None
     if timed is None and not stretch.sent:
         # The worker has not got what the search is computed from: it goes along the next time.
         stretch.sent = True
         return None
     if not isinstance(timed, tuple) or len(timed) != 2:
-        raise _lost(TypeError(f"a task came back with {type(timed).__name__}"))
+        raise _executor_error(TypeError(f"a task came back with {type(timed).__name__}"))
     return timed
 
 
-def _lost(error: BaseException) -> ConvergenceError:
+def _executor_error(error: BaseException) -> ConvergenceError:
     return ConvergenceError(
         f"the executor lost its work ({type(error).__name__}: {error}); start a new one and search again: "
         "with store= nothing that was finished is lost"
@@ -285,24 +305,24 @@ def _lost(error: BaseException) -> ConvergenceError:
 
 
 #: Time between two writes of candidates under an order law. Work lost on a crash is about this long.
-PIECE = 0.25
+CHECKPOINT_INTERVAL_S = 0.25
 #: Minimum number of candidates under an order law in one task, used for the first batch. The first worker then receives
 #: the record before the others ask for it.
-FEWEST = 256
+MIN_BLOCK_CANDIDATES = 256
 Done = TypeVar("Done", Rounds, Verdicts)
 #: Callback that stores a checkpoint of the rounds from the first to the last.
 Save = Callable[[int, int, Checkpoint | None], None]
 
 
-class Course(ABC, Generic[Done, Table]):
+class SearchState(ABC, Generic[Done, Table]):
     """Search state: number of candidates done and in total, and the current batch."""
 
     #: Whether a search begun by an earlier version can be resumed.
-    goes_on = True
+    can_resume = True
     #: Whether the core reports progress of local evaluation itself.
-    core_tells = False
+    core_reports_progress = False
 
-    def __init__(self, work: Work[Table], pace: Pace) -> None:
+    def __init__(self, work: SearchProblem[Table], pace: Throughput) -> None:
         self.work, self.pace = work, pace
         self.threads = work.settings.threads
         self.done = self.total = 0
@@ -312,28 +332,30 @@ class Course(ABC, Generic[Done, Table]):
         """Key of the search in the workers' caches."""
         return self.work.key
 
-    def payload(self, stretch: Stretch) -> Work[Table] | None:
+    def payload(self, stretch: CandidateBlock) -> SearchProblem[Table] | None:
         """Search problem to send with a block, or None unless a worker reported that it lacks it."""
         return self.work if stretch.sent else None
 
     @abstractmethod
-    def waves(self) -> Iterator[tuple[int, int]]:
+    def batches(self) -> Iterator[tuple[int, int]]:
         """Yield first index and end of each batch; the next is constructed once the previous one is complete."""
 
     @abstractmethod
-    def here(self, left: list[Stretch], progress: Told | None, save: Save | None) -> Iterator[tuple[Stretch, Any]]:
+    def evaluate_locally(
+        self, left: list[CandidateBlock], progress: ProgressCallback | None, save: Save | None
+    ) -> Iterator[tuple[CandidateBlock, Any]]:
         """Evaluate blocks in this process."""
 
     @abstractmethod
-    def task(self, stretch: Stretch) -> tuple[Any, ...]:
+    def task(self, stretch: CandidateBlock) -> tuple[Any, ...]:
         """Return a function and its arguments that evaluate a block in a worker."""
 
     @abstractmethod
-    def frame(self, number: int, stretch: Stretch, piece: Any) -> Done:
+    def frame(self, number: int, stretch: CandidateBlock, piece: Any) -> Done:
         """Convert the result of a block to a frame of search ``number``."""
 
     @abstractmethod
-    def take(self, done: Done) -> int:
+    def add_block(self, done: Done) -> int:
         """Add a block to the current batch; return how many of its candidates were stopped early, if known."""
 
     @abstractmethod
@@ -341,14 +363,14 @@ class Course(ABC, Generic[Done, Table]):
         """Reduce all batches to the table."""
 
 
-class EquationCourse(Course[Rounds, "_core._Found"]):
+class EquationSearchState(SearchState[Rounds, "_core._Found"]):
     """Search state of one equation; the rounds of a batch depend on the best rows of earlier batches."""
 
-    core_tells = True
-    work: EquationWork
+    core_reports_progress = True
+    work: EquationProblem
 
-    def __init__(self, work: EquationWork, algorithm: int | None = None) -> None:
-        super().__init__(work, Pace())
+    def __init__(self, work: EquationProblem, algorithm: int | None = None) -> None:
+        super().__init__(work, Throughput())
         self.total, self._ends, present = work.plan(algorithm)
         self.goes_on = algorithm is None or algorithm >= present
         self._parts: list[Part] = []
@@ -356,42 +378,44 @@ class EquationCourse(Course[Rounds, "_core._Found"]):
 
     @cached_property
     def _search(self) -> _core.OrderSearch:
-        return self.work.ready()
+        return self.work.build_evaluator()
 
-    def waves(self) -> Iterator[tuple[int, int]]:
+    def batches(self) -> Iterator[tuple[int, int]]:
         """Yield batches of rounds with the same rows, each with its own throughput: later ones exclude more."""
         first, keep = 0, self.work.settings.keep
         for end in self._ends:
             ranked = sorted({(row[1], row[0]) for part in self._parts for row in part[0]})[:keep]
             if len(ranked) == keep:
-                self._parts = [_up_to(ranked[-1], part) for part in self._parts]
+                self._parts = [_drop_beaten_rows(ranked[-1], part) for part in self._parts]
             self._seed = [(index, score) for score, index in ranked]
-            self.pace = Pace()
+            self.pace = Throughput()
             yield first, end
             first = end
 
-    def here(self, left: list[Stretch], progress: Told | None, save: Save | None) -> Iterator[tuple[Stretch, Part]]:
+    def evaluate_locally(
+        self, left: list[CandidateBlock], progress: ProgressCallback | None, save: Save | None
+    ) -> Iterator[tuple[CandidateBlock, Part]]:
         """Evaluate each block in one call, from its checkpoint."""
         for stretch in left:
             first, last = stretch.first, stretch.last
-            told = None if progress is None else partial(self._tell, progress, self.done)
+            told = None if progress is None else partial(self._report_progress, progress, self.done)
             saved = None if save is None else partial(save, first, last)
             part = self._search.rounds(first, last, self._seed, stretch.start, self.threads, told, saved)
             yield stretch, cast("Part", part)
 
-    def _tell(self, progress: Told, before: int, done: int, _all: int, pruned: int) -> None:
+    def _report_progress(self, progress: ProgressCallback, before: int, done: int, _all: int, pruned: int) -> None:
         progress(min(before + done, self.total), self.total, pruned)
 
-    def task(self, stretch: Stretch) -> tuple[Any, ...]:
+    def task(self, stretch: CandidateBlock) -> tuple[Any, ...]:
         """Return the function and arguments that evaluate a block of rounds."""
         ranged = stretch.first, stretch.last, self._seed, stretch.start, self.threads
-        return some_rounds, self.key, self.payload(stretch), *ranged
+        return evaluate_rounds, self.key, self.payload(stretch), *ranged
 
-    def frame(self, number: int, stretch: Stretch, piece: Part) -> Rounds:
+    def frame(self, number: int, stretch: CandidateBlock, piece: Part) -> Rounds:
         """Return the frame of a block of rounds."""
         return Rounds(number, stretch.first, stretch.last, piece)
 
-    def take(self, done: Rounds) -> int:
+    def add_block(self, done: Rounds) -> int:
         """Add a block of rounds."""
         self._parts.append(done.part)
         self.done += sum(done.part[1][1:])
@@ -402,52 +426,54 @@ class EquationCourse(Course[Rounds, "_core._Found"]):
         return self.work.join(self._parts)
 
 
-def _up_to(worst: tuple[float, int], part: Part) -> Part:
+def _drop_beaten_rows(worst: tuple[float, int], part: Part) -> Part:
     """Return a part without rows worse than the last ranked one."""
     rows, counts, failures = part
     return tuple(row for row in rows if (row[1], row[0]) <= worst), counts, failures
 
 
-class StageCourse(Course[Verdicts, "_core._FoundStage"]):
+class CoupledSearchState(SearchState[Verdicts, "_core._FoundStage"]):
     """Search state of coupled equations; the candidates of a batch depend on earlier batches."""
 
-    work: StageWork
+    work: CoupledProblem
 
-    def __init__(self, work: StageWork) -> None:
-        super().__init__(work, Pace(fewest=FEWEST))
-        self.search = work.ready(keeps_course=True)
+    def __init__(self, work: CoupledProblem) -> None:
+        super().__init__(work, Throughput(min_count=MIN_BLOCK_CANDIDATES))
+        self.search = work.build_evaluator(keeps_course=True)
         self._first = 0
         self._spans: list[Span] = []
         self._wave: list[Verdicts] = []
 
-    def waves(self) -> Iterator[tuple[int, int]]:
+    def batches(self) -> Iterator[tuple[int, int]]:
         """Yield batches of the candidates required next, numbered through all batches."""
         while spans := self.search.wanted():
             end = self._first + sum(last - first for _, first, last, _ in spans)
             self._spans, self._wave = spans, []
             self.total, _ = self.search.state()
             yield self._first, end
-            self.search.take(*_whole(self._wave, self._first, end), self.threads)
+            self.search.take(*_join_verdicts(self._wave, self._first, end), self.threads)
             self._first = end
         self.total = self._first
 
-    def here(self, left: list[Stretch], progress: Told | None, save: Save | None) -> Iterator[tuple[Stretch, Outcomes]]:
+    def evaluate_locally(
+        self, left: list[CandidateBlock], progress: ProgressCallback | None, save: Save | None
+    ) -> Iterator[tuple[CandidateBlock, Outcomes]]:
         """Evaluate candidates in tasks of about :data:`CHECKPOINT_INTERVAL_S` seconds."""
         for stretch in left:
             at = stretch.first
             while at < stretch.last:
-                piece = Stretch(at, min(stretch.last, at + self.pace.size(PIECE)))
+                piece = CandidateBlock(at, min(stretch.last, at + self.pace.count_for(CHECKPOINT_INTERVAL_S)))
                 began = time.monotonic()
                 outcomes = self.search.follow(self._cut(piece), self.threads, None)
-                self.pace.took(time.monotonic() - began, piece.last - piece.first)
+                self.pace.update(time.monotonic() - began, piece.last - piece.first)
                 yield piece, outcomes
                 at = piece.last
 
-    def task(self, stretch: Stretch) -> tuple[Any, ...]:
+    def task(self, stretch: CandidateBlock) -> tuple[Any, ...]:
         """Return the function and arguments that evaluate a block of candidates."""
-        return some_candidates, self.key, self.payload(stretch), self._cut(stretch), self.threads
+        return evaluate_candidates, self.key, self.payload(stretch), self._cut(stretch), self.threads
 
-    def _cut(self, stretch: Stretch) -> list[Span]:
+    def _cut(self, stretch: CandidateBlock) -> list[Span]:
         """Return the candidates of a block as spans, counted through all spans of the batch."""
         cut, at = [], self._first
         for equation, start, end, limit in self._spans:
@@ -457,11 +483,11 @@ class StageCourse(Course[Verdicts, "_core._FoundStage"]):
             at += end - start
         return cut
 
-    def frame(self, number: int, stretch: Stretch, piece: Outcomes) -> Verdicts:
+    def frame(self, number: int, stretch: CandidateBlock, piece: Outcomes) -> Verdicts:
         """Return the frame of a block of candidates."""
         return Verdicts(number, stretch.first, stretch.last, *piece)
 
-    def take(self, done: Verdicts) -> int:
+    def add_block(self, done: Verdicts) -> int:
         """Add a block of verdicts."""
         self._wave.append(done)
         self.done += len(done.kinds)
@@ -472,7 +498,7 @@ class StageCourse(Course[Verdicts, "_core._FoundStage"]):
         return self.search.outcome()
 
 
-def _whole(wave: list[Verdicts], first: int, end: int) -> Outcomes:
+def _join_verdicts(wave: list[Verdicts], first: int, end: int) -> Outcomes:
     """Return the verdicts of a batch in order; raise ModelError if its blocks do not cover it."""
     at, values, kinds = first, [], []
     for verdicts in sorted(wave, key=lambda v: v.first):
@@ -487,17 +513,27 @@ def _whole(wave: list[Verdicts], first: int, end: int) -> Outcomes:
 
 
 def search_equation(
-    work: EquationWork, *, store: Store | None, number: int, executor: Executor | None, progress: Told | None
+    work: EquationProblem,
+    *,
+    store: Store | None,
+    number: int,
+    executor: Executor | None,
+    progress: ProgressCallback | None,
 ) -> _core._Found:
     """Search the orders of one equation: in one call here, or in rounds with a checkpoint file or executor."""
     if store is None and executor is None:
         return work.search(progress)
     algorithm = None if store is None else store.contents.algorithm
-    return _do(EquationCourse(work, algorithm), store, number, executor, progress)
+    return _run_batches(EquationSearchState(work, algorithm), store, number, executor, progress)
 
 
-def search_stage(
-    work: StageWork, *, store: Store | None, number: int, executor: Executor | None, progress: Told | None
+def search_coupled(
+    work: CoupledProblem,
+    *,
+    store: Store | None,
+    number: int,
+    executor: Executor | None,
+    progress: ProgressCallback | None,
 ) -> _core._FoundStage:
     """Search coupled equations under an order law, like :func:`search_equation`; a finished search is only read."""
     if store is None and executor is None:
@@ -505,44 +541,48 @@ def search_stage(
     joined = None if store is None else store.contents.sections[number].joined
     if joined is not None:
         return _table(work, joined)
-    table = _do(StageCourse(work), store, number, executor, progress)
+    table = _run_batches(CoupledSearchState(work), store, number, executor, progress)
     if store is not None:
-        store.joined(number, table)
+        store.append_table(number, table)
     return table
 
 
-def _do(
-    course: Course[Done, Table], store: Store | None, number: int, executor: Executor | None, progress: Told | None
+def _run_batches(
+    course: SearchState[Done, Table],
+    store: Store | None,
+    number: int,
+    executor: Executor | None,
+    progress: ProgressCallback | None,
 ) -> Table:
     """Evaluate all blocks that a checkpoint file lacks, batch by batch, and join them."""
     section = None if store is None else store.contents.sections[number]
     save = None if store is None else partial(store.save, number)
     pruned = 0
-    for first, end in course.waves():
-        for held in _held(section, first, end):
-            course.take(held)
-        left = list(_left(section, first, end))
-        if left and store is not None and not course.goes_on:
-            raise store.outdated()
+    for first, end in course.batches():
+        for held in _stored_frames(section, first, end):
+            course.add_block(held)
+        left = list(_pending_blocks(section, first, end))
+        if left and store is not None and not course.can_resume:
+            raise store.outdated_error()
         if executor is None:
-            pieces = course.here(left, progress, save)
+            pieces = course.evaluate_locally(left, progress, save)
         else:
-            pieces = shipped(course.task, left, executor, course.pace)
+            pieces = run_on_executor(course.task, left, executor, course.pace)
         for stretch, piece in pieces:
             frame = course.frame(number, stretch, piece)
             if store is not None:
-                store.done(frame)
-            pruned += course.take(frame)
-            if progress is not None and not (course.core_tells and executor is None):
+                store.append_block(frame)
+            pruned += course.add_block(frame)
+            if progress is not None and not (course.core_reports_progress and executor is None):
                 progress(course.done, course.total, pruned)
-    if section is not None and section.law and section.dealt != course.total:
-        raise ModelError(f"it holds {section.dealt} candidates of {course.total}")
+    if section is not None and section.law and section.processed_count != course.total:
+        raise ModelError(f"it holds {section.processed_count} candidates of {course.total}")
     if progress is not None:
         progress(course.total, course.total, 0)
     return course.table()
 
 
-def equation_state(work: EquationWork, section: Section) -> tuple[int, float | None]:
+def equation_state(work: EquationProblem, section: Section) -> tuple[int, float | None]:
     """Number of candidates of one equation, and the best score so far."""
     best = section.best
     if best is not None and work.settings.norm == "l2":
@@ -550,20 +590,20 @@ def equation_state(work: EquationWork, section: Section) -> tuple[int, float | N
     return work.plan()[0], best
 
 
-def stage_state(work: StageWork, section: Section) -> tuple[int, float | None]:
+def coupled_state(work: CoupledProblem, section: Section) -> tuple[int, float | None]:
     """Number of candidates of a coupled search, as far as a checkpoint file determines it, and the best score."""
     if section.joined is not None:
-        return section.dealt, _table(work, section.joined)["rows"][0][1]
-    course = StageCourse(work)
-    for first, end in course.waves():
-        for held in _held(section, first, end):
-            course.take(held)
-        if any(_left(section, first, end)):
+        return section.processed_count, _table(work, section.joined)["rows"][0][1]
+    course = CoupledSearchState(work)
+    for first, end in course.batches():
+        for held in _stored_frames(section, first, end):
+            course.add_block(held)
+        if any(_pending_blocks(section, first, end)):
             break
     return course.search.state()
 
 
-def _table(work: StageWork, joined: Joined) -> _core._FoundStage:
+def _table(work: CoupledProblem, joined: CoupledTable) -> _core._FoundStage:
     """Return the table of a finished search in the form of the core; raise ModelError for another search."""
     widths = [len(terms) for _, _, terms in work.laws]
     dealt = sum(v for k, v in joined.counts.items() if k != "candidates")
@@ -581,25 +621,25 @@ def _table(work: StageWork, joined: Joined) -> _core._FoundStage:
     return cast("_core._FoundStage", {**table, "distinct": []})
 
 
-def _held(section: Section | None, first: int, end: int) -> list[Any]:
+def _stored_frames(section: Section | None, first: int, end: int) -> list[Any]:
     """Return the stored frames of a batch."""
     return [] if section is None else [frame for at, frame in section.done.items() if first <= at < end]
 
 
-def _left(section: Section | None, first: int, end: int) -> Iterator[Stretch]:
+def _pending_blocks(section: Section | None, first: int, end: int) -> Iterator[CandidateBlock]:
     """Yield the blocks of a batch to evaluate: partial ones from their checkpoint, and the gaps between."""
-    known: list[Stretch] = []
+    known: list[CandidateBlock] = []
     if section is not None:
-        known = [Stretch(at, frame.last) for at, frame in section.done.items()]
-        known += [Stretch(at, half.last, half.checkpoint) for at, half in section.open.items()]
+        known = [CandidateBlock(at, frame.last) for at, frame in section.done.items()]
+        known += [CandidateBlock(at, half.last, half.checkpoint) for at, half in section.open.items()]
     at = first
     for stretch in sorted(known, key=lambda s: s.first):
         if not first <= stretch.first < end:
             continue
         if at < stretch.first:
-            yield Stretch(at, stretch.first)
+            yield CandidateBlock(at, stretch.first)
         if stretch.start is not None:
             yield stretch
         at = stretch.last
     if at < end:
-        yield Stretch(at, end)
+        yield CandidateBlock(at, end)

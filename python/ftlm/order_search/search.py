@@ -19,36 +19,36 @@ from ftlm.data.run import Run, as_runs
 from ftlm.errors import DataError, FtlmError, ModelError
 from ftlm.model.model import Model
 from ftlm.order_search.checkpoint import RecordFile, Request, Store, read_store
-from ftlm.order_search.options import Coefficients, Criterion, Settings, check_used
+from ftlm.order_search.options import Coefficients, Criterion, Settings, check_options_used
 from ftlm.order_search.result import SearchResult, SearchRow, StoreStatus
 from ftlm.order_search.schedule import (
     CoreRecord,
-    EquationWork,
-    StageWork,
-    Told,
+    CoupledProblem,
+    EquationProblem,
+    ProgressCallback,
+    coupled_state,
     equation_state,
+    search_coupled,
     search_equation,
-    search_stage,
-    stage_state,
 )
 from ftlm.progress import Progress
 from ftlm.simulation.discretization import (
     InitialTuple,
     Record,
-    check_held,
     check_linear,
+    check_zero_order_hold,
     named_coefficients,
     named_signals,
     prepare,
 )
 from ftlm.structure.order import Order
-from ftlm.structure.order_grid import Lattice, axis_of, check_lattice
+from ftlm.structure.order_grid import OrderGrid, axis_of, check_order_grid
 from ftlm.structure.structure import Structure
 from ftlm.svg.heat_map import Landscape
 from ftlm.utils.validation import check_threads
 
 #: Settings that define a search. Threads do not change its result.
-KEPT = tuple(f.name for f in fields(Settings) if f.name != "threads")
+RECORDED_SETTINGS = tuple(f.name for f in fields(Settings) if f.name != "threads")
 Failures = list[tuple[dict[str, float], str]]
 
 
@@ -62,7 +62,7 @@ class Job:
     values: Mapping[str, tuple[float, ...]]
     records: list[Record]
     settings: Settings
-    progress: Told | None
+    progress: ProgressCallback | None
 
     @property
     def name(self) -> str:
@@ -71,7 +71,7 @@ class Job:
 
     def request(self, name: str) -> Request:
         """Return the definition that a checkpoint file stores."""
-        settings = {n: getattr(self.settings, n) for n in KEPT}
+        settings = {n: getattr(self.settings, n) for n in RECORDED_SETTINGS}
         records = tuple(RecordFile.of(r) for r in self.records)
         # Hints are not written: they tell a fit where to start and change no search.
         structure = replace(self.structure, hints=UNSET)
@@ -80,10 +80,10 @@ class Job:
         return Request(name, structure, dict(self.values), settings, records, self.runs, dict(self.units))
 
     @classmethod
-    def of(cls, request: Request, threads: int, progress: Told | None) -> Job:
+    def of(cls, request: Request, threads: int, progress: ProgressCallback | None) -> Job:
         """Restore a job from a checkpoint file; raise ModelError for an invalid request."""
         try:
-            kept: dict[str, Any] = {n: request.settings[n] for n in KEPT}
+            kept: dict[str, Any] = {n: request.settings[n] for n in RECORDED_SETTINGS}
         except KeyError as error:
             raise ModelError(f"setting {error} is missing") from None
         settings = Settings.check(**kept | {"threads": threads, "early_stopping": bool(kept["early_stopping"])})
@@ -98,25 +98,25 @@ class Job:
             raise ModelError("an order has no values")
         return cls(request.runs, request.units, structure, request.values, records, settings, progress)
 
-    def _recorded(self) -> tuple[tuple[CoreRecord, ...], list[bool], InitialTuple, Settings]:
+    def _common_arguments(self) -> tuple[tuple[CoreRecord, ...], list[bool], InitialTuple, Settings]:
         record = self.records[0]
         runs = tuple(r.core() for r in self.records)
         return runs, list(record.inputs), record.start, self.settings
 
-    def equation_work(self) -> EquationWork:
+    def equation_problem(self) -> EquationProblem:
         """Return the search problem of one equation."""
         item, signals = self.structure.equations[0], self.records[0].signals
         axes = [
             (signals.index(t.signal), axis_of(t.order, self.values), bool(t.order.names) and t.fixed is None)
             for t in item.terms
         ]
-        return EquationWork(
-            *self._recorded(),
+        return EquationProblem(
+            *self._common_arguments(),
             orders=(signals.index(item.output), axis_of(item.order, self.values), axes),
             fixed=[t.fixed for t in item.terms],
         )
 
-    def stage_work(self) -> StageWork:
+    def coupled_problem(self) -> CoupledProblem:
         """Return the search problem of coupled equations under their order law."""
         structure, signals = self.structure, self.records[0].signals
         names = structure.order_names
@@ -130,15 +130,15 @@ class Job:
             for e in structure.equations
         ]
         points = sum(r.m for r in self.records)
-        return StageWork(
-            *self._recorded(),
+        return CoupledProblem(
+            *self._common_arguments(),
             axes=[list(self.values[n]) for n in names],
             laws=laws,
             fixed=[[t.fixed for t in e.terms] for e in structure.equations],
-            scales=[s * points if self.settings.norm == "l1" else s for s in self._spreads(points)],
+            scales=[s * points if self.settings.norm == "l1" else s for s in self._standard_deviations(points)],
         )
 
-    def _spreads(self, points: int) -> list[float]:
+    def _standard_deviations(self, points: int) -> list[float]:
         """Standard deviation of each output, by which the scores of the equations are weighted."""
         spreads = []
         for output in self.structure.outputs:
@@ -159,10 +159,14 @@ def run_job(job: Job, *, store: Store | None = None, number: int = 0, executor: 
             "Client(…).get_executor()"
         )
     if job.structure.has_order_law:
-        stage = search_stage(job.stage_work(), store=store, number=number, executor=executor, progress=job.progress)
+        stage = search_coupled(
+            job.coupled_problem(), store=store, number=number, executor=executor, progress=job.progress
+        )
         return _result(job, *_stage_rows(job.structure, stage), stage["counts"], 0)
     try:
-        one = search_equation(job.equation_work(), store=store, number=number, executor=executor, progress=job.progress)
+        one = search_equation(
+            job.equation_problem(), store=store, number=number, executor=executor, progress=job.progress
+        )
     except ModelError as error:
         raise named_signals(error, job.records[0].signals) from None
     return _result(job, *_equation_rows(job.structure, one), one["counts"], one["boxed"])
@@ -172,15 +176,15 @@ def _equation_rows(structure: Structure, found: _core._Found) -> tuple[list[Sear
     """Return rows and failures of one equation, by names of orders and coefficients."""
     item = structure.equations[0]
 
-    def named(alpha: float, orders: list[float]) -> dict[str, float]:
+    def orders_by_name(alpha: float, orders: list[float]) -> dict[str, float]:
         pairs = zip((item.order, *(t.order for t in item.terms)), (alpha, *orders), strict=True)
         return {o.names[0]: v for o, v in pairs if o.names}
 
     table = [
-        SearchRow(rank, index, score, named(alpha, orders), named_coefficients(item, c))
+        SearchRow(rank, index, score, orders_by_name(alpha, orders), named_coefficients(item, c))
         for rank, (index, score, alpha, orders, c, _) in enumerate(found["rows"], 1)
     ]
-    return table, [(named(alpha, orders), str(reason)) for _, alpha, orders, reason in found["failures"]]
+    return table, [(orders_by_name(alpha, orders), str(reason)) for _, alpha, orders, reason in found["failures"]]
 
 
 def _stage_rows(structure: Structure, found: _core._FoundStage) -> tuple[list[SearchRow], Failures]:
@@ -220,7 +224,7 @@ def _result(job: Job, table: list[SearchRow], failures: Failures, counts: _core.
 def search_orders(
     runs: Run | Sequence[Run],
     equation: Structure,
-    lattice: Lattice | None = None,
+    lattice: OrderGrid | None = None,
     *,
     criterion: Criterion = "output-error",
     coefficients: Coefficients = "multi-innovation",
@@ -315,7 +319,7 @@ def search_orders(
     settings = Settings.check(
         criterion, norm, coefficients, keep=keep, threads=threads, early_stopping=early_stopping, **words
     )
-    check_used(coefficients, words, argument="coefficients")
+    check_options_used(coefficients, words, argument="coefficients")
     job = make_job(checked, equation, lattice, settings, m=m, progress=progress)
     if store is None:
         return run_job(job, executor=executor)
@@ -326,7 +330,7 @@ def search_orders(
 def make_job(
     runs: Run | Sequence[Run],
     equation: Structure,
-    lattice: Lattice | None = None,
+    lattice: OrderGrid | None = None,
     settings: Settings | None = None,
     *,
     m: int | None = None,
@@ -349,14 +353,14 @@ def make_job(
             "the equations share no order law, so they are searched one by one: "
             f"pass .equation({equation.outputs[0]!r}) or use identify"
         )
-    check_lattice(lattice)
-    values = (lattice or Lattice()).values(equation)
+    check_order_grid(lattice)
+    values = (lattice or OrderGrid()).values(equation)
     known = {n: v[0] for n, v in values.items() if len(v) == 1}
     for run in checked:
-        check_held(run, equation, known)
+        check_zero_order_hold(run, equation, known)
     records = prepare(checked, equation, m, power_of_two=settings.needs_haar)
     units = {n: u for n, u in checked[0].units.items() if n in equation.signals}
-    return Job(tuple(r.name for r in checked), units, equation, values, records, settings, _told(progress))
+    return Job(tuple(r.name for r in checked), units, equation, values, records, settings, _core_callback(progress))
 
 
 def resume_search(
@@ -413,7 +417,7 @@ def resume_job(
 ) -> SearchResult:
     """Go on with one search of a store."""
     threads = 1 if executor is not None and threads is None else threads
-    job = replace(job_of(store, number, threads), progress=_told(progress))
+    job = replace(job_of(store, number, threads), progress=_core_callback(progress))
     with _usable(store.path, store.contents.requests[number]):
         return run_job(job, store=store, number=number, executor=executor)
 
@@ -462,24 +466,24 @@ def search_status(path: str | os.PathLike[str]) -> dict[str, StoreStatus]:
         with _usable(path, request):
             job = Job.of(request, 1, None)
             if section.law:
-                candidates, best = stage_state(job.stage_work(), section)
+                candidates, best = coupled_state(job.coupled_problem(), section)
             else:
-                candidates, best = equation_state(job.equation_work(), section)
+                candidates, best = equation_state(job.equation_problem(), section)
         states[request.name] = StoreStatus(
             request.name,
             candidates,
-            section.dealt,
+            section.processed_count,
             best,
             job.settings.to_dict(),
             request.runs,
             contents.version,
-            contents.torn,
-            contents.damage,
+            contents.truncated_bytes,
+            contents.corruption,
         )
     return states
 
 
-def _told(progress: Callable[[int, int], None] | None) -> Told | None:
+def _core_callback(progress: Callable[[int, int], None] | None) -> ProgressCallback | None:
     """Return the callback of the core: a progress bar gets the excluded fraction too, other callables do not."""
     if progress is None or isinstance(progress, Progress):
         return progress
@@ -490,7 +494,7 @@ def landscape(
     runs: Run | Sequence[Run],
     structure: Structure,
     search: SearchResult,
-    lattice: Lattice | None = None,
+    lattice: OrderGrid | None = None,
     *,
     orders: tuple[str, str] | None = None,
     threads: int | None = None,
@@ -517,7 +521,7 @@ def landscape(
     ModelError
         Fewer than two orders with several values, or a name that is none of them.
     """
-    axes = {n: v for n, v in (lattice or Lattice()).values(structure).items() if len(v) > 1}
+    axes = {n: v for n, v in (lattice or OrderGrid()).values(structure).items() if len(v) > 1}
     best = search.orders
     names = orders or tuple(list(axes)[:2])
     if len(names) != 2 or names[0] == names[1] or any(n not in axes for n in names):
@@ -528,7 +532,7 @@ def landscape(
     table = search_orders(
         runs,
         fixed,
-        Lattice(orders={names[0]: x.tolist(), names[1]: y.tolist()}),
+        OrderGrid(orders={names[0]: x.tolist(), names[1]: y.tolist()}),
         m=search.m,
         keep=x.size * y.size,
         threads=threads,
@@ -543,24 +547,24 @@ def landscape(
 
 
 #: Factors by which each axis of the order grid is subsampled, coarsest first.
-COARSER = (16, 12, 10, 8, 6, 5, 4, 3, 2)
+SUBSAMPLING_FACTORS = (16, 12, 10, 8, 6, 5, 4, 3, 2)
 #: Maximum fraction of the candidates in a probing search, and the probing time [s] that suffices for an estimate.
-SHARE, ENOUGH = 1 / 12, 0.3
+MAX_PROBE_FRACTION, PROBE_TIME_S = 1 / 12, 0.3
 #: Range of the exponent of time over candidates. It is below 1 because finer grids exclude more.
-GROWTH = (0.7, 1.1)
+TIME_EXPONENT_RANGE = (0.7, 1.1)
 #: Range of measured over estimated computing time.
-CAME_TO = (0.6, 4.0)
+TIME_FACTOR_RANGE = (0.6, 4.0)
 #: Number of candidates from which on whole boxes may be excluded, not seen on coarse grids, and the exponent then.
-BOXED, IN_BOXES = 1 << 25, 0.5
+BOX_EXCLUSION_CANDIDATES, BOX_TIME_EXPONENT = 1 << 25, 0.5
 
 
-def announce(progress: object, jobs: Sequence[Job], store: Store | None = None) -> None:
+def announce_time(progress: object, jobs: Sequence[Job], store: Store | None = None) -> None:
     """Report the expected time of all searches on a progress bar; with a checkpoint file, of the remaining work."""
     if not isinstance(progress, Progress) or progress.quiet:
         return
     least = most = 0.0
     for number, job in enumerate(jobs):
-        left = 1.0 if store is None else _left(job, store, number)
+        left = 1.0 if store is None else _remaining_fraction(job, store, number)
         low, high = expected_seconds(job) if left > 0 else (0.0, 0.0)
         least, most = least + left * low, most + left * high
     progress.expect("the search", least, most)
@@ -573,43 +577,49 @@ def expected_seconds(job: Job, clock: Callable[[], float] = time.perf_counter) -
     """
     whole = _candidates(job)
     tried: list[tuple[float, float]] = []
-    for every in COARSER:
+    for every in SUBSAMPLING_FACTORS:
         part = replace(job, values={name: axis[::every] for name, axis in job.values.items()}, progress=None)
         try:
             count = _candidates(part)
             if tried and count <= tried[-1][0]:
                 continue
-            if count > SHARE * whole:
+            if count > MAX_PROBE_FRACTION * whole:
                 break
             begun = clock()
-            (part.stage_work() if job.structure.has_order_law else part.equation_work()).search(None)
+            (part.coupled_problem() if job.structure.has_order_law else part.equation_problem()).search(None)
         except FtlmError:
             # So coarse a lattice may have no candidate, or none with a finite score.
             continue
         tried.append((count, clock() - begun))
-        if tried[-1][1] >= ENOUGH:
+        if tried[-1][1] >= PROBE_TIME_S:
             break
     if not tried:
         return 0.0, 0.0
-    (count, took), power = tried[-1], GROWTH[1]
+    (count, took), power = tried[-1], TIME_EXPONENT_RANGE[1]
     if len(tried) > 1 and tried[-2][1] > 0:
         power = math.log(max(took / tried[-2][1], 1e-9)) / math.log(count / tried[-2][0])
-        power = min(max(power, GROWTH[0]), GROWTH[1])
+        power = min(max(power, TIME_EXPONENT_RANGE[0]), TIME_EXPONENT_RANGE[1])
     grown = took * (whole / count) ** power
-    boxed = grown if whole < BOXED else took * (BOXED / count) ** power * (whole / BOXED) ** IN_BOXES
-    return CAME_TO[0] * boxed, CAME_TO[1] * grown
+    boxed = (
+        grown
+        if whole < BOX_EXCLUSION_CANDIDATES
+        else took
+        * (BOX_EXCLUSION_CANDIDATES / count) ** power
+        * (whole / BOX_EXCLUSION_CANDIDATES) ** BOX_TIME_EXPONENT
+    )
+    return TIME_FACTOR_RANGE[0] * boxed, TIME_FACTOR_RANGE[1] * grown
 
 
 def _candidates(job: Job) -> float:
     """Number of candidates of a search; under an order law, points of the order grid."""
     if job.structure.has_order_law:
         return float(math.prod(len(axis) for axis in job.values.values()))
-    return float(job.equation_work().plan()[0])
+    return float(job.equation_problem().plan()[0])
 
 
-def _left(job: Job, store: Store, number: int) -> float:
+def _remaining_fraction(job: Job, store: Store, number: int) -> float:
     """Fraction of a search that a checkpoint file does not contain."""
     section = store.contents.sections[number]
     if job.structure.has_order_law:
         return 0.0 if section.joined is not None else 1.0
-    return 1.0 - min(section.dealt / _candidates(job), 1.0)
+    return 1.0 - min(section.processed_count / _candidates(job), 1.0)

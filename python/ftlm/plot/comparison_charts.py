@@ -6,10 +6,10 @@ from collections.abc import Mapping, Sequence
 
 import numpy as np
 
-from ftlm.data.run import Measured, Run
+from ftlm.data.run import Run, RunData
 from ftlm.errors import DataError
 from ftlm.svg.bar_chart import bar_chart, histogram
-from ftlm.svg.figure import POINTS, SMALL, Figure, Figures
+from ftlm.svg.figure import MAX_LINE_POINTS, SMALL_WIDTH_PX, Figure, Figures
 from ftlm.svg.line_chart import line_chart
 from ftlm.utils.formatting import number, symbol
 from ftlm.utils.validation import Floats
@@ -25,7 +25,7 @@ def pulse_times(comparison: Comparison, run: int = 0) -> Floats:
 
 
 def comparison_charts(
-    comparison: Comparison, *, units: Mapping[str, str] | None = None, label: str = "", points: int = POINTS
+    comparison: Comparison, *, units: Mapping[str, str] | None = None, label: str = "", points: int = MAX_LINE_POINTS
 ) -> list[Figure]:
     """Chart measured and simulated output, for every output of every run.
 
@@ -56,7 +56,7 @@ def comparison_charts(
     ]
 
 
-def input_charts(runs: Sequence[Run], signals: Sequence[str], *, points: int = POINTS) -> list[Figure]:
+def input_charts(runs: Sequence[Run], signals: Sequence[str], *, points: int = MAX_LINE_POINTS) -> list[Figure]:
     """Inputs of every run, to stand below its outputs.
 
     Parameters
@@ -85,7 +85,7 @@ def input_charts(runs: Sequence[Run], signals: Sequence[str], *, points: int = P
 
 
 def residual_series(
-    comparison: Comparison, *, units: Mapping[str, str] | None = None, label: str = "", points: int = POINTS
+    comparison: Comparison, *, units: Mapping[str, str] | None = None, label: str = "", points: int = MAX_LINE_POINTS
 ) -> list[Figure]:
     """Chart residuals of the simulation over time and their histogram, for every output of every run.
 
@@ -109,7 +109,7 @@ def residual_series(
                     x_label="time [s]",
                     y_label=axis,
                     points=points,
-                    width=SMALL,
+                    width=SMALL_WIDTH_PX,
                     height=190,
                 )
             )
@@ -165,7 +165,7 @@ def error_chart(
     run: int = 0,
     title: str = "",
     units: Mapping[str, str] | None = None,
-    points: int = POINTS,
+    points: int = MAX_LINE_POINTS,
 ) -> Figure:
     """Chart the absolute simulation errors of several models on one run, as in the paper's Figure 4(a).
 
@@ -229,7 +229,7 @@ def residual_charts(tests: Residuals, *, label: str = "") -> list[Figure]:
                     lags,
                     [("", values)],
                     stems=True,
-                    width=SMALL,
+                    width=SMALL_WIDTH_PX,
                     height=190,
                     bands=[(-band, band)],
                     title=f"Residual of {symbol(output)} with {other}{suffix}",
@@ -243,7 +243,7 @@ def residual_charts(tests: Residuals, *, label: str = "") -> list[Figure]:
 
 def _residual_caption(test: CorrelationTest, drawn: Floats, signal: str) -> str:
     """Caption of the chart of one test: result and limit; an empty signal means the residual itself."""
-    if not test.decided:
+    if not test.conclusive:
         why = f"{signal} does not move" if np.isnan(test.limit) else f"its limit is {number(test.limit)}, above 1"
         return f"Whether the residual follows {signal} is undecided: {why}."
     if not np.isfinite(test.statistic):
@@ -259,7 +259,7 @@ def _residual_caption(test: CorrelationTest, drawn: Floats, signal: str) -> str:
     return f"{bars} The residual {word} white noise: {judged} (99 %)."
 
 
-def picture(run: Measured, *signals: str) -> Figures:
+def picture(run: RunData, *signals: str) -> Figures:
     """Charts of a run; see :meth:`ftlm.Run.plot`."""
     unknown = [name for name in signals if name not in run]
     if unknown:
@@ -279,7 +279,7 @@ def picture(run: Measured, *signals: str) -> Figures:
                 title=f"{symbol(name)}, {role} of {run.name}",
                 x_label="time [s]",
                 y_label=f"{symbol(name)} [{unit}]" if unit else symbol(name),
-                points=POINTS,
+                points=MAX_LINE_POINTS,
                 height=240 if role == "output" else 180,
             )
         )

@@ -16,12 +16,12 @@ from ftlm.data.run import Run
 from ftlm.errors import ModelError
 from ftlm.estimation.cost_surface import output_error_landscape
 from ftlm.estimation.frequency_result import (
-    DECIBEL,
+    DECIBELS_PER_NEPER,
     FrequencyIdentification,
     FrequencyValidation,
-    curve_of,
-    grid_of,
-    placed,
+    assign_signals,
+    curve_frequencies,
+    model_curve,
 )
 from ftlm.estimation.result import Identification
 from ftlm.experiment_design.result import DesignedInput
@@ -30,26 +30,26 @@ from ftlm.order_search.search import landscape as scores_of
 from ftlm.plot.comparison_charts import pulse_times, with_unit
 from ftlm.plot.model_charts import Answer, bode_curves, pole_points, response_frequencies
 from ftlm.svg.heat_map import Landscape
-from ftlm.svg.line_chart import LINES
+from ftlm.svg.line_chart import LINE_STYLES
 from ftlm.utils.formatting import symbol
 from ftlm.utils.statistics import NORMAL_95
 from ftlm.validation.comparison import Comparison
 from ftlm.validation.residual_tests import Residuals
 
 #: Width of a figure and height of one row of axes [inch]; the width is a journal's double column.
-WIDTH, ROW = 7.0, 2.2
+FIGURE_WIDTH_INCH, ROW_HEIGHT_INCH = 7.0, 2.2
 #: Resolution in a notebook.
 NOTEBOOK_DPI = 110
 
 
-def figure_of(rows: int, columns: int = 1, *, row: float = ROW, **options: Any) -> tuple[Any, Any]:
+def figure_of(rows: int, columns: int = 1, *, row: float = ROW_HEIGHT_INCH, **options: Any) -> tuple[Any, Any]:
     """Return a figure with a grid of axes, created without pyplot."""
     try:
         module = importlib.import_module("matplotlib.figure")
     except ImportError:
         raise ModelError("matplotlib is not installed; pip install 'ftlm[plot]'") from None
 
-    class Drawing(module.Figure):  # type: ignore[misc, name-defined]
+    class NotebookFigure(module.Figure):  # type: ignore[misc, name-defined]
         """Figure that notebooks show although pyplot does not manage it."""
 
         def _repr_png_(self) -> bytes:
@@ -57,7 +57,7 @@ def figure_of(rows: int, columns: int = 1, *, row: float = ROW, **options: Any) 
             self.savefig(data, format="png", dpi=NOTEBOOK_DPI)
             return data.getvalue()
 
-    figure = Drawing(figsize=(WIDTH, max(row * rows, 2.0)), layout="constrained")
+    figure = NotebookFigure(figsize=(FIGURE_WIDTH_INCH, max(row * rows, 2.0)), layout="constrained")
     return figure, figure.subplots(rows, columns, squeeze=False, **options)
 
 
@@ -77,18 +77,18 @@ def axes_for(ax: Any, rows: int, columns: int = 1, **options: Any) -> tuple[Any,
     return given[0].figure, given.reshape(rows, columns)
 
 
-def plain(text: str) -> str:
+def escape_math(text: str) -> str:
     """Escape text for matplotlib's math mode."""
     return text.replace("$", r"\$")
 
 
 def label_of(name: str, units: Mapping[str, str]) -> str:
     """Return a signal's symbol with its unit."""
-    return plain(with_unit(symbol(name), units, name))
+    return escape_math(with_unit(symbol(name), units, name))
 
 
 #: Height of a residual plot relative to the fit plot above it.
-BENEATH = 0.4
+RESIDUAL_HEIGHT_SHARE = 0.4
 
 
 def fit(
@@ -145,8 +145,8 @@ def fit(
     for k in range(len(comparison.per_run)):
         drawn += [(k, name, kind) for name in comparison.output_error for kind in ("fit", "residual")]
         drawn += [(k, name, "input") for name in (shown[k].inputs if inputs else ())]
-    heights = [BENEATH if kind == "residual" else 1.0 if kind == "fit" else 0.7 for _, _, kind in drawn]
-    figure, axes = axes_for(ax, len(drawn), row=ROW * 0.75, height_ratios=heights)
+    heights = [RESIDUAL_HEIGHT_SHARE if kind == "residual" else 1.0 if kind == "fit" else 0.7 for _, _, kind in drawn]
+    figure, axes = axes_for(ax, len(drawn), row=ROW_HEIGHT_INCH * 0.75, height_ratios=heights)
     upper = None
     for axis, (k, name, kind) in zip(axes[:, 0], drawn, strict=True):
         if kind == "input":
@@ -158,19 +158,19 @@ def fit(
         if kind == "fit":
             upper = axis
             label = f"simulated, fit {figures[name].fit:.4g} %"
-            axis.plot(time, measured, color=LINES[0][0], linewidth=2.2, label="measured")
-            axis.plot(time, simulated, color=LINES[1][0], linewidth=1.0, label=label)
+            axis.plot(time, measured, color=LINE_STYLES[0][0], linewidth=2.2, label="measured")
+            axis.plot(time, simulated, color=LINE_STYLES[1][0], linewidth=1.0, label=label)
             # A run that runs away would flatten what it is to be compared with.
             height = float(np.ptp(measured)) or 1.0
             low, high = float(np.min(measured)) - 0.5 * height, float(np.max(measured)) + 0.5 * height
             axis.set(ylim=(low, high), ylabel=label_of(name, units))
-            axis.set_title(plain(run), fontsize="medium", loc="left")
+            axis.set_title(escape_math(run), fontsize="medium", loc="left")
             axis.legend(loc="upper right", fontsize="small", ncols=2)
             axis.tick_params(labelbottom=False)
             continue
         if ax is None:
             axis.sharex(upper)
-        axis.plot(time, measured - simulated, color=LINES[2][0], linewidth=0.7)
+        axis.plot(time, measured - simulated, color=LINE_STYLES[2][0], linewidth=0.7)
         axis.set(ylabel="residual", xlabel="time [s]")
     return figure
 
@@ -191,7 +191,7 @@ def _line_of(axis: Any, run: Run, name: str) -> None:
     axis.plot(
         run.time,
         run[name],
-        color=LINES[2 if name in run.inputs else 0][0],
+        color=LINE_STYLES[2 if name in run.inputs else 0][0],
         linewidth=1.0,
         drawstyle="steps-post" if held else "default",
     )
@@ -222,10 +222,10 @@ def run(run: Run, *, ax: Any = None) -> Any:
     if not isinstance(run, Run):
         raise ModelError(f"run is {type(run).__name__}; give a run, such as ftlm.load returns")
     names = [*run.outputs, *run.inputs]
-    figure, axes = axes_for(ax, len(names), row=ROW * 0.6)
+    figure, axes = axes_for(ax, len(names), row=ROW_HEIGHT_INCH * 0.6)
     for axis, name in zip(axes[:, 0], names, strict=True):
         _line_of(axis, run, name)
-    axes[0, 0].set_title(plain(run.name), fontsize="medium", loc="left")
+    axes[0, 0].set_title(escape_math(run.name), fontsize="medium", loc="left")
     return figure
 
 
@@ -260,11 +260,11 @@ def residuals(tests: Residuals | Identification, *, ax: Any = None) -> Any:
     for row, (output, correlations) in zip(axes, drawn.items(), strict=True):
         for axis, (name, test) in zip(row, correlations, strict=False):
             keep = test.lags != 0 if name == "itself" else np.ones(test.lags.size, dtype=bool)
-            axis.axhspan(-test.band, test.band, color=LINES[1][0], alpha=0.2, linewidth=0)
-            axis.vlines(test.lags[keep], 0, test.values[keep], color=LINES[1][0], linewidth=1.2)
-            axis.axhline(0, color=LINES[0][0], linewidth=0.6)
+            axis.axhspan(-test.band, test.band, color=LINE_STYLES[1][0], alpha=0.2, linewidth=0)
+            axis.vlines(test.lags[keep], 0, test.values[keep], color=LINE_STYLES[1][0], linewidth=1.2)
+            axis.axhline(0, color=LINE_STYLES[0][0], linewidth=0.6)
             other = name if name == "itself" else symbol(name)
-            axis.set_title(plain(f"{symbol(output)} with {other}: {test.verdict}"), fontsize="small")
+            axis.set_title(escape_math(f"{symbol(output)} with {other}: {test.verdict}"), fontsize="small")
             axis.set_xlabel("lag [samples]")
         row[0].set_ylabel("correlation")
         for axis in row[len(correlations) :]:
@@ -295,7 +295,7 @@ def landscape(result: Identification | Landscape, output: str | None = None, *, 
         An identification without a search, or without that one; fewer than two free orders; no matplotlib.
     """
     found: Landscape | Identification | None = result
-    if isinstance(result, Identification) and result.joint is not None:
+    if isinstance(result, Identification) and result.fit is not None:
         found = output_error_landscape(result)
         if found is None:
             raise ModelError("this fit has no two free orders with standard errors, so it has no landscape")
@@ -306,7 +306,7 @@ def landscape(result: Identification | Landscape, output: str | None = None, *, 
         if name not in result.searches:
             raise ModelError(f"there is no search {name!r}; there are {', '.join(result.searches)}")
         part = result.task.structure if name == "stage" else result.task.structure.equation(name)
-        found = scores_of(result.task.runs, part, result.searches[name], result.task.lattice_of(part))
+        found = scores_of(result.task.runs, part, result.searches[name], result.task.part_order_grid(part))
     if not isinstance(found, Landscape):
         raise ModelError(f"result is {type(found).__name__}; give an identification or a landscape")
     figure, axes = axes_for(ax, 1, row=3.2)
@@ -318,9 +318,9 @@ def landscape(result: Identification | Landscape, output: str | None = None, *, 
     drawn = axis.pcolormesh(found.x, found.y, scores, norm=norm, cmap="viridis", shading="nearest")
     axis.set_facecolor("0.8")
     row, column = divmod(int(np.nanargmin(scores)), scores.shape[1])
-    ring = {"markersize": 9, "fillstyle": "none", "color": LINES[1][0], "markeredgewidth": 2}
+    ring = {"markersize": 9, "fillstyle": "none", "color": LINE_STYLES[1][0], "markeredgewidth": 2}
     axis.plot(found.x[column], found.y[row], "o", **ring)
-    xlabel, ylabel = (plain(f"order {symbol(name)}") for name in found.names)
+    xlabel, ylabel = (escape_math(f"order {symbol(name)}") for name in found.names)
     axis.set(xlabel=xlabel, ylabel=ylabel)
     figure.colorbar(drawn, ax=axis, label=f"{found.score} (grey: no candidate, or diverged)")
     return figure
@@ -359,12 +359,14 @@ def bode(model: Model | Identification, w: ArrayLike | None = None, *, ax: Any =
     for i, curve in enumerate(curves):
         sides = ((curve.gain, curve.gain_spread, "gain [dB]"), (curve.phase, curve.phase_spread, "phase [degrees]"))
         for axis, (values, spread, label) in zip(axes[i], sides, strict=True):
-            axis.semilogx(omega, values, color=LINES[1][0], linewidth=1.2)
+            axis.semilogx(omega, values, color=LINE_STYLES[1][0], linewidth=1.2)
             if spread is not None:
-                axis.fill_between(omega, values - spread, values + spread, color=LINES[1][0], alpha=0.25, linewidth=0)
+                axis.fill_between(
+                    omega, values - spread, values + spread, color=LINE_STYLES[1][0], alpha=0.25, linewidth=0
+                )
             axis.set(ylabel=label, xlabel="frequency [rad/s]")
             axis.grid(visible=True, alpha=0.3)
-            axis.set_title(plain(f"{symbol(curve.output)} from {symbol(curve.input)}"), fontsize="small")
+            axis.set_title(escape_math(f"{symbol(curve.output)} from {symbol(curve.input)}"), fontsize="small")
     return figure
 
 
@@ -404,13 +406,13 @@ def poles(model: Model | Identification, *, ax: Any = None) -> Any:
     reach = 1.18 * float(np.max(np.abs(points)))
     angle = np.linspace(-q * np.pi / 2, q * np.pi / 2, 61)
     corner = 4 * reach * np.concatenate([[0.0], np.exp(1j * angle)])
-    axis.fill(corner.real, corner.imag, color=LINES[1][0], alpha=0.16, linewidth=0, label="not stable")
-    axis.plot(points.real, points.imag, "x", color=LINES[2][0], markersize=8, markeredgewidth=2)
+    axis.fill(corner.real, corner.imag, color=LINE_STYLES[1][0], alpha=0.16, linewidth=0, label="not stable")
+    axis.plot(points.real, points.imag, "x", color=LINE_STYLES[2][0], markersize=8, markeredgewidth=2)
     plane = "s" if q == 1 else f"s^{{{q:.4g}}}"
     axis.set(xlim=(-reach, reach), ylim=(-reach, reach), xlabel=f"real part of ${plane}$", ylabel="imaginary part")
     axis.set_aspect("equal")
-    axis.axhline(0, color=LINES[0][0], linewidth=0.6)
-    axis.axvline(0, color=LINES[0][0], linewidth=0.6)
+    axis.axhline(0, color=LINE_STYLES[0][0], linewidth=0.6)
+    axis.axvline(0, color=LINE_STYLES[0][0], linewidth=0.6)
     axis.grid(visible=True, alpha=0.3)
     axis.legend(loc="upper left", fontsize="small")
     return figure
@@ -440,25 +442,27 @@ def step(model: Model | Identification, time: ArrayLike | None = None, *, ax: An
     DataError
         Instants that are not regular from 0.
     """
-    return _answered(_model_of(model).step(time), ax)
+    return _response_figure(_model_of(model).step(time), ax)
 
 
 def impulse(model: Model | Identification, time: ArrayLike | None = None, *, ax: Any = None) -> Any:
     """Plot the response to unit impulses, averaged over each interval; otherwise as :func:`step`."""
-    return _answered(_model_of(model).impulse(time), ax)
+    return _response_figure(_model_of(model).impulse(time), ax)
 
 
-def _answered(found: Answer, ax: Any) -> Any:
+def _response_figure(found: Answer, ax: Any) -> Any:
     figure, axes = axes_for(ax, len(found.outputs), max(len(found.inputs), 1))
     for i, output in enumerate(found.outputs):
         for j, signal in enumerate(found.inputs):
             axis, values = axes[i, j], found.values[i, j]
-            axis.plot(found.time, values, color=LINES[1][0], linewidth=1.2)
+            axis.plot(found.time, values, color=LINE_STYLES[1][0], linewidth=1.2)
             if found.deviation is not None:
                 half = NORMAL_95 * found.deviation[i, j]
-                axis.fill_between(found.time, values - half, values + half, color=LINES[1][0], alpha=0.25, linewidth=0)
+                axis.fill_between(
+                    found.time, values - half, values + half, color=LINE_STYLES[1][0], alpha=0.25, linewidth=0
+                )
             axis.set(xlabel="time [s]", ylabel=label_of(output, found.units))
-            axis.set_title(plain(f"{found.kind} of {symbol(signal)}"), fontsize="small")
+            axis.set_title(escape_math(f"{found.kind} of {symbol(signal)}"), fontsize="small")
             axis.grid(visible=True, alpha=0.3)
     return figure
 
@@ -484,13 +488,13 @@ def correlation(result: Identification, *, ax: Any = None) -> Any:
     """
     if not isinstance(result, Identification):
         raise ModelError(f"result is {type(result).__name__}; give an identification")
-    if result.joint is None:
+    if result.fit is None:
         raise ModelError(f"method {result.method!r} gives no joint covariance; identify by method='output-error'")
-    names, values = result.joint.names, result.joint.correlation
+    names, values = result.fit.names, result.fit.correlation
     figure, axes = axes_for(ax, 1, row=4.0)
     axis = axes[0, 0]
     drawn = axis.imshow(values, vmin=-1, vmax=1, cmap="RdBu_r")
-    labels = [plain(symbol(n)) for n in names]
+    labels = [escape_math(symbol(n)) for n in names]
     axis.set_xticks(range(len(names)), labels)
     axis.set_yticks(range(len(names)), labels)
     for i, j in np.ndindex(values.shape):
@@ -530,10 +534,10 @@ def residual_series(result: Identification | Comparison, *, ax: Any = None) -> A
     for (left, right), (k, name) in zip(axes, pairs, strict=True):
         missed = comparison.measured[name][k] - comparison.simulated[name][k]
         there = missed[np.isfinite(missed)]
-        left.plot(pulse_times(comparison, k), missed, color=LINES[2][0], linewidth=0.7)
+        left.plot(pulse_times(comparison, k), missed, color=LINE_STYLES[2][0], linewidth=0.7)
         left.set(xlabel="time [s]", ylabel=label_of(name, units))
-        left.set_title(plain(f"residual, {comparison.per_run[k][0]}"), fontsize="small", loc="left")
-        right.hist(there, bins=31, color=LINES[2][0], alpha=0.7)
+        left.set_title(escape_math(f"residual, {comparison.per_run[k][0]}"), fontsize="small", loc="left")
+        right.hist(there, bins=31, color=LINE_STYLES[2][0], alpha=0.7)
         right.set(xlabel=label_of(name, units), ylabel="samples")
         right.locator_params(axis="x", nbins=3)
     return figure
@@ -570,7 +574,7 @@ def models(compared: Mapping[str, Comparison], *, ax: Any = None) -> Any:
             raise ModelError(
                 f"{name!r} has the outputs {', '.join(comparison.output_error)}, the first {', '.join(outputs)}"
             )
-    figure, axes = axes_for(ax, 1, row=max(ROW, 0.4 * len(compared) * len(outputs)))
+    figure, axes = axes_for(ax, 1, row=max(ROW_HEIGHT_INCH, 0.4 * len(compared) * len(outputs)))
     axis, height = axes[0, 0], 0.8 / len(outputs)
     for i, output in enumerate(outputs):
         places = np.arange(len(compared)) + (i - (len(outputs) - 1) / 2) * height
@@ -579,11 +583,11 @@ def models(compared: Mapping[str, Comparison], *, ax: Any = None) -> Any:
             places,
             np.clip(np.nan_to_num(fits, nan=0.0), 0.0, 100.0),
             height,
-            color=LINES[1 + i % 5][0],
-            label=plain(symbol(output)),
+            color=LINE_STYLES[1 + i % 5][0],
+            label=escape_math(symbol(output)),
         )
         axis.bar_label(bars, [f"{v:.4g}" for v in fits], fontsize="small", padding=3)
-    axis.set_yticks(range(len(compared)), [plain(n) for n in compared])
+    axis.set_yticks(range(len(compared)), [escape_math(n) for n in compared])
     axis.invert_yaxis()
     axis.set(xlabel="fit of the free run [%]", xlim=(0, 112))
     if len(outputs) > 1:
@@ -615,12 +619,12 @@ def design(result: DesignedInput, *, ax: Any = None) -> Any:
         raise ModelError(f"result is {type(result).__name__}; give what design_input returns")
     run, square = result.run, result.reference
     figure, axes = axes_for(ax, len(run.inputs) + len(run.outputs) + 1, row=1.9)
-    limits = {r.name: r.limit for r in result.reached}
+    limits = {r.name: r.limit for r in result.predicted_extremes}
     time = run.step * np.arange(run.length)
     for axis, name in zip(axes[:, 0], (*run.inputs, *run.outputs), strict=False):
         held = {"drawstyle": "steps-post"} if name in run.inputs else {}
-        axis.plot(time, square[name], color=LINES[1][0], linewidth=0.9, label=square.name, **held)
-        axis.plot(time, run[name], color=LINES[0][0], linewidth=1.1, label="designed", **held)
+        axis.plot(time, square[name], color=LINE_STYLES[1][0], linewidth=0.9, label=square.name, **held)
+        axis.plot(time, run[name], color=LINE_STYLES[0][0], linewidth=1.1, label="designed", **held)
         if math.isfinite(limits[name]):
             for side in (-1, 1):
                 axis.axhline(
@@ -638,8 +642,8 @@ def _draw_spectrum(axis: Any, result: DesignedInput) -> None:
     rows = result.run.length - 1
     frequencies = np.fft.rfftfreq(rows, result.step)
     for shown, color, label in (
-        (result.reference, LINES[1][0], result.reference.name),
-        (result.run, LINES[0][0], "designed"),
+        (result.reference, LINE_STYLES[1][0], result.reference.name),
+        (result.run, LINE_STYLES[0][0], "designed"),
     ):
         power = np.sum([np.abs(np.fft.rfft(shown[n][:rows])) ** 2 for n in shown.inputs], axis=0)
         axis.plot(frequencies[1:], np.cumsum(power[1:]) / np.sum(power[1:]), color=color, linewidth=1.1, label=label)
@@ -649,7 +653,7 @@ def _draw_spectrum(axis: Any, result: DesignedInput) -> None:
         axis.plot(
             result.spectrum.lines.frequencies[order],
             best / best[-1],
-            color=LINES[2][0],
+            color=LINE_STYLES[2][0],
             linewidth=0.9,
             linestyle="--",
             label="best periodic",
@@ -692,30 +696,36 @@ def response(
     DataError
         Data of signals that the model does not have.
     """
-    model, records = _given(result, data)
+    model, records = _model_and_data(result, data)
     figure, axes = axes_for(ax, len(records), 2)
     for (left, right), record in zip(axes, records, strict=True):
-        omega, _ = grid_of(record)
-        ours, wide, turned = curve_of(model, record, omega)
+        omega, _ = curve_frequencies(record)
+        ours, wide, turned = model_curve(model, record, omega)
         phase = np.degrees(np.unwrap(np.angle(ours)))
         order = np.argsort(record.frequency, kind="stable")
         near = phase[np.searchsorted(omega, record.frequency[order])]
         angles = record.phase[order]
         angles = angles - 360.0 * np.round(np.median(angles - near) / 360.0)
-        gain = DECIBEL * np.log(np.abs(ours))
+        gain = DECIBELS_PER_NEPER * np.log(np.abs(ours))
         unit = f" of {record.unit}" if record.unit else ""
         for axis, curve, dots, half, label in (
             (left, gain, record.gain[order], wide, f"gain [dB{unit}]"),
             (right, phase, angles, turned, "phase [degrees]"),
         ):
             axis.semilogx(
-                record.frequency[order], dots, "o", fillstyle="none", markersize=4, color=LINES[0][0], label="measured"
+                record.frequency[order],
+                dots,
+                "o",
+                fillstyle="none",
+                markersize=4,
+                color=LINE_STYLES[0][0],
+                label="measured",
             )
-            axis.semilogx(omega, curve, color=LINES[1][0], linewidth=1.2, label="model")
+            axis.semilogx(omega, curve, color=LINE_STYLES[1][0], linewidth=1.2, label="model")
             if half is not None:
-                axis.fill_between(omega, curve - half, curve + half, color=LINES[1][0], alpha=0.25, linewidth=0)
+                axis.fill_between(omega, curve - half, curve + half, color=LINE_STYLES[1][0], alpha=0.25, linewidth=0)
             axis.set(xlabel="frequency [rad/s]", ylabel=label)
-            axis.set_title(plain(f"{symbol(record.output)} from {symbol(record.input)}"), fontsize="small")
+            axis.set_title(escape_math(f"{symbol(record.output)} from {symbol(record.input)}"), fontsize="small")
             axis.grid(visible=True, alpha=0.3)
         left.legend(fontsize="small")
     return figure
@@ -743,10 +753,10 @@ def nyquist(
     DataError
         Data of signals that the model does not have.
     """
-    model, records = _given(result, data)
+    model, records = _model_and_data(result, data)
     figure, axes = axes_for(ax, len(records), row=3.4)
     for axis, record in zip(axes[:, 0], records, strict=True):
-        curve, _, _ = curve_of(model, record, grid_of(record)[0])
+        curve, _, _ = model_curve(model, record, curve_frequencies(record)[0])
         impedance = record.unit.endswith("Ω")
         upward = -1.0 if impedance else 1.0
         axis.plot(
@@ -755,21 +765,21 @@ def nyquist(
             "o",
             fillstyle="none",
             markersize=4,
-            color=LINES[0][0],
+            color=LINE_STYLES[0][0],
             label="measured",
         )
-        axis.plot(curve.real, upward * curve.imag, color=LINES[1][0], linewidth=1.2, label="model")
+        axis.plot(curve.real, upward * curve.imag, color=LINE_STYLES[1][0], linewidth=1.2, label="model")
         unit = f" [{record.unit}]" if record.unit else ""
         words = ("Re Z", "−Im Z") if impedance else ("real part", "imaginary part")
         axis.set(xlabel=words[0] + unit, ylabel=words[1] + unit)
         axis.set_aspect("equal", adjustable="datalim")
-        axis.set_title(plain(f"{symbol(record.output)} from {symbol(record.input)}"), fontsize="small")
+        axis.set_title(escape_math(f"{symbol(record.output)} from {symbol(record.input)}"), fontsize="small")
         axis.grid(visible=True, alpha=0.3)
         axis.legend(fontsize="small")
     return figure
 
 
-def _given(
+def _model_and_data(
     result: FrequencyIdentification | Model, data: FrequencyData | FrequencyValidation | None
 ) -> tuple[Model, list[FrequencyData]]:
     """Return the model and the frequency data of the arguments."""
@@ -782,7 +792,7 @@ def _given(
     if isinstance(data, FrequencyValidation):
         records = list(data.data)
     elif isinstance(data, FrequencyData):
-        records = [placed(model, data)]
+        records = [assign_signals(model, data)]
     elif data is not None:
         raise ModelError(f"data is {type(data).__name__}; give frequency data, such as load_frequency returns")
     if not records:

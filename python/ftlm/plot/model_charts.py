@@ -12,20 +12,20 @@ from numpy.typing import ArrayLike
 from ftlm.analysis.frequency_response import frequency_response, response_deviation, response_inputs, transfer_functions
 from ftlm.analysis.poles import modes
 from ftlm.analysis.time_response import Response, response
-from ftlm.model.model import Solved, check_solved
-from ftlm.simulation.discretization import COULOMB
+from ftlm.model.model import ModelData, check_model
+from ftlm.simulation.discretization import COULOMB_PREFIX
 from ftlm.svg.complex_plane import plane_chart
-from ftlm.svg.figure import SMALL, Figure
+from ftlm.svg.figure import SMALL_WIDTH_PX, Figure
 from ftlm.svg.line_chart import line_chart
 from ftlm.utils.formatting import symbol
 from ftlm.utils.statistics import NORMAL_95
 from ftlm.utils.validation import Complex, Floats
 
 #: Decibels per unit of the natural logarithm of a gain.
-DECIBEL = 20.0 / math.log(10.0)
+DECIBELS_PER_NEPER = 20.0 / math.log(10.0)
 
 
-def response_frequencies(model: Solved, step: float | None = None, duration: float | None = None) -> Floats:
+def response_frequencies(model: ModelData, step: float | None = None, duration: float | None = None) -> Floats:
     """Default frequencies [rad/s] of a response: from one period per record to half the sampling rate."""
     if step is not None and duration is not None:
         return np.geomspace(2 * math.pi / duration, math.pi / step, 240)
@@ -37,7 +37,7 @@ def response_frequencies(model: Solved, step: float | None = None, duration: flo
     return np.geomspace(middle / 100, middle * 100, 240)
 
 
-def bode_charts(model: Solved, w: ArrayLike | None = None) -> list[Figure]:
+def bode_charts(model: ModelData, w: ArrayLike | None = None) -> list[Figure]:
     """Return gain and phase charts for every pair of output and external input, with 95 % bands if known.
 
     Parameters
@@ -48,10 +48,10 @@ def bode_charts(model: Solved, w: ArrayLike | None = None) -> list[Figure]:
         Frequencies [rad/s]; by default around the corner frequencies of the model.
     """
     omega = response_frequencies(model) if w is None else np.asarray(w, dtype=np.float64)
-    return drawn_bode(omega, bode_curves(model, omega))
+    return bode_figures(omega, bode_curves(model, omega))
 
 
-def drawn_bode(omega: Floats, curves: Sequence[BodeCurve]) -> list[Figure]:
+def bode_figures(omega: Floats, curves: Sequence[BodeCurve]) -> list[Figure]:
     """Return the gain and phase charts of some curves."""
     figures = []
     for curve in curves:
@@ -69,7 +69,7 @@ def drawn_bode(omega: Floats, curves: Sequence[BodeCurve]) -> list[Figure]:
                     log_x=True,
                     bands=bands,
                     title=f"{title}: {kind}",
-                    width=SMALL,
+                    width=SMALL_WIDTH_PX,
                     height=220,
                     x_label="frequency [rad/s]",
                     y_label=label,
@@ -79,7 +79,7 @@ def drawn_bode(omega: Floats, curves: Sequence[BodeCurve]) -> list[Figure]:
     return figures
 
 
-def pole_points(model: Solved) -> tuple[float, Complex]:
+def pole_points(model: ModelData) -> tuple[float, Complex]:
     """Order q of the plane s^q and the poles in it with their conjugates; empty for a model with friction."""
     q = plane_order(model)
     found = () if model.structure.has_friction else modes(model)
@@ -87,13 +87,13 @@ def pole_points(model: Solved) -> tuple[float, Complex]:
     for m in found:
         angle = math.acos(max(-1.0, min(1.0, -m.damping)))
         # Beyond the negative axis of s a relaxation of fractional order stands on the one of s^q.
-        turn = math.pi if not m.swings and not m.grows else q * angle
+        turn = math.pi if not m.oscillatory and not m.unstable else q * angle
         value = m.frequency**q * complex(math.cos(turn), math.sin(turn))
-        points += [value, value.conjugate()] if m.swings else [complex(value.real)]
+        points += [value, value.conjugate()] if m.oscillatory else [complex(value.real)]
     return q, np.array(points, dtype=np.complex128)
 
 
-def pole_charts(model: Solved) -> list[Figure]:
+def pole_charts(model: ModelData) -> list[Figure]:
     """Return the pole chart in the plane of s^q, q the highest order over the next integer, with the unstable sector.
 
     Empty for a model with friction or without poles.
@@ -108,7 +108,7 @@ def pole_charts(model: Solved) -> list[Figure]:
         return []
     found = modes(model)
     plane = "s" if q == 1 else f"s^{q:.4g}"
-    inside = sum(m.grows for m in found)
+    inside = sum(m.unstable for m in found)
     words = "none is in it" if not inside else f"{inside} of {len(found)} modes in it: the model is not stable"
     caption = f"Shade: |arg {plane}| < {90 * q:.4g} degrees, where poles make a free run grow; {words}."
     if q != 1:
@@ -126,7 +126,7 @@ def pole_charts(model: Solved) -> list[Figure]:
     ]
 
 
-def plane_order(model: Solved) -> float:
+def plane_order(model: ModelData) -> float:
     """Order q of the pole plane s^q: 1 for integer orders, else between 0.5 and 1."""
     orders = [e.order.constant for e in model.equations]
     orders += [t.order.constant for e in model.equations for t in e.terms]
@@ -147,7 +147,7 @@ class BodeCurve:
     phase_spread: Floats | None
 
 
-def bode_curves(model: Solved, omega: Floats) -> list[BodeCurve]:
+def bode_curves(model: ModelData, omega: Floats) -> list[BodeCurve]:
     """Return the curves of all connected pairs of input and output; Coulomb friction is omitted."""
     response = frequency_response(model, omega)
     spread = None
@@ -158,14 +158,14 @@ def bode_curves(model: Solved, omega: Floats) -> list[BodeCurve]:
     for i, output in enumerate(model.outputs):
         for j, name in enumerate(inputs):
             h = response[i, j]
-            if not np.any(h) or name.startswith(COULOMB):
+            if not np.any(h) or name.startswith(COULOMB_PREFIX):
                 continue
             with np.errstate(divide="ignore", invalid="ignore"):
                 gain = 20 * np.log10(np.abs(h))
             phase = np.degrees(np.unwrap(np.angle(np.where(np.isfinite(h), h, 1.0))))
             widths: tuple[Floats | None, Floats | None] = (None, None)
             if spread is not None:
-                widths = (DECIBEL * NORMAL_95 * spread[0][i, j], np.degrees(NORMAL_95 * spread[1][i, j]))
+                widths = (DECIBELS_PER_NEPER * NORMAL_95 * spread[0][i, j], np.degrees(NORMAL_95 * spread[1][i, j]))
             curves.append(BodeCurve(output, name, gain, phase, *widths))
     return curves
 
@@ -187,7 +187,7 @@ class Bode:
 
     def figures(self) -> list[Figure]:
         """Its charts, as in a report."""
-        return drawn_bode(self.frequency, self.curves)
+        return bode_figures(self.frequency, self.curves)
 
     def __str__(self) -> str:
         pairs = ", ".join(f"{c.output} from {c.input}" for c in self.curves) or "no input reaches an output"
@@ -199,9 +199,9 @@ class Bode:
         return "".join(f._repr_html_() for f in self.figures())
 
 
-def bode(model: Solved, w: ArrayLike | None = None) -> Bode:
+def bode(model: ModelData, w: ArrayLike | None = None) -> Bode:
     """Return the frequency response of a model with charts; see :meth:`ftlm.Model.bode`."""
-    check_solved(model)
+    check_model(model)
     omega = response_frequencies(model) if w is None else np.asarray(w, dtype=np.float64)
     return Bode(omega, tuple(bode_curves(model, omega)))
 
@@ -220,7 +220,7 @@ def response_charts(found: Response, *, units: Mapping[str, str] | None = None) 
     for i, output in enumerate(found.outputs):
         for j, signal in enumerate(found.inputs):
             values = found.values[i, j]
-            if signal.startswith(COULOMB) or not np.any(values):
+            if signal.startswith(COULOMB_PREFIX) or not np.any(values):
                 continue
             bands, shade = [], "No covariance, so there is no band."
             if found.deviation is not None:
@@ -232,7 +232,7 @@ def response_charts(found: Response, *, units: Mapping[str, str] | None = None) 
                     found.time,
                     [("", values)],
                     bands=bands,
-                    width=SMALL,
+                    width=SMALL_WIDTH_PX,
                     height=220,
                     x_label="time [s]",
                     title=f"{symbol(output)} after a unit {found.kind} of {symbol(signal)}",
@@ -279,7 +279,7 @@ class Answer(Response):
         return "".join(f._repr_html_() for f in self.figures())
 
 
-def answer(model: Solved, time: ArrayLike | None, kind: str) -> Answer:
+def answer(model: ModelData, time: ArrayLike | None, kind: str) -> Answer:
     """Return a step or impulse response of a model with charts; see :meth:`ftlm.Model.step`."""
     found = response(model, time, kind=kind)
     return Answer(**vars(found), units=dict(model.units))

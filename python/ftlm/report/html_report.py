@@ -19,37 +19,44 @@ from ftlm.estimation.cost_surface import output_error_landscape
 from ftlm.estimation.linear import multi_innovation_trace, trace_chart
 from ftlm.estimation.model_checks import validate
 from ftlm.estimation.output_error import JointFit
-from ftlm.estimation.result import Judged, Task
+from ftlm.estimation.result import IdentificationRecord, Task
 from ftlm.estimation.verdict import Verdict, saved_verdict, verdict, verdict_html
 from ftlm.model.model import Model
-from ftlm.order_search.options import COMPARED_LENGTHS
+from ftlm.order_search.options import COMPARED_INNOVATION_LENGTHS
 from ftlm.order_search.result import SearchResult, search_summary, search_top
 from ftlm.order_search.search import landscape
 from ftlm.plot.comparison_charts import comparison_charts, input_charts, residual_charts, residual_series
 from ftlm.plot.model_charts import bode_charts, pole_charts, response_frequencies
-from ftlm.report.text_summary import order_in_words, settings_rows
+from ftlm.report.text_summary import describe_order, settings_rows
 from ftlm.report.typesetting import equations_html, parameter_table
-from ftlm.structure.input_nonlinearity import WORDS
-from ftlm.svg.figure import POINTS, Figure
+from ftlm.structure.input_nonlinearity import INPUT_EFFECT_LABELS
+from ftlm.svg.figure import MAX_LINE_POINTS, Figure
 from ftlm.svg.heat_map import correlation_map, heat_map
 from ftlm.svg.html_page import Section, Table, write_page
 from ftlm.utils.files import check_free
-from ftlm.utils.formatting import Cell, number, symbol, symbol_html, unbounded
-from ftlm.validation.comparison import Comparison, compare, errors_table, initial_terms_table, lost_fits, warned
-from ftlm.validation.findings import SHOWN, concerns
+from ftlm.utils.formatting import Cell, format_bound, number, symbol, symbol_html
+from ftlm.validation.comparison import (
+    Comparison,
+    compare,
+    errors_table,
+    initial_terms_table,
+    validation_fit_warnings,
+    warnings_html,
+)
+from ftlm.validation.findings import MAX_SUMMARY_WARNINGS, group_warnings
 from ftlm.validation.information_criteria import InformationCriteria, information_table
-from ftlm.validation.residual_tests import LAGS, Residuals, resid, residual_table
+from ftlm.validation.residual_tests import DEFAULT_LAGS, Residuals, resid, residual_table
 
 #: Largest number of pole maps and step responses on a page.
 MOST_FIGURES = 9
-_LOOKS = {"trust": "trust", "with care": "care", "do not use": "not"}
+_LEVEL_CSS_CLASSES = {"trust": "trust", "with care": "care", "do not use": "not"}
 
 
 def verdict_box(judged: Verdict, of: str = "") -> Markup:
     """Return a verdict as the first box of a page; `of` names the model if there are several."""
     remedy = Markup(' <span class="todo">→ {}</span>').format(judged.remedy) if judged.remedy else ""
     return Markup('<div class="first {}" role="note"><strong>{}</strong>{}{}</div>').format(
-        _LOOKS[judged.level],
+        _LEVEL_CSS_CLASSES[judged.level],
         f"{of}{judged.level}" if of else judged.level.capitalize(),
         judged.reason[0].upper() + judged.reason[1:],
         remedy,
@@ -58,11 +65,11 @@ def verdict_box(judged: Verdict, of: str = "") -> Markup:
 
 def first_warnings(warnings: Sequence[str]) -> tuple[list[str], list[str]]:
     """Split warnings into the most serious groups, with remedies, and the remaining warnings."""
-    found = concerns(warnings)
+    found = group_warnings(warnings)
     shown: list[str] = []
     left: list[str] = []
     for k, concern in enumerate(found):
-        if k >= SHOWN:
+        if k >= MAX_SUMMARY_WARNINGS:
             left += concern.warnings
             continue
         remedy = concern.remedy if concern.remedy not in concern.warnings[0] else ""
@@ -82,14 +89,14 @@ def title_of(model: Model) -> str:
     return f"Model of {', '.join(map(symbol, structure.outputs))}{driven}"
 
 
-def behaviour_tables(model: Model) -> list[Table]:
+def behavior_tables(model: Model) -> list[Table]:
     """Return tables of steady-state gains and modes with standard errors; empty if the model has none."""
     if model.structure.has_friction:
         return []
     tables = []
     try:
         found = modes(model)
-        grows = any(mode.grows for mode in found)
+        grows = any(mode.unstable for mode in found)
         states = () if grows or model.structure.limits else steady_states(model)
     except FtlmError:
         # Equations that cannot be solved for their outputs together have neither.
@@ -100,7 +107,7 @@ def behaviour_tables(model: Model) -> list[Table]:
             above, below = (model.units.get(n, "") for n in (state.output, state.input))
             pair = Markup("{} from {}").format(symbol_html(state.output), symbol_html(state.input))
             unit = f"{above}/{below}" if above and below else ""
-            sure = order_in_words(state)
+            sure = describe_order(state)
             if state.order > 0:
                 runs = f" t^{state.order:.4g}/Γ({state.order + 1:.4g})" if state.order != 1 else " per second"
                 rows.append([pair, state.rate, state.error, unit, f"none: it runs on, so much{runs}{sure}"])
@@ -115,7 +122,9 @@ def behaviour_tables(model: Model) -> list[Table]:
         rows = [
             [
                 f"{k + 1}",
-                f"{number(m.pole.real, 4)} ± {number(abs(m.pole.imag), 4)}j" if m.swings else number(m.pole.real, 4),
+                f"{number(m.pole.real, 4)} ± {number(abs(m.pole.imag), 4)}j"
+                if m.oscillatory
+                else number(m.pole.real, 4),
                 m.frequency,
                 m.frequency_error,
                 m.damping,
@@ -134,7 +143,7 @@ def behaviour_tables(model: Model) -> list[Table]:
     return tables
 
 
-def behaviour_figures(model: Model) -> list[Figure]:
+def behavior_figures(model: Model) -> list[Figure]:
     """Return pole maps and step responses; outputs without poles or with overflow are omitted."""
     figures: list[Figure] = []
     if model.structure.has_friction or model.structure.limits:
@@ -157,11 +166,15 @@ SERIES_POINTS = 600
 #: Points of a convergence curve.
 TRACE_POINTS = 64
 #: Text for models with friction, in place of their stability.
-STICKS = "The body rests while friction holds it, so that no poles say how it comes to rest."
+FRICTION_STABILITY_NOTE = "The body rests while friction holds it, so that no poles say how it comes to rest."
 
 
 def identification_page(
-    result: Judged, path: str | os.PathLike[str], *, validation: Run | Sequence[Run] | None = None, force: bool = False
+    result: IdentificationRecord,
+    path: str | os.PathLike[str],
+    *,
+    validation: Run | Sequence[Run] | None = None,
+    force: bool = False,
 ) -> Path:
     """Write the HTML report of one identification.
 
@@ -207,15 +220,15 @@ def identification_page(
     judged = verdict(result, pooled)
     task = result.task
     runs = [*(() if task is None else task.runs), *others]
-    sections = first_sections(model, warnings, compared, bool(others), result.joint, runs)
+    sections = first_sections(model, warnings, compared, bool(others), result.fit, runs)
     sections.append(residual_section(tests, result.information, compared, model.units))
-    sections += correlation_sections(result.joint)
+    sections += correlation_sections(result.fit)
     steps = [(r.step, r.duration) for r in ((() if task is None else task.runs) or others)]
     sections.append(frequency_section(model, steps))
     sections += _search_sections(result)
     titled = ((f"Initial terms of the free runs, {label}", c) for label, c in compared)
     initial = [t for title, c in titled if (t := initial_terms_table(c, title=title)) is not None]
-    starts = [starts_table(result.joint)] if result.joint is not None and result.joint.starts else []
+    starts = [starts_table(result.fit)] if result.fit is not None and result.fit.starts else []
     sections.append(Section("Settings", tables=[settings_table(result), *starts, *initial]))
     return write_page(
         path, title=title_of(model), sections=sections, lead=lead_of(compared), force=force, verdict=verdict_box(judged)
@@ -243,19 +256,19 @@ def first_sections(
     shown, left = first_warnings(warned)
     charts = sum(len(c.per_run) for _, c in compared) * len(model.outputs)
     # Two lines a chart, drawn once wide and once narrow with half the points.
-    points = min(POINTS, PAGE_POINTS // (3 * max(min(charts, PAGE_CHARTS), 1)))
+    points = min(MAX_LINE_POINTS, PAGE_POINTS // (3 * max(min(charts, PAGE_CHARTS), 1)))
     drawn = _with_inputs(model, compared, runs, points)
     own = compared[0][1] if compared and compared[0][0] == "estimation" else None
     equations = [
         *equations_html(model, None if own is None else own.offsets),
-        STICKS if model.structure.has_friction else f"As a whole, the model is {model.stability()}.",
+        FRICTION_STABILITY_NOTE if model.structure.has_friction else f"As a whole, the model is {model.stability()}.",
     ]
     sections = [
         Section("Warnings", words[1:] if warned else words, shown, more=left),
         Section("Equations", equations, tables=[parameter_table(model, joint)]),
     ]
-    if figures := behaviour_figures(model):
-        sections.append(Section("Gain, modes and steps", tables=behaviour_tables(model), figures=figures, small=True))
+    if figures := behavior_figures(model):
+        sections.append(Section("Gain, modes and steps", tables=behavior_tables(model), figures=figures, small=True))
     if compared:
         left_out = f"{charts - PAGE_CHARTS} further charts are left out; the table above has every run."
         sections += [
@@ -285,7 +298,7 @@ def _with_inputs(
 
 def tests_on(model: Model, runs: Sequence[Run]) -> list[tuple[str, Residuals]]:
     """Return the residual tests of each run that is long enough."""
-    return [("validation", resid(model, run)) for run in runs if run.length >= 2 * LAGS + 3]
+    return [("validation", resid(model, run)) for run in runs if run.length >= 2 * DEFAULT_LAGS + 3]
 
 
 def correlation_sections(joint: JointFit | None) -> list[Section]:
@@ -335,7 +348,7 @@ def frequency_section(model: Model, steps: Sequence[tuple[float, float]]) -> Sec
     return Section("Frequency response", words, figures=bode_charts(model, omega)[:SMALL_CHARTS], small=True)
 
 
-def _search_sections(result: Judged) -> list[Section]:
+def _search_sections(result: IdentificationRecord) -> list[Section]:
     """Return the convergence of the recursion and the order search with its score maps."""
     sections = []
     traces = _traces(result)
@@ -368,13 +381,13 @@ def _maps(task: Task, searches: Mapping[str, SearchResult]) -> list[Figure]:
     maps = []
     for name, search in searches.items():
         part = task.structure if name == "stage" else task.structure.equation(name)
-        own = task.lattice_of(part)
+        own = task.part_order_grid(part)
         if sum(len(v) > 1 for v in own.values(part).values()) >= 2:
             maps.append(heat_map(landscape(task.runs, part, search, own)))
     return maps
 
 
-def _traces(result: Judged) -> list[Figure]:
+def _traces(result: IdentificationRecord) -> list[Figure]:
     """Return the recursion at the orders found, for the paper's p and the one used.
 
     Empty if the first run does not start at rest.
@@ -397,7 +410,7 @@ def _traces(result: Judged) -> list[Figure]:
             continue
         traces = [
             (f"p = {p}", multi_innovation_trace(run, at_orders, innovation_length=p, every=every, **options))
-            for p in sorted({*COMPARED_LENGTHS, int(used["innovation_length"])})
+            for p in sorted({*COMPARED_INNOVATION_LENGTHS, int(used["innovation_length"])})
         ]
         figures.append(trace_chart(traces, title=f"Error (45) of {symbol(solved.output)}, run {run.name}"))
     return figures
@@ -413,14 +426,14 @@ def lead_of(compared: Sequence[tuple[str, Comparison]]) -> str:
     return " ".join(sentences)
 
 
-def estimates_table(result: Judged | None, truth: Mapping[str, float] | None = None) -> Table:
+def estimates_table(result: IdentificationRecord | None, truth: Mapping[str, float] | None = None) -> Table:
     """Return orders and coefficients of a joint fit with intervals, and true values if known."""
     rows: list[list[Cell]] = []
-    if result is not None and result.joint is not None:
-        for name, value in {**result.orders, **result.joint.coefficients}.items():
+    if result is not None and result.fit is not None:
+        for name, value in {**result.orders, **result.fit.coefficients}.items():
             low, high = result.intervals[name]
             known = [truth.get(name)] if truth else []
-            spread = [v if math.isfinite(v) else unbounded(v) for v in (result.standard_errors[name], low, high)]
+            spread = [v if math.isfinite(v) else format_bound(v) for v in (result.standard_errors[name], low, high)]
             rows.append([symbol_html(name), value, *spread, *known])
     columns, groups = ["parameter", "value", "standard error", "from", "to"], [("", 3), ("95 % interval", 2)]
     if truth:
@@ -428,7 +441,7 @@ def estimates_table(result: Judged | None, truth: Mapping[str, float] | None = N
     return Table("Output error: orders and coefficients, with intervals", columns, rows, groups=groups)
 
 
-def grouped_warnings(results: Mapping[str, Judged | None]) -> list[str]:
+def grouped_warnings(results: Mapping[str, IdentificationRecord | None]) -> list[str]:
     """Return warnings of several results by label, merging those that differ only in numbers."""
     groups: dict[str, tuple[str, list[str]]] = {}
     for label, result in results.items():
@@ -450,7 +463,7 @@ def starts_table(joint: JointFit, *, rows: int = 10, title: str = "Automatic sta
     return Table(title, ("rank", "start from", "cost per residual"), cells, note=note)
 
 
-def settings_table(result: Judged, *, title: str = "What the result depends on") -> Table:
+def settings_table(result: IdentificationRecord, *, title: str = "What the result depends on") -> Table:
     """Return a table of the settings of a result: estimator, criterion, M, p, K0, initial terms and runs."""
     structure, comparison = result.model.structure, result.comparison
     rows: list[list[Cell]] = [
@@ -460,7 +473,10 @@ def settings_table(result: Judged, *, title: str = "What the result depends on")
         *settings_rows(result.settings, searched=bool(result.searches)),
     ]
     rows += [[f"delay of {symbol(name)}", f"{delay:g} s"] for name, delay in structure.delay.items()]
-    rows += [[f"{WORDS[limit.law]} of {symbol(limit.signal)}", f"{limit.value:g}"] for limit in structure.limits]
+    rows += [
+        [f"{INPUT_EFFECT_LABELS[limit.law]} of {symbol(limit.signal)}", f"{limit.value:g}"]
+        for limit in structure.limits
+    ]
     if structure.sensor_filter is not None:
         filtered = ", ".join(symbol(o) for o in structure.sensor_filter.signals)
         rows.append(["known sensor filter on", filtered])
@@ -472,16 +488,16 @@ def settings_table(result: Judged, *, title: str = "What the result depends on")
 
 
 #: Phrases for the result of the independence test.
-_INDEPENDENCE = {"yes": "independent of", "no": "not independent of", "undecided": "perhaps independent of"}
+_INDEPENDENCE_PHRASES = {"yes": "independent of", "no": "not independent of", "undecided": "perhaps independent of"}
 
 
-def identification_html(result: Judged) -> str:
+def identification_html(result: IdentificationRecord) -> str:
     """Return warnings, equations, parameters with intervals, both errors and residual tests as HTML."""
     model = result.model
     parts = [verdict_html(verdict(result))]
     parts += [Markup("<p>{}</p>").format(e) for e in equations_html(model, result.comparison.offsets)]
-    parts += [table.to_html() for table in behaviour_tables(model)]
-    parts.append(parameter_table(model, result.joint).to_html())
+    parts += [table.to_html() for table in behavior_tables(model)]
+    parts.append(parameter_table(model, result.fit).to_html())
     # One run is enough to see; a report has all.
     figures = comparison_charts(result.comparison, units=model.units, points=NOTEBOOK_POINTS)
     parts += [Markup(f._repr_html_()) for f in figures[: len(result.output_error)]]  # made of escaped parts
@@ -491,16 +507,16 @@ def identification_html(result: Judged) -> str:
             Markup("{}: residuals {}, {} the inputs").format(
                 symbol_html(o),
                 "white" if white else "not white",
-                _INDEPENDENCE[result.residuals.independence[o]],
+                _INDEPENDENCE_PHRASES[result.residuals.independence[o]],
             )
             for o, white in result.residuals.white.items()
         ]
         parts.append(Markup("<p>{} (99 %).</p>").format(Markup("; ").join(verdicts)))
     shown, left = first_warnings(result.warnings)
-    parts.append(warned(shown))
+    parts.append(warnings_html(shown))
     if left:
         folded = Markup("<details><summary>{} more warning{}</summary>{}</details>")
-        parts.append(folded.format(len(left), "" if len(left) == 1 else "s", warned(left)))
+        parts.append(folded.format(len(left), "" if len(left) == 1 else "s", warnings_html(left)))
     return str(Markup("").join(parts))
 
 
@@ -534,7 +550,7 @@ def model_page(
     for run, comparison in zip(others, validated, strict=True):
         words = [*comparison.warnings, *run.warnings]
         if known is not None:
-            words += lost_fits({n: f for n, f in known.fit.items() if f is not None}, comparison)
+            words += validation_fit_warnings({n: f for n, f in known.fit.items() if f is not None}, comparison)
             words += ["it has the name of a run that the model was identified from"] * (run.name in known.runs)
         warnings += [f"validation run {run.name}: {w.removeprefix(run.name + ': ')}" for w in words]
     compared = [("validation", comparison) for comparison in validated]

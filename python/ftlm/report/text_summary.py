@@ -12,40 +12,40 @@ from markupsafe import Markup
 
 from ftlm.analysis.poles import Mode, SteadyState, modes, steady_states
 from ftlm.errors import FtlmError
-from ftlm.estimation.result import Judged
+from ftlm.estimation.result import IdentificationRecord
 from ftlm.estimation.verdict import verdict
 from ftlm.model.model import Model
 from ftlm.report.typesetting import ORDER_DECIMALS, units_of
-from ftlm.structure.equation import Equation, numeric
+from ftlm.structure.equation import Equation, format_equation
 from ftlm.structure.order import Order
-from ftlm.utils.formatting import Cell, Exact, symbol, unbounded, with_error, wrapped
+from ftlm.utils.formatting import Cell, Exact, format_bound, symbol, with_error, wrap_text
 from ftlm.utils.statistics import NORMAL_95
-from ftlm.validation.comparison import Comparison, offsets_in_words
-from ftlm.validation.findings import SHOWN, concerns, left_over
+from ftlm.validation.comparison import Comparison, describe_offsets
+from ftlm.validation.findings import MAX_SUMMARY_WARNINGS, group_warnings, hidden_warnings_text
 
 #: Most modes that are listed.
 MOST_MODES = 6
 
 
-def summary(result: Judged, validation: Comparison | None = None) -> str:
+def summary(result: IdentificationRecord, validation: Comparison | None = None) -> str:
     """Return the summary of a result as text."""
     judged = verdict(result, validation)
-    lines = [*wrapped(str(judged)), ""]
-    lines += equations_in_words(result.model, result.comparison)
-    lines += ["", *numbers_in_words(result), *behaviour_in_words(result.model), ""]
-    lines += [*fits_in_words(result, validation), *_residuals(result), *_starts(result)]
-    lines += concerns_in_words(result.warnings)
+    lines = [*wrap_text(str(judged)), ""]
+    lines += equation_lines(result.model, result.comparison)
+    lines += ["", *parameter_lines(result), *behavior_lines(result.model), ""]
+    lines += [*fit_lines(result, validation), *_residuals(result), *_starts(result)]
+    lines += finding_lines(result.warnings)
     return "\n".join(lines)
 
 
-def equations_in_words(model: Model, comparison: Comparison | None = None) -> list[str]:
+def equation_lines(model: Model, comparison: Comparison | None = None) -> list[str]:
     """Return the equations with delays, limits and friction, and with offsets if there is one run."""
     structure = model.structure
     lines = []
     for item in model.equations:
         known = _offset(item.output, comparison)
         tail = structure.offset_in_words if known is None else known
-        lines.append(numeric(_readable(item), structure.acting(".6g")) + tail)
+        lines.append(format_equation(_readable(item), structure.describe_inputs(".6g")) + tail)
     return lines
 
 
@@ -66,13 +66,13 @@ def _offset(output: str, comparison: Comparison | None) -> str | None:
     return "".join(f" {'-' if v < 0 else '+'} {abs(v):.4g}{what}" for v, what in written)
 
 
-def numbers_in_words(result: Judged) -> list[str]:
+def parameter_lines(result: IdentificationRecord) -> list[str]:
     """Return orders and coefficients with standard errors, units and nominal values, one line each."""
     errors, units, stated = result.standard_errors, units_of(result.model), result.model.structure.reference
-    values = {**result.orders, **result.joint_values, **result.coefficients}
+    values = {**result.orders, **result.parameter_values, **result.coefficients}
     rows = []
     for name, value in values.items():
-        spread = f"± {unbounded(errors[name])}" if name in errors else ""
+        spread = f"± {format_bound(errors[name])}" if name in errors else ""
         tail = f"[{result.profiles[name]}]" if name in result.profiles else ""
         if name in stated:
             tail = f"{tail}  (stated {stated[name]:.6g})".strip()
@@ -86,7 +86,7 @@ def numbers_in_words(result: Judged) -> list[str]:
     return [*lines, f"  ({note})"] if errors else lines
 
 
-def behaviour_in_words(model: Model) -> list[str]:
+def behavior_lines(model: Model) -> list[str]:
     """Return lines on steady-state gains and modes, if the model has them."""
     if model.structure.has_friction:
         return ["  no poles, no gain: a body that may stick answers out of proportion"]
@@ -94,29 +94,29 @@ def behaviour_in_words(model: Model) -> list[str]:
     # Equations that cannot be solved for their outputs together have neither; everything else can be told.
     with contextlib.suppress(FtlmError):
         found = modes(model)
-        grows = any(mode.grows for mode in found)
+        grows = any(mode.unstable for mode in found)
         word = "mode" if len(found) == 1 else "modes"
-        lines += [f"  {word if k == 0 else '':<7}{mode_in_words(mode)}" for k, mode in enumerate(found[:MOST_MODES])]
+        lines += [f"  {word if k == 0 else '':<7}{describe_mode(mode)}" for k, mode in enumerate(found[:MOST_MODES])]
         if len(found) > MOST_MODES:
             lines.append(f"         and {len(found) - MOST_MODES} faster ones: .model.modes()")
         if not (grows or model.structure.limits):
-            lines = [f"  {'gain':<7}{gain_in_words(s, model)}" for s in steady_states(model)] + lines
+            lines = [f"  {'gain':<7}{describe_gain(s, model)}" for s in steady_states(model)] + lines
     return lines
 
 
-def mode_in_words(mode: Mode) -> str:
+def describe_mode(mode: Mode) -> str:
     """Describe a mode and its pole."""
     s = mode.pole
-    where = f"{s.real:.4g} ± {abs(s.imag):.4g}j" if mode.swings else f"{s.real:.4g}"
+    where = f"{s.real:.4g} ± {abs(s.imag):.4g}j" if mode.oscillatory else f"{s.real:.4g}"
     return f"{mode}; pole {where}"
 
 
-def gain_in_words(state: SteadyState, model: Model) -> str:
+def describe_gain(state: SteadyState, model: Model) -> str:
     """Describe a steady-state gain, or the growth of an output without steady state."""
     pair = f"{state.output} from {state.input}"
     above, below = (model.units.get(n, "") for n in (state.output, state.input))
     unit = f" {above}/{below}" if above and below else ""
-    rate, sure = with_error(state.rate, state.error), order_in_words(state)
+    rate, sure = with_error(state.rate, state.error), describe_order(state)
     if state.order > 0:
         course = "per second" if state.order == 1 else f"t^{state.order:.4g}/Γ({state.order + 1:.4g})"
         return f"{pair}: none, it integrates: {rate}{unit} {course}{sure}"
@@ -125,7 +125,7 @@ def gain_in_words(state: SteadyState, model: Model) -> str:
     return f"{pair}: {rate}{unit}{sure}"
 
 
-def order_in_words(state: SteadyState) -> str:
+def describe_order(state: SteadyState) -> str:
     """Describe the uncertainty of the order with which an output grows, if it was estimated."""
     error = state.order_error
     if not error:
@@ -136,7 +136,7 @@ def order_in_words(state: SteadyState) -> str:
     return f"; order {with_error(state.order, error)}" + ("" if told else f", which may be {whole:g}: {meaning}")
 
 
-def fits_in_words(result: Judged, validation: Comparison | None) -> list[str]:
+def fit_lines(result: IdentificationRecord, validation: Comparison | None) -> list[str]:
     """Return lines on the simulation fit on estimation and validation data, and on the equation error."""
     width = max(len(o) for o in result.output_error) + 2
     lines = [f"{'fit of the free run, %':<24}{'estimation':>12}{'validation':>12}{'RMSE':>12}"]
@@ -149,7 +149,7 @@ def fits_in_words(result: Judged, validation: Comparison | None) -> list[str]:
     return lines
 
 
-def _residuals(result: Judged) -> list[str]:
+def _residuals(result: IdentificationRecord) -> list[str]:
     if result.residuals is None:
         return ["residuals: the runs are too short for tests"]
     white = ", ".join(f"{o} {'yes' if w else 'no'}" for o, w in result.residuals.white.items())
@@ -157,40 +157,40 @@ def _residuals(result: Judged) -> list[str]:
     return [f"residuals white: {white}; independent of the inputs: {free} (99 %)"]
 
 
-def _starts(result: Judged) -> list[str]:
+def _starts(result: IdentificationRecord) -> list[str]:
     """Return lines on offsets outside the equations, and on runs with nonzero initial conditions."""
     comparison = result.comparison
     shown = {o for o in result.output_error if _offset(o, comparison) is not None}
     hidden = any(o not in shown for run in comparison.offsets for o in run)
-    lines = offsets_in_words(comparison) if hidden else []
+    lines = describe_offsets(comparison) if hidden else []
     moving = [
         f"{name} ({sum(map(len, terms.values()))})"
         for (name, _, _), terms in zip(comparison.per_run, comparison.initial, strict=True)
         if sum(map(len, terms.values())) and not comparison.offsets
     ]
     if moving:
-        lines += wrapped(f"in motion at its start, initial terms estimated with it: {', '.join(moving)}")
+        lines += wrap_text(f"in motion at its start, initial terms estimated with it: {', '.join(moving)}")
     return lines
 
 
-def concerns_in_words(warnings: Sequence[str], how: str = "print(result.details())") -> list[str]:
+def finding_lines(warnings: Sequence[str], how: str = "print(result.details())") -> list[str]:
     """Return up to three groups of warnings with remedies, most serious first."""
-    found = concerns(warnings)
+    found = group_warnings(warnings)
     lines = []
-    for concern in found[:SHOWN]:
-        lines += wrapped(f"{concern.warnings[0]}{concern.count}", "! ")
+    for concern in found[:MAX_SUMMARY_WARNINGS]:
+        lines += wrap_text(f"{concern.warnings[0]}{concern.count}", "! ")
         if concern.remedy and concern.remedy not in concern.warnings[0]:
-            lines += wrapped(concern.remedy, "  -> ")
-    more = left_over(found)
+            lines += wrap_text(concern.remedy, "  -> ")
+    more = hidden_warnings_text(found)
     return [*lines, f"  ({more}: {how})"] if more else lines
 
 
-COORDINATES = {"haar": "Haar coordinates", "time": "order of time"}
-INITIAL = {"rest": "none, the records start at rest", "caputo": "Caputo's, estimated for each run"}
-NORMS = {"l1": "sum of absolute errors (45)", "l2": "RMSE (46)"}
+ROW_BASIS_TEXTS = {"haar": "Haar coordinates", "time": "order of time"}
+INITIAL_TERMS_TEXTS = {"rest": "none, the records start at rest", "caputo": "Caputo's, estimated for each run"}
+NORM_TEXTS = {"l1": "sum of absolute errors (45)", "l2": "RMSE (46)"}
 
 
-def settings_in_words(settings: Mapping[str, Any]) -> str:
+def settings_text(settings: Mapping[str, Any]) -> str:
     """Return the settings on one line."""
     words = f"M = {settings['m']}"
     if "refinement" in settings:
@@ -202,7 +202,7 @@ def settings_in_words(settings: Mapping[str, Any]) -> str:
         words += f", p = {settings['innovation_length']}, K0 = {settings['prior_covariance']:g}"
         words += f", {settings['rows']} rows"
     if "loss" in settings:
-        words += f", loss: {settings['loss']} ({robust_in_words(settings)})"
+        words += f", loss: {settings['loss']} ({robust_loss_text(settings)})"
     words += f", initial terms: {settings['initial']}"
     words += f", offset: {settings['offset']}, one a run" if "offset" in settings else ""
     words += f", offset found by test: {settings['offset_test']}" if "offset_test" in settings else ""
@@ -211,7 +211,7 @@ def settings_in_words(settings: Mapping[str, Any]) -> str:
     )
 
 
-def robust_in_words(settings: Mapping[str, Any]) -> str:
+def robust_loss_text(settings: Mapping[str, Any]) -> str:
     """Return a summary of the robust loss as text."""
     return (
         f"{settings['lowered']} of {settings['samples']} residuals down-weighted, {settings['outliers']} of them "
@@ -226,7 +226,7 @@ def settings_rows(settings: Mapping[str, Any], *, searched: bool) -> list[list[C
         rows += [
             ["innovation length, p", int(settings["innovation_length"])],
             [Markup("prior covariance, K<sub>0</sub>"), Exact(settings["prior_covariance"])],
-            ["rows of the recursion", COORDINATES.get(settings["rows"], settings["rows"])],
+            ["rows of the recursion", ROW_BASIS_TEXTS.get(settings["rows"], settings["rows"])],
         ]
     if "refinement" in settings:
         rows += [
@@ -235,8 +235,8 @@ def settings_rows(settings: Mapping[str, Any], *, searched: bool) -> list[list[C
         ]
         rows += [[f"noise found on {symbol(name)}", float(level)] for name, level in settings["noise"].items()]
     if "loss" in settings:
-        rows.append(["loss", f"{settings['loss']}: {robust_in_words(settings)}"])
-    rows.append(["initial terms", INITIAL.get(str(settings["initial"]), str(settings["initial"]))])
+        rows.append(["loss", f"{settings['loss']}: {robust_loss_text(settings)}"])
+    rows.append(["initial terms", INITIAL_TERMS_TEXTS.get(str(settings["initial"]), str(settings["initial"]))])
     if "offset" in settings:
         rows.append(["offset of each equation", f"{settings['offset']}, estimated for each run"])
     if "offset_test" in settings:
@@ -244,5 +244,7 @@ def settings_rows(settings: Mapping[str, Any], *, searched: bool) -> list[list[C
     if "reference" in settings:
         rows.append(["reference", f"{settings['reference']}; instrument: what of the inputs follows it"])
     if searched:
-        rows.append(["orders ranked by", f"{settings['criterion']}, {NORMS.get(settings['norm'], settings['norm'])}"])
+        rows.append(
+            ["orders ranked by", f"{settings['criterion']}, {NORM_TEXTS.get(settings['norm'], settings['norm'])}"]
+        )
     return rows

@@ -11,20 +11,25 @@ from msgspec import UNSET
 
 from ftlm.data.units import coefficient_unit
 from ftlm.estimation.output_error import JointFit
-from ftlm.model.model import Solved
+from ftlm.model.model import ModelData
 from ftlm.structure.equation import Equation
-from ftlm.structure.input_nonlinearity import SHORT, WORDS, Limit, input_name
+from ftlm.structure.input_nonlinearity import (
+    INPUT_EFFECT_ABBREVIATIONS,
+    INPUT_EFFECT_LABELS,
+    InputNonlinearity,
+    input_name,
+)
 from ftlm.structure.order import Order
 from ftlm.svg.html_page import Table
-from ftlm.utils.formatting import GREEK, SYMBOL, Cell, Exact, number, symbol, symbol_html, unbounded
+from ftlm.utils.formatting import GREEK_LETTERS, SYMBOL_PATTERN, Cell, Exact, format_bound, number, symbol, symbol_html
 from ftlm.utils.statistics import NORMAL_95
 
 #: Decimals of an order in an equation; the model file stores all digits.
 ORDER_DECIMALS = 4
-THIN = Markup('<mspace width="0.17em"></mspace>')  # our constant
-_LATE = Markup("<mrow><mo>(</mo><mi>t</mi><mo>−</mo>{}{}<mi>s</mi><mo>)</mo></mrow>")
-_LIMITED = Markup("<mrow><mi>{}</mi><mo>(</mo>{}<mo>,</mo>{}<mo>)</mo></mrow>")
-_FALL = Markup(
+THIN_SPACE = Markup('<mspace width="0.17em"></mspace>')  # our constant
+_DELAYED_TIME = Markup("<mrow><mo>(</mo><mi>t</mi><mo>−</mo>{}{}<mi>s</mi><mo>)</mo></mrow>")
+_LIMITED_INPUT = Markup("<mrow><mi>{}</mi><mo>(</mo>{}<mo>,</mo>{}<mo>)</mo></mrow>")
+_GAUSSIAN_DECAY = Markup(
     "<msup><mi>e</mi><mrow><mo>−</mo><msup><mrow><mo>(</mo>{}<mo>/</mo>{}<mo>)</mo></mrow><mn>2</mn></msup></mrow></msup>"
 )
 _PLAIN_DIGITS = str.maketrans("⁻⁰¹²³⁴⁵⁶⁷⁸⁹", "-0123456789")
@@ -33,7 +38,7 @@ _PLAIN_DIGITS = str.maketrans("⁻⁰¹²³⁴⁵⁶⁷⁸⁹", "-0123456789")
 def equation_html(
     item: Equation,
     delay: Mapping[str, float] | None = None,
-    limits: Sequence[Limit] = (),
+    limits: Sequence[InputNonlinearity] = (),
     offset: Mapping[str, float] | str = "",
 ) -> Markup:
     """Return an identified equation as MathML, one element per term so that lines break between terms.
@@ -59,7 +64,7 @@ def equation_html(
             _math(
                 lead
                 + _number_math(abs(value))
-                + THIN
+                + THIN_SPACE
                 + _derivative_math(term.order, term.signal, (delay or {}).get(term.signal, 0.0), limits),
                 "term",
             )
@@ -68,22 +73,24 @@ def equation_html(
         fc, fs, vs = item.friction.law
         speed = _derivative_math(Order(1.0), item.output)
         minus, sign = Markup('<mo form="infix">−</mo>'), Markup("<mi>sgn</mi><mo>(</mo>{}<mo>)</mo>").format(speed)
-        parts.append(_math(minus + _number_math(fc) + THIN + sign, "term"))
+        parts.append(_math(minus + _number_math(fc) + THIN_SPACE + sign, "term"))
         if item.friction.stribeck is not None:
-            fall = _FALL.format(speed, _number_math(vs))
-            parts.append(_math(minus + _number_math(fs) + THIN + fall + THIN + sign, "term"))
+            fall = _GAUSSIAN_DECAY.format(speed, _number_math(vs))
+            parts.append(_math(minus + _number_math(fs) + THIN_SPACE + fall + THIN_SPACE + sign, "term"))
     if isinstance(offset, str):
         words = offset.removeprefix(" + ")
         parts += [_math(Markup('<mo form="infix">+</mo><mi>{}</mi>').format(words), "term")] if words else []
     else:
         for name, value in offset.items():
             sign, time = Markup('<mo form="infix">{}</mo>').format("−" if value < 0 else "+"), _symbol_math("t")
-            tail = THIN + time if name == "ramp" else Markup("")
+            tail = THIN_SPACE + time if name == "ramp" else Markup("")
             parts.append(_math(sign + _number_math(abs(value)) + tail, "term"))
     return Markup('<span class="equation">{}</span>').format(Markup(" ").join(parts))
 
 
-def equations_html(model: Solved, offsets: Sequence[Mapping[str, Mapping[str, float]]] | None = None) -> list[Markup]:
+def equations_html(
+    model: ModelData, offsets: Sequence[Mapping[str, Mapping[str, float]]] | None = None
+) -> list[Markup]:
     """Equations of a model as MathML; offsets as numbers if there is one run, since each run has its own."""
     structure = model.structure
     own = offsets[0] if offsets is not None and len(offsets) == 1 else {}
@@ -93,7 +100,7 @@ def equations_html(model: Solved, offsets: Sequence[Mapping[str, Mapping[str, fl
     ]
 
 
-def units_of(model: Solved) -> dict[str, str]:
+def units_of(model: ModelData) -> dict[str, str]:
     """Unit of every named coefficient, friction, delay and limit whose unit is known."""
     out = {}
     for item in model.equations:
@@ -137,27 +144,29 @@ def _short(value: float) -> Exact:
 
 
 def _symbol_math(name: str) -> Markup:
-    parts = SYMBOL.fullmatch(name)
+    parts = SYMBOL_PATTERN.fullmatch(name)
     if not parts:
         return Markup("<mi>{}</mi>").format(name)
-    stem = Markup("<mi>{}</mi>").format(GREEK.get(parts[1], parts[1]))
+    stem = Markup("<mi>{}</mi>").format(GREEK_LETTERS.get(parts[1], parts[1]))
     return Markup("<msub>{}<mn>{}</mn></msub>").format(stem, parts[2]) if parts[2] else stem
 
 
-def _derivative_math(order: Order, signal: str, delay: float = 0.0, limits: Sequence[Limit] = ()) -> Markup:
+def _derivative_math(order: Order, signal: str, delay: float = 0.0, limits: Sequence[InputNonlinearity] = ()) -> Markup:
     written = _symbol_math(signal)
     if delay > 0:
-        written += _LATE.format(_number_math(_short(delay)), THIN)
+        written += _DELAYED_TIME.format(_number_math(_short(delay)), THIN_SPACE)
     for limit in limits:
         if limit.signal == signal and not isinstance(limit.value, tuple):
-            written = _LIMITED.format(SHORT[limit.law], written, _number_math(_short(float(limit.value))))
+            written = _LIMITED_INPUT.format(
+                INPUT_EFFECT_ABBREVIATIONS[limit.law], written, _number_math(_short(float(limit.value)))
+            )
     if not order.names and round(order.constant, ORDER_DECIMALS) == 0:
         return written
-    value = Markup("<mi>{}</mi>").format(str(order)) if order.names else _signed(order.constant)
-    return Markup("<msup><mi>D</mi>{}</msup>{}{}").format(value, THIN, written)
+    value = Markup("<mi>{}</mi>").format(str(order)) if order.names else _signed_math(order.constant)
+    return Markup("<msup><mi>D</mi>{}</msup>{}{}").format(value, THIN_SPACE, written)
 
 
-def _signed(value: float) -> Markup:
+def _signed_math(value: float) -> Markup:
     value = round(value, ORDER_DECIMALS) + 0.0
     text = number(Exact(abs(value)))
     return Markup("<mrow><mo>−</mo><mn>{}</mn></mrow>" if value < 0 else "<mn>{}</mn>").format(text)
@@ -171,7 +180,9 @@ def derivative_html(order: Order, signal: str) -> Markup:
     return Markup("D<sup>{}</sup> {}").format(text, symbol_html(signal))
 
 
-def parameter_table(model: Solved, joint: JointFit | None = None, *, title: str = "Orders and coefficients") -> Table:
+def parameter_table(
+    model: ModelData, joint: JointFit | None = None, *, title: str = "Orders and coefficients"
+) -> Table:
     """Return a table of orders and coefficients with their terms, standard errors and reference values.
 
     Parameters
@@ -205,7 +216,7 @@ def parameter_table(model: Solved, joint: JointFit | None = None, *, title: str 
         half = None if error is None else NORMAL_95 * error
         ends: list[Cell] = [None, None] if half is None else [value - half, value + half]
         if name in profiles:
-            ends = [v if math.isfinite(v) else unbounded(v) for v in profiles[name]]
+            ends = [v if math.isfinite(v) else format_bound(v) for v in profiles[name]]
         return [symbol_html(name), value, error, *ends, stated, unit_html(units.get(name, "")), place]
 
     rows = [row(n, v if known else Exact(v), None, "free order") for n, v in model.orders.items()]
@@ -225,14 +236,14 @@ def parameter_table(model: Solved, joint: JointFit | None = None, *, title: str 
             of = {item.friction.name: "Coulomb friction"}
             if near is not None:
                 of |= {near.name: "Stribeck friction, beyond Coulomb's at rest,", near.speed_name: "Stribeck's speed"}
-            for name, value in item.friction.found.items():
+            for name, value in item.friction.identified_coefficients.items():
                 shown.add(name)
                 place = Markup("{} in the equation of {}").format(of[name], symbol_html(item.output))
                 rows.append(row(name, value, reference.get(name), place))
     inputs = {input_name("delay", n): (f"delay of {symbol(n)}", v) for n, v in model.structure.delay.items()}
     for limit in model.structure.limits:
         if not isinstance(limit.value, tuple):
-            inputs[limit.name] = (f"{WORDS[limit.law]} of {symbol(limit.signal)}", limit.value)
+            inputs[limit.name] = (f"{INPUT_EFFECT_LABELS[limit.law]} of {symbol(limit.signal)}", limit.value)
     inputs = {n: known_of for n, known_of in inputs.items() if n in errors}
     rows += [
         row(n, v, None, "free in the coefficient law") for n, v in extra.items() if n not in shown and n not in inputs
@@ -264,7 +275,7 @@ def unit_html(unit: str) -> Markup:
     return Markup("").join(raised)
 
 
-def model_html(model: Solved) -> str:
+def model_html(model: ModelData) -> str:
     """Return the equations and parameters of a model as HTML."""
     lines = Markup("").join(Markup("<p>{}</p>").format(e) for e in equations_html(model))
     known = model.orders or model.coefficients

@@ -2,7 +2,7 @@
 
 from ftlm.reproduction.claims import Claim, printed_saturation, table_3_coefficients
 from ftlm.reproduction.cross_validation import Deflection, UnseenOrders, Verdict, orders_on_unseen_runs
-from ftlm.reproduction.demo import Demo, StageRow, run_demo
+from ftlm.reproduction.demo import Demo, DemoStage, run_demo
 from ftlm.reproduction.published_values import AsPrinted, as_printed, implied_spreads
 from ftlm.reproduction.report import unseen_page
 from ftlm.reproduction.reproduction import Reproduction, reproduce
@@ -16,11 +16,11 @@ __all__ = [
     "Claim",
     "Deflection",
     "Demo",
+    "DemoStage",
     "PaperRow",
     "Reproduction",
     "Rival",
     "Stage",
-    "StageRow",
     "UnseenOrders",
     "Verdict",
     "as_printed",

@@ -9,32 +9,32 @@ from dataclasses import dataclass, field
 from itertools import pairwise
 from typing import Any, Literal
 
-from ftlm.arm.flexible_link import PARAMETERS, order_law
+from ftlm.arm.flexible_link import PARAMETER_SETS, order_law
 from ftlm.data.run import Run
-from ftlm.estimation.linear import Trace
+from ftlm.estimation.linear import MultiInnovationTrace
 from ftlm.reproduction import published_values as printed
 from ftlm.reproduction.optimizer_comparison import Panel, Trial
-from ftlm.reproduction.published_models import Ran
-from ftlm.reproduction.published_values import NEAR, AsPrinted, implied_spreads
-from ftlm.reproduction.simulated_arm import STAGES, truth_of
-from ftlm.reproduction.stage_result import PRIORS, TRACE_EVERY, WEAK_PRIOR, Rival, Stage
-from ftlm.structure.order_grid import Lattice
+from ftlm.reproduction.published_models import PrintedModelRun
+from ftlm.reproduction.published_values import MAX_COEFFICIENT_RATIO, AsPrinted, implied_spreads
+from ftlm.reproduction.simulated_arm import STAGE_NUMBERS, truth_of
+from ftlm.reproduction.stage_result import PRIOR_COVARIANCES, TRACE_EVERY, WEAK_PRIOR, Rival, Stage
+from ftlm.structure.order_grid import OrderGrid
 from ftlm.utils.formatting import symbol
 from ftlm.validation.comparison import metrics
 
 
 @dataclass(frozen=True)
-class Recomputed:
+class ReproductionData:
     """Stage results and runs; its fields are those of :class:`ftlm.Reproduction`."""
 
     square: Run
     sine: Run | None
     simulated: bool
     stages: dict[int, Stage]
-    lattice: Lattice
+    lattice: OrderGrid
     notes: tuple[str, ...] = field(default=())
     panel: Panel = field(default_factory=Panel)
-    ran: tuple[Ran, ...] = ()
+    ran: tuple[PrintedModelRun, ...] = ()
     as_printed: dict[str, AsPrinted] = field(default_factory=dict)
 
     @property
@@ -58,19 +58,19 @@ class Recomputed:
         return {output: rival for stage in self.stages.values() for output, rival in stage.rivals.items()}
 
     @property
-    def traces(self) -> dict[str, dict[int, Trace]]:
+    def traces(self) -> dict[str, dict[int, MultiInnovationTrace]]:
         """Convergence of all stages by output and p."""
         return {output: each for stage in self.stages.values() for output, each in stage.traces.items()}
 
     @property
-    def weak_traces(self) -> dict[str, dict[int, Trace]]:
+    def weak_traces(self) -> dict[str, dict[int, MultiInnovationTrace]]:
         """Convergence with the weak prior by output and p."""
         return {output: each for stage in self.stages.values() for output, each in stage.weak_traces.items()}
 
 
 Word = Literal["holds", "does not hold", "turns with", "cannot be told from a simulated truth", "cannot be told"]
 #: Factor chosen by the simulation; a verdict that it alone decides reproduces this choice.
-TRUTH = "the arm"
+ARM_FACTOR = "the arm"
 
 
 @dataclass(frozen=True)
@@ -90,7 +90,7 @@ class Case:
 
 
 @dataclass(frozen=True)
-class Ruling:
+class ClaimVerdict:
     """Verdict of a claim over all its cases.
 
     Parameters
@@ -108,11 +108,11 @@ class Ruling:
     word: Word
     factors: tuple[str, ...] = ()
     cases: int = 0
-    held: int = 0
+    holding_cases: int = 0
     levels: tuple[tuple[str, int, int], ...] = ()
 
     def __str__(self) -> str:
-        return f"turns with {_listed(self.factors)}" if self.word == "turns with" else self.word
+        return f"turns with {_join_words(self.factors)}" if self.word == "turns with" else self.word
 
 
 def case(holds: bool, **factors: str) -> Case:
@@ -120,7 +120,7 @@ def case(holds: bool, **factors: str) -> Case:
     return Case(tuple((name.replace("_", " "), level) for name, level in factors.items()), holds)
 
 
-def ruled(cases: Sequence[Case], *, of_the_machine: bool = False) -> Ruling:
+def combine_cases(cases: Sequence[Case], *, of_the_machine: bool = False) -> ClaimVerdict:
     """Return the verdict of all cases together.
 
     A claim holds if it holds in every case, and does not hold if it holds in none. Otherwise it depends on those
@@ -137,19 +137,19 @@ def ruled(cases: Sequence[Case], *, of_the_machine: bool = False) -> Ruling:
     held = sum(case.holds for case in cases)
     counts = len(cases), held
     if not cases:
-        return Ruling("cannot be told")
-    if of_the_machine and len({dict(case.factors).get(TRUTH) for case in cases}) < 2:
-        return Ruling("cannot be told from a simulated truth", (TRUTH,), *counts)
+        return ClaimVerdict("cannot be told")
+    if of_the_machine and len({dict(case.factors).get(ARM_FACTOR) for case in cases}) < 2:
+        return ClaimVerdict("cannot be told from a simulated truth", (ARM_FACTOR,), *counts)
     if held in (0, len(cases)):
-        return Ruling("holds" if held else "does not hold", (), *counts)
+        return ClaimVerdict("holds" if held else "does not hold", (), *counts)
     names = [name for name, _ in cases[0].factors]
     flips = {name: _flips(cases, name) for name in names}
     turning = sorted((n for n in names if flips[n]), key=lambda n: -flips[n])
-    if of_the_machine and TRUTH in turning:
-        return Ruling("cannot be told from a simulated truth", (TRUTH,), *counts, _levels(cases, TRUTH))
+    if of_the_machine and ARM_FACTOR in turning:
+        return ClaimVerdict("cannot be told from a simulated truth", (ARM_FACTOR,), *counts, _levels(cases, ARM_FACTOR))
     # One factor that decides every outcome says all.
     factors = next(([n] for n in names if _decides(cases, n)), turning or names)
-    return Ruling("turns with", tuple(factors), *counts, _levels(cases, factors[0]))
+    return ClaimVerdict("turns with", tuple(factors), *counts, _levels(cases, factors[0]))
 
 
 def _levels(cases: Sequence[Case], name: str) -> tuple[tuple[str, int, int], ...]:
@@ -177,26 +177,26 @@ def _decides(cases: Sequence[Case], name: str) -> bool:
     return all(len(outcomes) == 1 for outcomes in levels.values())
 
 
-def _listed(names: Sequence[str]) -> str:
+def _join_words(names: Sequence[str]) -> str:
     return names[0] if len(names) == 1 else f"{', '.join(names[:-1])} and {names[-1]}"
 
 
 #: Relative difference below which two errors are equal.
-ALIKE = 0.02
+MIN_RELATIVE_DIFFERENCE = 0.02
 #: Largest ratio of output error to equation error, and largest NR, of a model that describes the data.
-FLATTERY, EXPLAINS = 5.0, 0.5
+MAX_ERROR_RATIO, MAX_EXPLAINING_NR = 5.0, 0.5
 #: Relative difference of two standard deviations of one record that the digits of Table 7 allow.
-MIXED = 0.15
+MAX_DEVIATION_MISMATCH = 0.15
 #: Largest error of an estimate, in standard errors, that is due to chance.
-BY_CHANCE = 4.0
+MAX_STANDARD_ERRORS = 4.0
 #: Smallest relative saving of steps that counts as faster convergence.
-SOONER = 0.1
+MIN_STEP_SAVING = 0.1
 #: Arm of integer orders with friction that no fitted model includes.
-FEIGNED = "whole orders, friction"
+UNMODELED_FRICTION_ARM = "whole orders, friction"
 #: Steps between two points of a convergence curve.
-STEPS = TRACE_EVERY
+CURVE_INTERVAL_STEPS = TRACE_EVERY
 #: Largest ratio of the standard deviations of a model and of the machine.
-MOVES = 2.0
+MAX_DEVIATION_RATIO = 2.0
 
 
 @dataclass(frozen=True)
@@ -216,7 +216,7 @@ class Claim:
     """
 
     claim: str
-    ruling: Ruling
+    ruling: ClaimVerdict
     brief: str
     evidence: str
 
@@ -237,13 +237,13 @@ class Claim:
             "verdict": self.verdict,
             "turns with": list(self.ruling.factors),
             "cases": self.ruling.cases,
-            "held": self.ruling.held,
+            "held": self.ruling.holding_cases,
             "brief": self.brief,
             "evidence": self.evidence,
         }
 
 
-def claims(found: Recomputed) -> list[Claim]:
+def claims(found: ReproductionData) -> list[Claim]:
     """Compare the claims of the paper, and its errors, with computed numbers.
 
     Every verdict follows from numbers by a rule.
@@ -272,7 +272,7 @@ def numbers_listed(values: Iterable[float], digits: int = 4) -> str:
     return ", ".join("∞" if math.isinf(v) else f"{v:.{digits}g}" for v in values)
 
 
-def listed(numbers: Mapping[str, Iterable[float]], digits: int = 4) -> str:
+def numbers_by_angle(numbers: Mapping[str, Iterable[float]], digits: int = 4) -> str:
     """Format the numbers of every angle."""
     return "; ".join(f"{symbol(name)} {numbers_listed(values, digits)}" for name, values in numbers.items())
 
@@ -285,7 +285,7 @@ def printed_saturation(output: str) -> tuple[float, float, float]:
     output
         An angle of the paper, such as ``"theta11"``.
     """
-    rows = printed.FRACTIONAL[output]
+    rows = printed.FRACTIONAL_ROWS[output]
     first, last = printed.INNOVATION_LENGTHS[0], printed.INNOVATION_LENGTHS[-1]
     # 1/a = 1/x + (c/x)/p is a line in 1/p.
     slope = (1 / rows[first].coefficients["a"] - 1 / rows[last].coefficients["a"]) / (1 / first - 1 / last)
@@ -295,7 +295,7 @@ def printed_saturation(output: str) -> tuple[float, float, float]:
     return x, c, max(abs(x * p / (p + c) / a - 1) for p, a in between)
 
 
-def weak_spread(stage: Stage, output: str) -> float:
+def weak_prior_variation(stage: Stage, output: str) -> float:
     """Largest relative change of a coefficient between p = 1 and any other p, with a weak prior."""
     each = stage.weak[output]
     first = each[printed.INNOVATION_LENGTHS[0]]
@@ -304,15 +304,15 @@ def weak_spread(stage: Stage, output: str) -> float:
 
 def prior_in_words(prior: float) -> str:
     """Format K0 as 1 or 10¹⁰."""
-    return "1" if prior == PRIORS[0] else "10¹⁰"
+    return "1" if prior == PRIOR_COVARIANCES[0] else "10¹⁰"
 
 
-def spread_in_words(found: Recomputed) -> str:
+def deviation_in_words(found: ReproductionData) -> str:
     """Describe the ratio of implied to simulated standard deviations, and the NR that it implies."""
-    factors = sorted(r.too_small for r in found.ran)
+    factors = sorted(r.deviation_ratio for r in found.ran)
     # What moves r times less than the angle leaves at least 1 - 1/r of its deviation.
-    floors = [max(1 - 1 / r.too_small, 0.0) for r in found.ran]
-    stated = [float(printed.FRACTIONAL[r.output][r.p].nr or 0.0) for r in found.ran]
+    floors = [max(1 - 1 / r.deviation_ratio, 0.0) for r in found.ran]
+    stated = [float(printed.FRACTIONAL_ROWS[r.output][r.p].nr or 0.0) for r in found.ran]
     beyond = sum(low > nr for low, nr in zip(floors, stated, strict=True))
     middle = f"from {factors[0]:.3g} to {factors[-1]:.3g}, median {statistics.median(factors):.3g}"
     if not beyond:
@@ -335,31 +335,47 @@ def _of_trials(trials: Sequence[Trial], holding: Sequence[bool]) -> list[Case]:
     ]
 
 
-def _held(ruling: Ruling) -> str:
+def _case_counts(ruling: ClaimVerdict) -> str:
     """Describe the number of cases in which a claim holds, by level of the deciding factor."""
     name = "K0 = " if ruling.factors[:1] == ("K0",) else ""
     parts = "; ".join(f"{name}{level}: {held} of {count}" for level, count, held in ruling.levels)
-    return f"{ruling.held} of {ruling.cases} cases" + (f"; {parts}" if parts else "")
+    return f"{ruling.holding_cases} of {ruling.cases} cases" + (f"; {parts}" if parts else "")
 
 
-def _claims_of_printed_models(found: Recomputed) -> list[Claim]:
+def _claims_of_printed_models(found: ReproductionData) -> list[Claim]:
     if not found.ran:
         return []
-    worst = max(found.ran, key=lambda r: r.too_small)
-    ratios = {o: [r.too_small for r in found.ran if r.output == o] for o in dict.fromkeys(r.output for r in found.ran)}
-    moves = ruled([case(1 / MOVES < r.too_small < MOVES, the_angle=symbol(r.output), p=str(r.p)) for r in found.ran])
-    stable = ruled([case(r.stability.stable, the_angle=symbol(r.output), p=str(r.p)) for r in found.ran])
+    worst = max(found.ran, key=lambda r: r.deviation_ratio)
+    ratios = {
+        o: [r.deviation_ratio for r in found.ran if r.output == o] for o in dict.fromkeys(r.output for r in found.ran)
+    }
+    moves = combine_cases(
+        [
+            case(
+                1 / MAX_DEVIATION_RATIO < r.deviation_ratio < MAX_DEVIATION_RATIO,
+                the_angle=symbol(r.output),
+                p=str(r.p),
+            )
+            for r in found.ran
+        ]
+    )
+    stable = combine_cases([case(r.stability.stable, the_angle=symbol(r.output), p=str(r.p)) for r in found.ran])
     poles = {o: [r.stability.unstable_poles for r in found.ran if r.output == o] for o in ratios}
     counted = sorted({v for each in poles.values() for v in each})
     returned = [
-        (r, k, r.returned.get(k, {}).get(f"a{printed.OUTPUTS.index(r.output) + 1}", math.nan))
+        (r, k, r.returned_coefficients.get(k, {}).get(f"a{printed.ANGLE_NAMES.index(r.output) + 1}", math.nan))
         for r in found.ran
-        for k in PRIORS
+        for k in PRIOR_COVARIANCES
     ]
-    own = [printed.FRACTIONAL[r.output][r.p].coefficients["a"] for r, _, _ in returned]
-    back = ruled(
+    own = [printed.FRACTIONAL_ROWS[r.output][r.p].coefficients["a"] for r, _, _ in returned]
+    back = combine_cases(
         [
-            case(abs(a / own_a - 1) < ALIKE, K0=prior_in_words(k), the_angle=symbol(r.output), p=str(r.p))
+            case(
+                abs(a / own_a - 1) < MIN_RELATIVE_DIFFERENCE,
+                K0=prior_in_words(k),
+                the_angle=symbol(r.output),
+                p=str(r.p),
+            )
             for (r, k, a), own_a in zip(returned, own, strict=True)
         ]
     )
@@ -368,22 +384,23 @@ def _claims_of_printed_models(found: Recomputed) -> list[Claim]:
         Claim(
             "The printed models, under the paper's current, move as the paper's arm does.",
             moves,
-            f"{symbol(worst.output)}, p = {worst.p}: ±{worst.moved:.2g} rad, {worst.too_small:.0f} times less than the "
-            f"paper's own angle ({worst.implied:.2g} rad)",
+            f"{symbol(worst.output)}, p = {worst.p}: ±{worst.angle_deviation:.2g} rad, {worst.deviation_ratio:.0f} "
+            "times less than the "
+            f"paper's own angle ({worst.implied_deviation:.2g} rad)",
             "standard deviation of the angle that RMSE / NR implies, over that of the printed model's free run from "
-            f"rest, for p = 1, 3, 5, 7: {listed(ratios, 3)}; {spread_in_words(found)}.",
+            f"rest, for p = 1, 3, 5, 7: {numbers_by_angle(ratios, 3)}; {deviation_in_words(found)}.",
         ),
         Claim(
             "The printed models are stable.",
             stable,
             f"poles with a positive real part of a stage: {numbers_listed(counted, 2)}",
-            f"poles of both printed equations of a stage together, for p = 1, 3, 5, 7: {listed(poles, 2)}.",
+            f"poles of both printed equations of a stage together, for p = 1, 3, 5, 7: {numbers_by_angle(poles, 2)}.",
         ),
         Claim(
             "Identified from its own response, a printed model returns its coefficients.",
             back,
             "a at p = 7, K0 = 1: "
-            + "; ".join(f"{symbol(r.output)} {a:.2g}, not {w:g}" for r, k, a, w in last if k == PRIORS[0]),
+            + "; ".join(f"{symbol(r.output)} {a:.2g}, not {w:g}" for r, k, a, w in last if k == PRIOR_COVARIANCES[0]),
             "no noise, its own orders, multi-innovation with its own p; a returned at p = 7 and printed: "
             + "; ".join(f"{symbol(r.output)}, K0 = {prior_in_words(k)}: {a:.3g} ({w:g})" for r, k, a, w in last)
             + ". With orders free around the printed ones it ends at "
@@ -398,13 +415,13 @@ def _claims_of_printed_models(found: Recomputed) -> list[Claim]:
     ]
 
 
-def _claims_of_tables(found: Recomputed) -> list[Claim]:
+def _claims_of_tables(found: ReproductionData) -> list[Claim]:
     tables = found.as_printed
     if not tables:
         return []
     priors = [t.reading.prior for t in tables.values()]
-    again = ruled(_of_angles({o: t.near for o, t in tables.items()}))
-    optimum = ruled(_of_angles({o: t.rank == 1 for o, t in tables.items()}))
+    again = combine_cases(_of_angles({o: t.is_close for o, t in tables.items()}))
+    optimum = combine_cases(_of_angles({o: t.rank == 1 for o, t in tables.items()}))
     return [
         Claim(
             "Tables 4 and 5 can be computed again from what the paper says.",
@@ -412,7 +429,7 @@ def _claims_of_tables(found: Recomputed) -> list[Claim]:
             "as equation errors, K0 chosen for each angle, a and NR come within a mean factor of "
             + ", ".join(f"{t.away:.2f} ({symbol(o)})" for o, t in tables.items())
             + "; b, d, g over printed, p = 7: "
-            + listed({o: [t.ratios[c][-1] for c in "bdg"] for o, t in tables.items()}, 3),
+            + numbers_by_angle({o: [t.ratios[c][-1] for c in "bdg"] for o, t in tables.items()}, 3),
             "the nearest reading of each angle, the factor by which a and NR are away in the mean, and that with K0 = "
             "1: "
             + "; ".join(f"{symbol(o)}: {t.reading}: {t.away:.3g}, {t.away_at_one:.3g}" for o, t in tables.items())
@@ -421,8 +438,8 @@ def _claims_of_tables(found: Recomputed) -> list[Claim]:
                 f"{symbol(o)} " + ", ".join(f"{c} {min(q):.3g} to {max(q):.3g}" for c, q in t.ratios.items())
                 for o, t in tables.items()
             )
-            + f". A case holds where all are within a factor of {NEAR:g}. Computed with the arm of whole orders and "
-            "friction, every angle scaled to the deviation that RMSE / NR implies, at the printed orders; errors are "
+            + f". A case holds where all are within a factor of {MAX_COEFFICIENT_RATIO:g}. Computed with the arm of whole "
+            "orders and friction, every angle scaled to the deviation that RMSE / NR implies, at the printed orders; errors are "
             f"those of the equation, and K0 differ by a factor of {max(priors) / min(priors):.3g}.",
         ),
         Claim(
@@ -441,7 +458,7 @@ def _claims_of_tables(found: Recomputed) -> list[Claim]:
     ]
 
 
-def _of_main(found: Recomputed, prior: float) -> dict[str, Trial]:
+def _of_main(found: ReproductionData, prior: float) -> dict[str, Trial]:
     """Return the first record's trials on the main arm, by angle."""
     own: dict[str, Trial] = {}
     for t in found.panel.trials:
@@ -453,45 +470,46 @@ def _of_main(found: Recomputed, prior: float) -> dict[str, Trial]:
 def _falls(t: Trial) -> bool:
     """Whether the error (45) never rises with p, and is smaller at the largest p than at the first."""
     e = [t.errors[p] for p in printed.INNOVATION_LENGTHS]
-    return all(b <= a for a, b in pairwise(e)) and e[-1] < (1 - ALIKE) * e[0]
+    return all(b <= a for a, b in pairwise(e)) and e[-1] < (1 - MIN_RELATIVE_DIFFERENCE) * e[0]
 
 
-def _claim_of_smaller_errors(found: Recomputed) -> Claim:
+def _claim_of_smaller_errors(found: ReproductionData) -> Claim:
     trials = found.panel.trials
-    ruling = ruled(_of_trials(trials, [_falls(t) for t in trials]))
+    ruling = combine_cases(_of_trials(trials, [_falls(t) for t in trials]))
     ends = [
-        f"K0 = {prior_in_words(k)}: {listed({o: t.errors.values() for o, t in _of_main(found, k).items()})}"
-        for k in PRIORS
+        f"K0 = {prior_in_words(k)}: {numbers_by_angle({o: t.errors.values() for o, t in _of_main(found, k).items()})}"
+        for k in PRIOR_COVARIANCES
     ]
     return Claim(
         "A larger innovation length p gives a smaller error (45): Tables 4 and 5.",
         ruling,
-        _held(ruling),
+        _case_counts(ruling),
         f"error of the free run for p = 1, 3, 5, 7, each at its best orders, on the first record: {'; '.join(ends)}. "
         f"A case is one angle of one record with one K0, and holds where no step of p is worse and p = 7 is better by "
-        f"more than {100 * ALIKE:g} %.",
+        f"more than {100 * MIN_RELATIVE_DIFFERENCE:g} %.",
     )
 
 
-def _claim_of_p_itself(found: Recomputed) -> Claim:
+def _claim_of_p_itself(found: ReproductionData) -> Claim:
     """Claim that errors fall with p, tested with a weak prior, where p has no weight."""
     trials = [t for t in found.panel.trials if t.prior == WEAK_PRIOR]
-    ruling = ruled(_of_trials(trials, [_falls(t) for t in trials]))
+    ruling = combine_cases(_of_trials(trials, [_falls(t) for t in trials]))
     first, last = printed.INNOVATION_LENGTHS[0], printed.INNOVATION_LENGTHS[-1]
     ratios = [t.errors[last] / t.errors[first] for t in trials if math.isfinite(t.errors[first]) and t.errors[first]]
-    away = ", ".join(f"{100 * printed_saturation(o)[2]:.2g} % ({symbol(o)})" for o in printed.OUTPUTS)
+    away = ", ".join(f"{100 * printed_saturation(o)[2]:.2g} % ({symbol(o)})" for o in printed.ANGLE_NAMES)
     words, brief = "", "no record that starts at rest"
     if ratios:
         brief = (
-            f"{_held(ruling)}; with a weak prior the error of p = {last} is {min(ratios):.4g} to {max(ratios):.4g} "
+            f"{_case_counts(ruling)}; with a weak prior the error of p = {last} is {min(ratios):.4g} to "
+            f"{max(ratios):.4g} "
             f"times that of p = {first}"
         )
         words = (
             f"with a weak prior (K0 = {WEAK_PRIOR:.0e}) the error (45) of p = {last} is {min(ratios):.4g} to "
             f"{max(ratios):.4g} times that of p = {first}, each at its best orders; a case holds where no step of p is "
-            f"worse and p = {last} is better by more than {100 * ALIKE:g} %. "
+            f"worse and p = {last} is better by more than {100 * MIN_RELATIVE_DIFFERENCE:g} %. "
         )
-    spread = [weak_spread(s, o) for s in found.stages.values() for o in s.weak]
+    spread = [weak_prior_variation(s, o) for s in found.stages.values() for o in s.weak]
     if spread:
         words += f"At the same orders coefficients differ by at most {100 * max(spread):.2g} % between the p. "
     return Claim(
@@ -502,79 +520,90 @@ def _claim_of_p_itself(found: Recomputed) -> Claim:
     )
 
 
-def sooner(arrived: Mapping[int, float]) -> bool | None:
+def converges_faster(arrived: Mapping[int, float]) -> bool | None:
     """Whether larger p need fewer steps; None if all converge at the first evaluated step."""
     steps = [arrived[p] for p in printed.INNOVATION_LENGTHS]
-    if max(steps) <= STEPS:
+    if max(steps) <= CURVE_INTERVAL_STEPS:
         return None
     # What never arrives is not faster than what does not, either.
-    falls = all(b <= a for a, b in pairwise(steps)) and steps[-1] <= (1 - SOONER) * steps[0]
+    falls = all(b <= a for a, b in pairwise(steps)) and steps[-1] <= (1 - MIN_STEP_SAVING) * steps[0]
     return math.isfinite(max(steps)) and falls
 
 
-def _claim_of_convergence(found: Recomputed) -> Claim | None:
-    trials = [t for t in found.panel.trials if sooner(t.arrived) is not None]
+def _claim_of_convergence(found: ReproductionData) -> Claim | None:
+    trials = [t for t in found.panel.trials if converges_faster(t.convergence_steps) is not None]
     if not found.panel.trials:
         return None
     at_once = len(found.panel.trials) - len(trials)
-    ruling = ruled(_of_trials(trials, [bool(sooner(t.arrived)) for t in trials]))
+    ruling = combine_cases(_of_trials(trials, [bool(converges_faster(t.convergence_steps)) for t in trials]))
     ends = [
-        f"K0 = {prior_in_words(k)}: {listed({o: t.arrived.values() for o, t in _of_main(found, k).items()})}"
-        for k in PRIORS
+        f"K0 = {prior_in_words(k)}: "
+        f"{numbers_by_angle({o: t.convergence_steps.values() for o, t in _of_main(found, k).items()})}"
+        for k in PRIOR_COVARIANCES
     ]
     return Claim(
         "A larger p converges faster: Figures 4(b), 5(b), 7(b), 8(b).",
         ruling,
-        _held(ruling),
+        _case_counts(ruling),
         "steps until the error stays within 2 % of the end of p = 1, all p at the same orders, on the first record, "
-        f"for p = 1, 3, 5, 7: {'; '.join(ends)}. Records where all p arrive by step {STEPS}, the first that is looked "
+        f"for p = 1, 3, 5, 7: {'; '.join(ends)}. Records where all p arrive by step {CURVE_INTERVAL_STEPS}, the "
+        "first that is looked "
         f"at, are no cases: {at_once} of {len(found.panel.trials)}. A case holds where all arrive, no larger p "
-        f"later, and p = 7 by {100 * SOONER:g} % sooner than p = 1.",
+        f"later, and p = 7 by {100 * MIN_STEP_SAVING:g} % sooner than p = 1.",
     )
 
 
-def _claim_of_the_manual(found: Recomputed) -> Claim:
+def _claim_of_the_manual(found: ReproductionData) -> Claim:
     trials = found.panel.trials
-    ruling = ruled(_of_trials(trials, [t.nr < t.manual for t in trials]), of_the_machine=found.simulated)
+    ruling = combine_cases(_of_trials(trials, [t.nr < t.manual for t in trials]), of_the_machine=found.simulated)
     pairs = [
-        f"K0 = {prior_in_words(k)}: {listed({o: (t.manual, t.nr) for o, t in _of_main(found, k).items()}, 3)}"
-        for k in PRIORS
+        f"K0 = {prior_in_words(k)}: {numbers_by_angle({o: (t.manual, t.nr) for o, t in _of_main(found, k).items()}, 3)}"
+        for k in PRIOR_COVARIANCES
     ]
     return Claim(
         "The fractional model (p = 7) is closer to the run than the manual's integer-order model: Figures 6 and 9.",
         ruling,
-        _held(ruling),
+        _case_counts(ruling),
         f"NR of the manual's model by explicit Euler and of p = 7 on the first record: {'; '.join(pairs)}. The "
         "manual's parameters were identified from none of these runs.",
     )
 
 
-def _claim_of_orders(found: Recomputed) -> Claim:
-    freed = found.panel.freed
+def _claim_of_orders(found: ReproductionData) -> Claim:
+    freed = found.panel.order_comparisons
     cases = [
-        case(f.free[o] < (1 - ALIKE) * f.whole[o] and bool(f.away), the_arm=f.arm, the_angle=symbol(o))
+        case(
+            f.free[o] < (1 - MIN_RELATIVE_DIFFERENCE) * f.whole[o] and bool(f.fractional_orders),
+            the_arm=f.arm,
+            the_angle=symbol(o),
+        )
         for f in freed
         for o in f.free
     ]
-    ruling = ruled(cases, of_the_machine=found.simulated)
-    each = [f"{f.arm}: {listed({o: (f.whole[o], f.free[o]) for o in f.free}, 3)}" for f in freed]
-    rubbing = [f"{symbol(n)} = {f.orders[n][0]:.3g}" for f in freed if f.arm == FEIGNED for n in f.away]
+    ruling = combine_cases(cases, of_the_machine=found.simulated)
+    each = [f"{f.arm}: {numbers_by_angle({o: (f.whole[o], f.free[o]) for o in f.free}, 3)}" for f in freed]
+    rubbing = [
+        f"{symbol(n)} = {f.orders[n][0]:.3g}"
+        for f in freed
+        if f.arm == UNMODELED_FRICTION_ARM
+        for n in f.fractional_orders
+    ]
     feigned = f"Of the arm of whole orders that rubs the fit gives {', '.join(rubbing)}. " if rubbing else ""
-    away = [f"{f.arm}, stage {f.stage}: {', '.join(map(symbol, f.away)) or 'none'}" for f in freed]
+    away = [f"{f.arm}, stage {f.stage}: {', '.join(map(symbol, f.fractional_orders)) or 'none'}" for f in freed]
     return Claim(
         "Fractional orders describe the arm better than whole ones.",
         ruling,
-        _held(ruling),
+        _case_counts(ruling),
         "(14)–(15) with whole and with free orders, both by output error from the current alone; NR of both: "
         f"{'; '.join(each)}. Orders whose 95 % interval excludes the whole one: {'; '.join(away)}. {feigned}"
         "Measured runs decide: ftlm orders.",
     )
 
 
-def _claim_of_near_orders(found: Recomputed) -> Claim:
+def _claim_of_near_orders(found: ReproductionData) -> Claim:
     near = {o: (s.near.estimation.equation_error[o].nr, s.near.estimation.output_error[o].nr) for s, o in found.angles}
-    ruling = ruled(
-        _of_angles({o: out < FLATTERY * eq and out < EXPLAINS for o, (eq, out) in near.items()}),
+    ruling = combine_cases(
+        _of_angles({o: out < MAX_ERROR_RATIO * eq and out < MAX_EXPLAINING_NR for o, (eq, out) in near.items()}),
         of_the_machine=found.simulated,
     )
     return Claim(
@@ -583,7 +612,7 @@ def _claim_of_near_orders(found: Recomputed) -> Claim:
         "NR of the equation and of the free run: "
         + "; ".join(f"{symbol(o)} {numbers_listed(v, 2)}" for o, v in near.items()),
         "with these orders and the best coefficients for them, NR of the equation error and of the free run: "
-        f"{listed(near, 3)}.",
+        f"{numbers_by_angle(near, 3)}.",
     )
 
 
@@ -591,9 +620,9 @@ def table_3_coefficients() -> dict[str, tuple[float, float, float]]:
     """Coefficients of (22)-(25) from Table 3, from the effective parameters, and as printed in the integer rows."""
     found = {}
     for stage in (1, 2):
-        table, effective = (PARAMETERS[n][stage].coefficients(stage) for n in ("table-3", "effective"))
+        table, effective = (PARAMETER_SETS[n][stage].coefficients(stage) for n in ("table-3", "effective"))
         for k in (1, 2):
-            row = printed.INTEGER[f"theta{stage}{k}"]
+            row = printed.INTEGER_ROWS[f"theta{stage}{k}"]
             for letter, value in row.coefficients.items():
                 name = f"{letter}{2 * stage - 2 + k}"
                 found[name] = (table[name], effective[name], value)
@@ -604,12 +633,12 @@ def _claim_of_table_3() -> Claim:
     rows = table_3_coefficients()
     ratios = {n: t / p for n, (t, _, p) in rows.items()}
     effective = max(abs(e / p - 1) for _, e, p in rows.values())
-    off = [n for n, r in ratios.items() if abs(r - 1) > ALIKE]
+    off = [n for n, r in ratios.items() if abs(r - 1) > MIN_RELATIVE_DIFFERENCE]
     worst = max(off, key=lambda n: abs(math.log(abs(ratios[n]))), default=None)
     words = "" if worst is None else f"; {worst} is {ratios[worst]:.3g} times the printed value"
     return Claim(
         "Table 3 gives the integer-order models of Tables 4 and 5.",
-        ruled([case(not off)]),
+        combine_cases([case(not off)]),
         f"{len(off)} of {len(rows)} coefficients are not those printed{words}",
         f"{len(off)} of {len(rows)} coefficients from Table 3 are not those printed{words}. The maker's effective "
         f"parameters (torque with gear and efficiency) give every one of them to {100 * effective:.1g} %.",
@@ -620,10 +649,14 @@ def _claim_of_one_record() -> Claim:
     spreads = implied_spreads()
     return Claim(
         "Table 7 compares both algorithms on one record.",
-        ruled(_of_angles({o: abs(genetic / lattice - 1) <= MIXED for o, (genetic, lattice) in spreads.items()})),
-        f"standard deviations that its two columns imply [rad]: {listed(spreads, 2)}",
+        combine_cases(
+            _of_angles(
+                {o: abs(genetic / lattice - 1) <= MAX_DEVIATION_MISMATCH for o, (genetic, lattice) in spreads.items()}
+            )
+        ),
+        f"standard deviations that its two columns imply [rad]: {numbers_by_angle(spreads, 2)}",
         "standard deviation of the angle that RMSE / NR implies, genetic algorithm and multi-innovation: "
-        f"{listed(spreads, 3)} rad. One record has one standard deviation.",
+        f"{numbers_by_angle(spreads, 3)} rad. One record has one standard deviation.",
     )
 
 
@@ -638,7 +671,7 @@ def _ends(seeds: Iterable[float]) -> tuple[float, float, float]:
     return each[0], statistics.median(each), each[-1]
 
 
-def _claim_of_rivals(found: Recomputed) -> Claim | None:
+def _claim_of_rivals(found: ReproductionData) -> Claim | None:
     contests = found.panel.contests
     if not contests:
         return None
@@ -654,9 +687,9 @@ def _claim_of_rivals(found: Recomputed) -> Claim | None:
         for k, error in c.lattice.items()
         for name, errors in (("genetic", c.genetic), ("differential evolution", c.evolution))
     ]
-    ruling = ruled(cases)
+    ruling = combine_cases(cases)
     first = {c.output: c for c in reversed(contests)}
-    own = {o: first[o] for o in printed.OUTPUTS if o in first}
+    own = {o: first[o] for o in printed.ANGLE_NAMES if o in first}
     errors = {
         o: (*c.lattice.values(), *_ends(c.genetic.values()), *_ends(c.evolution.values())) for o, c in own.items()
     }
@@ -666,16 +699,17 @@ def _claim_of_rivals(found: Recomputed) -> Claim | None:
     return Claim(
         "Multi-innovation has a smaller error than the genetic algorithm: Figure 11, Table 7.",
         ruling,
-        _held(ruling),
+        _case_counts(ruling),
         f"the same record, criterion (45) of the free run, {budgets}, {seeds} seeds, bounds that know nothing of the "
         "maker's values; first record, error of p = 7 with K0 = 1 and 10¹⁰, best, median and worst seed of the "
-        f"genetic algorithm, of differential evolution: {listed(errors, 3)}. A case holds where p = 7 is better than "
+        f"genetic algorithm, of differential evolution: {numbers_by_angle(errors, 3)}. A case holds where p = 7 is "
+        "better than "
         "the median seed of the rival.",
     )
 
 
-def _claim_of_the_derivative(found: Recomputed) -> Claim:
-    hub_and_link = {n: printed.last_orders(f"theta{n}1") | printed.last_orders(f"theta{n}2") for n in STAGES}
+def _claim_of_the_derivative(found: ReproductionData) -> Claim:
+    hub_and_link = {n: printed.last_orders(f"theta{n}1") | printed.last_orders(f"theta{n}2") for n in STAGE_NUMBERS}
     dropped = [order_law(n, "derived")["input"].at(orders) for n, orders in hub_and_link.items()]
     parts = [stage.derived for stage in found.stages.values()]
     orders = ", ".join(f"{part.order:.3g}" for part in parts)
@@ -683,16 +717,16 @@ def _claim_of_the_derivative(found: Recomputed) -> Claim:
     bent = {p.output: p.correlations.values() for p in parts}
     return Claim(
         "Eliminating the other angle leaves the current as it is: (19), (21).",
-        ruled([case(abs(v) < 1e-9, the_stage=str(n)) for n, v in zip(hub_and_link, dropped, strict=True)]),
+        combine_cases([case(abs(v) < 1e-9, the_stage=str(n)) for n, v in zip(hub_and_link, dropped, strict=True)]),
         f"order of the current's derivative that it brings in: {numbers_listed(dropped, 2)}",
         f"the elimination differentiates the current by the order {numbers_listed(dropped, 2)} at the printed orders "
         f"and {orders} at those identified here, where that changes the deflection's free run by NR {changed}. "
         "Correlation of the deflection with the current as measured, by (14)–(15) and with the same numbers by "
-        f"(22)–(25): {listed(bent, 2)}.",
+        f"(22)–(25): {numbers_by_angle(bent, 2)}.",
     )
 
 
-def _claim_of_the_form(found: Recomputed) -> Claim | None:
+def _claim_of_the_form(found: ReproductionData) -> Claim | None:
     """Claim about the orders that the published form finds for an arm with links that move with their hubs."""
     away: list[str] = []
     fits: dict[str, list[float]] = {}
@@ -706,34 +740,36 @@ def _claim_of_the_form(found: Recomputed) -> Claim | None:
                 # The one order that the published form alone leaves free is fixed in the other.
                 known, error = truth.get(name, 2.0), published.result.standard_errors[name]
                 count += 1
-                by_chance = math.isfinite(error) and abs(value - known) <= BY_CHANCE * error
+                by_chance = math.isfinite(error) and abs(value - known) <= MAX_STANDARD_ERRORS * error
                 if not by_chance:
                     away.append(f"{symbol(name)} {value:.4g} ± {error:.2g} ({known:g})")
     if not count:
         return None
-    words = f"All {count} orders of (22)–(25) are within {BY_CHANCE:g} standard errors of the truth."
+    words = f"All {count} orders of (22)–(25) are within {MAX_STANDARD_ERRORS:g} standard errors of the truth."
     if away:
         words = (
-            f"{len(away)} of {count} orders of (22)–(25) are more than {BY_CHANCE:g} standard errors from the truth "
+            f"{len(away)} of {count} orders of (22)–(25) are more than {MAX_STANDARD_ERRORS:g} standard errors from "
+            "the truth "
             f"(in brackets) or have none that is finite: {', '.join(away)}."
         )
     return Claim(
         "Equations (22)–(25) find the orders of an arm that (14)–(15) describe.",
-        ruled([case(not away)]),
-        f"{len(away)} of {count} orders are more than {BY_CHANCE:g} standard errors from the truth",
+        combine_cases([case(not away)]),
+        f"{len(away)} of {count} orders are more than {MAX_STANDARD_ERRORS:g} standard errors from the truth",
         "the simulated arm integrates (14)–(15). Both forms fitted by output error to the currents alone, fit in "
-        f"percent of (14)–(15) and of (22)–(25): {listed(fits)}. {words}",
+        f"percent of (14)–(15) and of (22)–(25): {numbers_by_angle(fits)}. {words}",
     )
 
 
 def _claim_of_the_impossible_row() -> Claim:
-    row = printed.INTEGER["theta22"]
+    row = printed.INTEGER_ROWS["theta22"]
     error, rmse = float(row.error or 0.0), float(row.rmse or 0.0)
-    mean = error / printed.POINTS
+    mean = error / printed.PULSE_COUNT
     return Claim(
         "The integer row of θ₂₂ in Table 5 is possible.",
-        ruled([case(mean <= rmse, the_angle="θ₂₂")]),
+        combine_cases([case(mean <= rmse, the_angle="θ₂₂")]),
         f"mean absolute error {mean:.3g} rad, RMSE {rmse:g} rad",
-        f"its error {error:g} over {printed.POINTS} points is a mean of {mean:.4g} rad, its RMSE {rmse:g} rad; a mean "
+        f"its error {error:g} over {printed.PULSE_COUNT} points is a mean of {mean:.4g} rad, its RMSE {rmse:g} rad; "
+        "a mean "
         "absolute value never exceeds the root mean square.",
     )

@@ -14,17 +14,17 @@ from ftlm.errors import DataError, FtlmError, ModelError
 from ftlm.estimation.identify import identify
 from ftlm.estimation.result import Identification
 from ftlm.progress import Progress
-from ftlm.reproduction.simulated_arm import STAGES, StageNumber, thinned
+from ftlm.reproduction.simulated_arm import STAGE_NUMBERS, StageNumber, decimate_run
 from ftlm.structure.structure import Structure
 from ftlm.utils.formatting import symbol
-from ftlm.utils.resources import between, by_output_error, expected
-from ftlm.utils.validation import check_threads, listed
+from ftlm.utils.resources import duration_bounds, estimate_duration, output_error_cost
+from ftlm.utils.validation import check_threads, join_names
 from ftlm.validation.comparison import Comparison, finite
 
 #: Free orders of each structure; the other orders are integer.
-WHOLE = "whole orders"
-KINDS: dict[str, tuple[str, ...]] = {
-    WHOLE: (),
+INTEGER_KIND = "whole orders"
+FREE_ORDERS_BY_KIND: dict[str, tuple[str, ...]] = {
+    INTEGER_KIND: (),
     "fractional elasticity": ("beta",),
     "fractional damping": ("mu",),
     "both fractional": ("beta", "mu"),
@@ -33,13 +33,13 @@ WHOLE_ORDERS = {"beta": 0.0, "mu": 1.0}
 #: Most samples of a run in a fit; the arm's modes are a decade below the reduced rate of a 20 s run.
 MOST_ROWS = 1250
 #: Label of the structures of ``Deflection.before``.
-WITHOUT = "without the rate of the other deflection"
+WITHOUT_RATE_LABEL = "without the rate of the other deflection"
 #: Smallest significant difference in fit on a validation run [percentage points].
-MARGIN = 0.5
+MIN_FIT_GAIN = 0.5
 
 
 @dataclass(frozen=True)
-class Fitted:
+class RunFit:
     """Structure fitted to one run, with its simulations on all runs.
 
     Parameters
@@ -51,11 +51,11 @@ class Fitted:
     """
 
     result: Identification
-    compared: dict[str, Comparison]
+    comparisons: dict[str, Comparison]
 
     def fit(self, run: str) -> float:
         """Fit of the simulation in percent; minus infinity on overflow."""
-        value = next(iter(self.compared[run].fit_percent.values()))
+        value = next(iter(self.comparisons[run].fit_percent.values()))
         return value if math.isfinite(value) else -math.inf
 
     @property
@@ -65,7 +65,7 @@ class Fitted:
         Two terms of the deflection differ only in their orders. The lower order belongs to the elasticity, regardless
         of its name in the fit.
         """
-        joint = self.result.joint
+        joint = self.result.fit
         values = {**self.result.orders, **({} if joint is None else joint.coefficients)}
         letters = {n.rstrip("0123456789"): n for n in values}
         names = {n: n for n in values}
@@ -119,16 +119,16 @@ class Deflection:
 
     output: str
     structure: Structure
-    fits: dict[str, dict[str, Fitted]]
+    fits: dict[str, dict[str, RunFit]]
     failed: dict[tuple[str, str], str] = field(default_factory=dict)
     before: Deflection | None = None
 
     def gains(self, kind: str) -> dict[tuple[str, str], float]:
         """Gain in fit over integer orders by (estimation run, validation run) [percentage points]."""
         found = {}
-        for run, whole in self.fits[WHOLE].items():
+        for run, whole in self.fits[INTEGER_KIND].items():
             other = self.fits[kind].get(run)
-            for judged in whole.compared:
+            for judged in whole.comparisons:
                 if judged != run:
                     alone, free = whole.fit(judged), -math.inf if other is None else other.fit(judged)
                     found[run, judged] = 0.0 if alone == free else free - alone
@@ -136,35 +136,35 @@ class Deflection:
 
     def worse(self, kind: str) -> list[str]:
         """Runs on which a fit is worse than that of integer orders, which its structure contains."""
-        both = ((run, each, self.fits[WHOLE][run]) for run, each in self.fits[kind].items())
-        return [run for run, free, whole in both if not free.fit(run) > whole.fit(run) - MARGIN]
+        both = ((run, each, self.fits[INTEGER_KIND][run]) for run, each in self.fits[kind].items())
+        return [run for run, free, whole in both if not free.fit(run) > whole.fit(run) - MIN_FIT_GAIN]
 
     def intervals(self, kind: str) -> dict[str, dict[str, tuple[float, float]]]:
         """Return 95 % intervals of the free orders, by order, then by estimation run."""
         return {
             name: {run: each.estimates[name][1:] for run, each in self.fits[kind].items()}
             for name in self.structure.order_names
-            if name.rstrip("0123456789") in KINDS[kind]
+            if name.rstrip("0123456789") in FREE_ORDERS_BY_KIND[kind]
         }
 
     @property
     def verdicts(self) -> list[Verdict]:
         """Verdicts of all kinds with a fractional order."""
-        return [self.verdict(kind) for kind in KINDS if kind != WHOLE]
+        return [self.verdict(kind) for kind in FREE_ORDERS_BY_KIND if kind != INTEGER_KIND]
 
     def verdict(self, kind: str) -> Verdict:
         """Verdict of one kind, from its gains and intervals."""
         told = self.intervals(kind)
         whole = {name: WHOLE_ORDERS[name.rstrip("0123456789")] for name in told}
         worse = self.worse(kind)
-        complete = not worse and not any(k in (kind, WHOLE) for k, _ in self.failed)
-        earns = judged(list(self.gains(kind).values()), told, whole) if complete else None
+        complete = not worse and not any(k in (kind, INTEGER_KIND) for k, _ in self.failed)
+        earns = improves_prediction(list(self.gains(kind).values()), told, whole) if complete else None
         before, after = (
             {
                 pair: "no fit" if pair[0] not in self.fits[k] else percent(self.fits[k][pair[0]].fit(pair[1]))
                 for pair in self.gains(kind)
             }
-            for k in (WHOLE, kind)
+            for k in (INTEGER_KIND, kind)
         )
         fits = "; ".join(f"{run} → {other} {before[run, other]}, then {after[run, other]}" for run, other in before)
         orders = "; ".join(
@@ -172,20 +172,20 @@ class Deflection:
             for name, each in told.items()
         )
         words = f"Fit of unseen runs, percent: {fits}. 95 % intervals: {orders}."
-        if not all(overlapping(each.values()) for each in told.values()):
+        if not all(have_common_value(each.values()) for each in told.values()):
             words += " The runs contradict each other."
         if worse:
             words += f" On {', '.join(worse)} it fits worse than the whole orders that it contains: no optimum found."
         return Verdict(kind, earns, words)
 
 
-def overlapping(intervals: Any) -> bool:
+def have_common_value(intervals: Any) -> bool:
     """Whether all intervals have a value in common."""
     each = list(intervals)
     return not each or max(low for low, _ in each) <= min(high for _, high in each)
 
 
-def judged(
+def improves_prediction(
     gains: Sequence[float], intervals: Mapping[str, Mapping[str, tuple[float, float]]], whole: Mapping[str, float]
 ) -> bool | None:
     """Whether fractional orders improve the prediction, from their gains on validation runs and their intervals.
@@ -196,10 +196,15 @@ def judged(
     """
     runs = list(next(iter(intervals.values()), {}))
     told = [any(not e[r][0] <= whole[n] <= e[r][1] for n, e in intervals.items()) for r in runs]
-    counts = median(gains) >= MARGIN
-    if all(told) and counts and min(gains) > -MARGIN and all(overlapping(e.values()) for e in intervals.values()):
+    counts = median(gains) >= MIN_FIT_GAIN
+    if (
+        all(told)
+        and counts
+        and min(gains) > -MIN_FIT_GAIN
+        and all(have_common_value(e.values()) for e in intervals.values())
+    ):
         return True
-    if max(gains) < MARGIN or (not any(told) and not counts):
+    if max(gains) < MIN_FIT_GAIN or (not any(told) and not counts):
         return False
     return None
 
@@ -243,16 +248,16 @@ class UnseenOrders:
         return {
             "runs": [run.name for run in self.runs],
             "filtered": self.filtered,
-            "margin": MARGIN,
+            "margin": MIN_FIT_GAIN,
             "deflections": {
-                output: _told(d) | ({} if d.before is None else {"without_rate": _told(d.before)})
+                output: _deflection_dict(d) | ({} if d.before is None else {"without_rate": _deflection_dict(d.before)})
                 for output, d in self.deflections.items()
             },
             "notes": list(self.notes),
         }
 
 
-def _told(deflection: Deflection) -> dict[str, Any]:
+def _deflection_dict(deflection: Deflection) -> dict[str, Any]:
     """Return fits and verdicts of one structure for JSON."""
     return {
         "equation": str(deflection.structure),
@@ -261,7 +266,7 @@ def _told(deflection: Deflection) -> dict[str, Any]:
             kind: {
                 run: {
                     "numbers": f.numbers,
-                    "fit": {other: finite(f.fit(other)) for other in f.compared},
+                    "fit": {other: finite(f.fit(other)) for other in f.comparisons},
                     "estimates": {n: float(v) for n, (v, *_) in f.estimates.items()},
                     "intervals": {n: list(map(finite, ends)) for n, (_, *ends) in f.estimates.items()},
                     "warnings": list(f.result.warnings),
@@ -338,7 +343,7 @@ def orders_on_unseen_runs(
     if len(runs) < 2:
         raise DataError(f"{len(runs)} run cannot be both fitted and unseen; give two or more")
     if len({run.name for run in runs}) < len(runs):
-        raise DataError(f"runs {listed(r.name for r in runs)} do not all have names of their own; rename a file")
+        raise DataError(f"runs {join_names(r.name for r in runs)} do not all have names of their own; rename a file")
     stages = stages_in(runs)
     notes: list[str] = []
     used = []
@@ -346,23 +351,23 @@ def orders_on_unseen_runs(
         every = -(-run.length // MOST_ROWS)
         if every > 1:
             notes.append(f"of run {run.name} one of {every} rows is used, {every * run.step:.4g} s apart")
-        used.append(thinned(run, every) if every > 1 else run)
+        used.append(decimate_run(run, every) if every > 1 else run)
     deflections = {}
     both = len(stages) == 2
     if isinstance(progress, Progress):
         structures = [link_structure(stage, both=both, filtered=filtered) for stage in stages]
         each = sum(
-            by_output_error(run.length, len(s.order_names) + len(s.coefficient_names))
+            output_error_cost(run.length, len(s.order_names) + len(s.coefficient_names))
             for s in structures
             for run in used
         )
-        fits = len(KINDS) * (2 if both else 1) * each
-        progress.expect("all of it", *between(expected(fits, check_threads(threads))))
+        fits = len(FREE_ORDERS_BY_KIND) * (2 if both else 1) * each
+        progress.expect("all of it", *duration_bounds(estimate_duration(fits, check_threads(threads))))
     for stage in stages:
         found = _deflection(link_structure(stage, both=both, filtered=filtered), "", used, threads, say, progress)
         if both:
             less = link_structure(stage, both=True, filtered=filtered, rate=False)
-            found = replace(found, before=_deflection(less, f", {WITHOUT}", used, threads, say, progress))
+            found = replace(found, before=_deflection(less, f", {WITHOUT_RATE_LABEL}", used, threads, say, progress))
         deflections[found.output] = found
     return UnseenOrders(tuple(used), deflections, filtered, tuple(notes))
 
@@ -375,7 +380,7 @@ def stages_in(runs: Sequence[Run]) -> list[StageNumber]:
     DataError
         There is none.
     """
-    found = [n for n in STAGES if all(f"theta{n}{k}" in run.signals for run in runs for k in (1, 2))]
+    found = [n for n in STAGE_NUMBERS if all(f"theta{n}{k}" in run.signals for run in runs for k in (1, 2))]
     if not found:
         have = "; ".join(f"{run.name}: {', '.join(run.signals)}" for run in runs)
         raise DataError(
@@ -396,18 +401,18 @@ def _deflection(
     """Fit every kind of structure to every run."""
     output = structure.outputs[0]
     runs = [run.select(list(structure.signals)) for run in runs]
-    fits: dict[str, dict[str, Fitted]] = {kind: {} for kind in KINDS}
+    fits: dict[str, dict[str, RunFit]] = {kind: {} for kind in FREE_ORDERS_BY_KIND}
     failed = {}
-    for kind, free in KINDS.items():
+    for kind, free in FREE_ORDERS_BY_KIND.items():
         letters = {n: n.rstrip("0123456789") for n in structure.order_names}
         held = {n: WHOLE_ORDERS[letter] for n, letter in letters.items() if letter not in free}
         for run in runs:
             say(f"{output}{told}: {kind}, fitted to {run.name}")
             try:
                 result = identify(run, structure.with_orders(held), threads=threads, progress=progress)
-                fits[kind][run.name] = Fitted(result, {other.name: result.model.compare(other) for other in runs})
+                fits[kind][run.name] = RunFit(result, {other.name: result.model.compare(other) for other in runs})
             except FtlmError as error:
-                if kind == WHOLE:
+                if kind == INTEGER_KIND:
                     raise ModelError(f"{output}, whole orders, fitted to {run.name}: {error}") from error
                 failed[kind, run.name] = str(error)
     return Deflection(output, structure, fits, failed)

@@ -9,31 +9,31 @@ from pathlib import Path
 from typing import Any
 
 from ftlm.data.run import Run
-from ftlm.estimation.linear import Trace
+from ftlm.estimation.linear import MultiInnovationTrace
 from ftlm.estimation.result import Identification
 from ftlm.estimation.verdict import Validation
-from ftlm.progress import Course
-from ftlm.reproduction.published_values import INNOVATION_LENGTHS, OUTPUTS
-from ftlm.reproduction.simulated_arm import STAGES, demo_run, truth_of
+from ftlm.progress import ShareTracker
+from ftlm.reproduction.published_values import ANGLE_NAMES, INNOVATION_LENGTHS
+from ftlm.reproduction.simulated_arm import STAGE_NUMBERS, demo_run, truth_of
 from ftlm.reproduction.stage_models import Preset, StageWork
-from ftlm.reproduction.stage_result import Candidate, Derived
+from ftlm.reproduction.stage_result import Candidate, DroppedDerivative
 from ftlm.reproduction.tables import letters_of
-from ftlm.structure.order_grid import Lattice
+from ftlm.structure.order_grid import OrderGrid
 from ftlm.utils.files import check_folder
 from ftlm.validation.comparison import Metrics, finite
 
 #: Candidates that the result of an order search keeps.
-KEEP = 20
+TOP_CANDIDATES = 20
 #: Steps between two points of a convergence curve; 128 points are more than a page shows.
 TRACE_EVERY = 16
 #: Steps of a stage that are announced: an order search for each p and for least squares, and the joint fit.
 PARTS_OF_A_STAGE = len(INNOVATION_LENGTHS) + 2
 #: Models that are saved, by the suffix of their file name.
-SAVED = {"paper": f"p = {INNOVATION_LENGTHS[-1]}", "output-error": "output error"}
+SAVED_MODELS = {"paper": f"p = {INNOVATION_LENGTHS[-1]}", "output-error": "output error"}
 
 
 @dataclass(frozen=True)
-class StageRow:
+class DemoStage:
     """Row of the demonstration's tables, in the form of the paper's Tables 4 and 5, for one output.
 
     Parameters
@@ -81,21 +81,21 @@ class Demo:
 
     square: Run
     sine: Run
-    rows: dict[int, list[StageRow]]
+    rows: dict[int, list[DemoStage]]
     results: dict[int, dict[str, Identification]]
-    traces: dict[str, dict[int, Trace]]
-    derived: dict[int, Derived]
+    traces: dict[str, dict[int, MultiInnovationTrace]]
+    derived: dict[int, DroppedDerivative]
     files: list[Path]
 
     @cached_property
-    def checked(self) -> dict[int, Validation]:
+    def validations(self) -> dict[int, Validation]:
         """Validation of the output-error models on the sine run, by stage."""
         return {stage: results["output error"].validate(self.sine) for stage, results in self.results.items()}
 
     @property
     def truth(self) -> dict[int, dict[str, float]]:
         """Orders and free coefficients of the simulated arm, by stage."""
-        return {stage: truth_of(stage) for stage in STAGES}
+        return {stage: truth_of(stage) for stage in STAGE_NUMBERS}
 
     def to_dict(self) -> dict[str, Any]:
         """Return rows and estimates for JSON."""
@@ -127,17 +127,17 @@ class Demo:
         }
 
 
-def rows_of(candidate: Candidate) -> list[StageRow]:
+def rows_of(candidate: Candidate) -> list[DemoStage]:
     """Return a table row for every equation of a model that was compared with both runs."""
     own, other = candidate.estimation, candidate.validation
-    rows: list[StageRow] = []
+    rows: list[DemoStage] = []
     if other is None:
         return rows
     for item in candidate.model.equations:
-        output, index = item.output, 1 + OUTPUTS.index(item.output)
+        output, index = item.output, 1 + ANGLE_NAMES.index(item.output)
         orders, coefficients = ({f"{n}{index}": v for n, v in part.items()} for part in letters_of(item))
         errors = own.equation_error[output], own.output_error[output], other.output_error[output]
-        rows.append(StageRow(candidate.label, output, orders, coefficients, *errors))
+        rows.append(DemoStage(candidate.label, output, orders, coefficients, *errors))
     return rows
 
 
@@ -182,7 +182,7 @@ def run_demo(
     DataError
         A file exists and ``force`` is not set, or the folder cannot be written.
     """
-    names = [f"stage{n}-{stem}.json" for n in STAGES for stem in SAVED]
+    names = [f"stage{n}-{stem}.json" for n in STAGE_NUMBERS for stem in SAVED_MODELS]
     check_folder(folder, ["square.csv", "sine.csv", *names, "demo.html"], force=force)
     say("recording both stages on the virtual rig, under a square and a sine current")
     square, sine = (demo_run(shape, noise=noise, seed=seed) for shape in ("square", "sine"))
@@ -190,28 +190,31 @@ def run_demo(
     for run in (square, sine):
         demo.files.append(folder / f"{run.name}.csv")
         run.to_csv(demo.files[-1], force=force)
-    course = Course(progress)
-    parts = len(STAGES) * PARTS_OF_A_STAGE
+    course = ShareTracker(progress)
+    parts = len(STAGE_NUMBERS) * PARTS_OF_A_STAGE
     at = 0
 
-    def named(label: str) -> None:
+    def begin_part(label: str) -> None:
         nonlocal at
-        course.at(at / parts)
+        course.advance_to(at / parts)
         at += 1
-        work.progress = course.until(at / parts)
+        work.progress = course.subtask(at / parts)
         say(label)
 
-    preset = Preset(Lattice(step=step), KEEP, TRACE_EVERY, alike=False)
-    for stage in STAGES:
-        work = StageWork(stage, square, sine, preset, threads, named, None)
-        models = {"integer order": work.stepped("integer order", work.manual("integer order")), **work.searches()}
+    preset = Preset(OrderGrid(increment=step), TOP_CANDIDATES, TRACE_EVERY, common_pulses=False)
+    for stage in STAGE_NUMBERS:
+        work = StageWork(stage, square, sine, preset, threads, begin_part, None)
+        models = {
+            "integer order": work.euler_candidate("integer order", work.manual("integer order")),
+            **work.searches(),
+        }
         words = "all orders and coefficients together by output error, from the current alone"
         models["output error"] = work.joint("output error", work.coupled, words)
         demo.rows[stage] = [row for candidate in models.values() for row in rows_of(candidate)]
         demo.results[stage] = {label: c.result for label, c in models.items() if c.result is not None}
         demo.traces.update(work.traces(models))
-        demo.derived[stage] = work.derived(models["output error"].model)
-        for stem, label in SAVED.items():
+        demo.derived[stage] = work.dropped_derivative(models["output error"].model)
+        for stem, label in SAVED_MODELS.items():
             demo.files.append(folder / f"stage{stage}-{stem}.json")
             models[label].model.save(demo.files[-1], force=force)
     return demo

@@ -9,12 +9,12 @@ from itertools import pairwise
 import numpy as np
 from markupsafe import Markup
 
-from ftlm.estimation.linear import Trace, trace_chart
+from ftlm.estimation.linear import MultiInnovationTrace, trace_chart
 from ftlm.plot.comparison_charts import error_chart, pulse_times
 from ftlm.reproduction import published_values as printed
-from ftlm.reproduction.claims import Recomputed, Ruling
-from ftlm.reproduction.stage_result import PAIR, Candidate, Derived, Stage
-from ftlm.svg.figure import NARROW, Figure, svg
+from ftlm.reproduction.claims import ClaimVerdict, ReproductionData
+from ftlm.reproduction.stage_result import MULTI_INNOVATION_LABELS, Candidate, DroppedDerivative, Stage
+from ftlm.svg.figure import NARROW_WIDTH_PX, Figure, svg
 from ftlm.svg.line_chart import line_chart
 from ftlm.utils.formatting import symbol
 from ftlm.utils.validation import Floats
@@ -27,12 +27,12 @@ LINE_POINTS = 500
 FARTHEST, FARTHEST_ERROR = 4.0, 1000.0
 
 
-def compared_with(*, simulated: bool) -> str:
+def reference_label(*, simulated: bool) -> str:
     """Label of the line that models are compared with."""
     return "simulated arm" if simulated else "measured"
 
 
-def within(values: Floats, measured: Floats) -> Floats:
+def mask_excursions(values: Floats, measured: Floats) -> Floats:
     """Replace values far from the measured ones by NaN; the chart marks the gap."""
     middle = float(np.mean(measured))
     limit = FARTHEST * float(np.max(np.abs(measured - middle)))
@@ -46,10 +46,10 @@ def fit_chart(
     """Chart of an angle and its simulations by some models."""
     first = models[0][1]
     measured = first.measured[output][0]
-    lines = [(compared_with(simulated=simulated), measured)]
+    lines = [(reference_label(simulated=simulated), measured)]
     gone = []
     for label, comparison in models:
-        response = within(comparison.simulated[output][0], measured)
+        response = mask_excursions(comparison.simulated[output][0], measured)
         left = np.flatnonzero(np.isnan(response))
         if left.size:
             gone.append(f"{label} leaves the drawing after {pulse_times(first)[left[0]]:.2g} s")
@@ -66,7 +66,7 @@ def fit_chart(
     )
 
 
-def ran_charts(found: Recomputed) -> list[Figure]:
+def printed_model_charts(found: ReproductionData) -> list[Figure]:
     """Charts of the printed hub models under the paper's current, beside an angle of the implied standard deviation."""
     charts = []
     for output in dict.fromkeys(r.output for r in found.ran if r.output.endswith("1")):
@@ -76,8 +76,9 @@ def ran_charts(found: Recomputed) -> list[Figure]:
         lines += [(f"printed, p = {r.p}", r.response) for r in rows]
         caption = (
             f"The printed equations of Table {3 + int(output[-2])} from the current alone, and the simulated arm, "
-            f"scaled to the deviation that the printed RMSE / NR implies ({last.implied:.2g} rad). p = {last.p} moves "
-            f"{last.too_small:.0f} times less than the angle that it was identified from."
+            f"scaled to the deviation that the printed RMSE / NR implies ({last.implied_deviation:.2g} rad). p = "
+            f"{last.p} moves "
+            f"{last.deviation_ratio:.0f} times less than the angle that it was identified from."
         )
         charts.append(
             line_chart(
@@ -93,9 +94,9 @@ def ran_charts(found: Recomputed) -> list[Figure]:
     return charts
 
 
-def share_picture(ruling: Ruling) -> Markup:
+def share_picture(ruling: ClaimVerdict) -> Markup:
     """Bar of the share of cases in which a claim holds, for every level of the deciding factor."""
-    levels = ruling.levels or (("", ruling.cases, ruling.held),)
+    levels = ruling.levels or (("", ruling.cases, ruling.holding_cases),)
     height = 10 * len(levels) - 2
     words = "; ".join(f"{level + ': ' if level else ''}{held} of {count}" for level, count, held in levels)
     out = [Markup('<svg class="share" viewBox="0 0 88 {}" role="img" aria-label="holds in {}">').format(height, words)]
@@ -106,7 +107,7 @@ def share_picture(ruling: Ruling) -> Markup:
     return Markup("").join([*out, Markup("</svg>")])
 
 
-def convergence_chart(traces: Mapping[int, Trace], title: str, *, log_x: bool = True) -> Figure:
+def convergence_chart(traces: Mapping[int, MultiInnovationTrace], title: str, *, log_x: bool = True) -> Figure:
     """Chart of the error (45) over the steps of the recursion, one line per p."""
     ends = max(float(t.error[-1]) for t in traces.values())
     drawn = {}
@@ -120,10 +121,10 @@ def convergence_chart(traces: Mapping[int, Trace], title: str, *, log_x: bool = 
     return replace(figure, caption=f"{figure.caption} {words}".strip()) if gaps else figure
 
 
-def derivative_chart(derived: Derived, *, simulated: bool = True) -> Figure:
+def derivative_chart(derived: DroppedDerivative, *, simulated: bool = True) -> Figure:
     """Chart of the measured deflection, of (14)-(15), and of the published form with the same parameters."""
     nr, bent = metrics(derived.derived, derived.published).nr, derived.correlations
-    own = compared_with(simulated=simulated)
+    own = reference_label(simulated=simulated)
     lines = [(own, derived.measured), ("(14)–(15)", derived.derived), ("(22)–(25)", derived.published)]
     caption = (
         f"The same numbers in both, order of the current 0 where it should be {derived.order:.3g}. NR between the two: "
@@ -183,10 +184,10 @@ def stage_figures(stage: Stage, *, simulated: bool) -> list[Figure]:
 
 
 def _letter(output: str) -> str:
-    return "abcd"[printed.OUTPUTS.index(output)]
+    return "abcd"[printed.ANGLE_NAMES.index(output)]
 
 
-def sine_figures(found: Recomputed) -> list[Figure]:
+def sine_figures(found: ReproductionData) -> list[Figure]:
     """Figure 10."""
     return [
         figure
@@ -198,10 +199,10 @@ def sine_figures(found: Recomputed) -> list[Figure]:
 
 
 #: Labels of the lines.
-RIVAL_NAMES = {PAIR[0]: "p = 7, K₀ = 1", PAIR[1]: "p = 7, weak prior"}
+RIVAL_NAMES = {MULTI_INNOVATION_LABELS[0]: "p = 7, K₀ = 1", MULTI_INNOVATION_LABELS[1]: "p = 7, weak prior"}
 
 
-def rival_figures(found: Recomputed) -> list[Figure]:
+def rival_figures(found: ReproductionData) -> list[Figure]:
     """Figure 11, on the validation run, or on the estimation run without one."""
     figures = []
     for output, rival in found.rivals.items():
@@ -212,7 +213,7 @@ def rival_figures(found: Recomputed) -> list[Figure]:
 
 
 #: Boxes of Figure 2: (heading, equations), from left to right or from top to bottom.
-BOXES = (
+FLOW_CHART_BOXES = (
     ("Energies", "(7)–(11)"),
     ("Equations", "(14)–(21), (26)"),
     ("Pulse means", "(28)–(39)"),
@@ -226,15 +227,15 @@ BOXES = (
 def flow_chart() -> Figure:
     """Figure 2: from the physics to the model."""
     title = "Figure 2. From the physics to the identified model"
-    names = ", then ".join(f"{a} {b}" for a, b in BOXES)
+    names = ", then ".join(f"{a} {b}" for a, b in FLOW_CHART_BOXES)
     described = f"Flow chart: {names}. From the free run an arrow leads back to the orders: every candidate in turn."
     return Figure(title, _flow(described, narrow=False), _flow(described, narrow=True))
 
 
 def _flow(described: str, *, narrow: bool) -> Markup:
     """Flow chart with boxes and arrows; a loop leads from the simulation back to the orders."""
-    count = len(BOXES)
-    width, step, w, h = (NARROW, 62, 200, 42) if narrow else (980, 140, 122, 54)
+    count = len(FLOW_CHART_BOXES)
+    width, step, w, h = (NARROW_WIDTH_PX, 62, 200, 42) if narrow else (980, 140, 122, 54)
     height = 12 + count * step if narrow else 128
     places = [(30, 6 + k * step) if narrow else (4 + k * step, 40) for k in range(count)]
     box, path = Markup('<rect x="{}" y="{}" width="{}" height="{}" rx="5"/>'), Markup('<path d="{}"/>')
@@ -258,7 +259,7 @@ def _flow(described: str, *, narrow: bool) -> Markup:
     out.append(Markup('<path d="{}" stroke-dasharray="none"/></g>').format(loop))
     out.append(Markup('<g font-size="12" fill="currentColor" text-anchor="middle">'))
     text = Markup('<text x="{}" y="{}" font-weight="600">{}</text><text x="{}" y="{}">{}</text>')
-    for (left, top), (head, below) in zip(places, BOXES, strict=True):
+    for (left, top), (head, below) in zip(places, FLOW_CHART_BOXES, strict=True):
         middle = left + w / 2
         out.append(text.format(middle, top + h / 2 - 4, head, middle, top + h / 2 + 13, below))
     out.append(Markup('<text x="{}" y="{}">{}</text></g>').format(*place, words))

@@ -10,33 +10,33 @@ from typing import Any
 import numpy as np
 
 from ftlm import _core
-from ftlm.arm.flexible_link import flexible_link, link_model, whole_order
+from ftlm.arm.flexible_link import flexible_link, integer_order, link_model
 from ftlm.data.run import Run
 from ftlm.estimation.genetic import Genetic, GeneticRun, differential_evolution_search, genetic_search
 from ftlm.estimation.identify import identify
-from ftlm.estimation.linear import Trace, multi_innovation_trace
+from ftlm.estimation.linear import MultiInnovationTrace, multi_innovation_trace
 from ftlm.estimation.result import Identification
 from ftlm.order_search.result import SearchResult
 from ftlm.order_search.search import search_orders
 from ftlm.reproduction import published_values as printed
 from ftlm.reproduction.published_values import INNOVATION_LENGTHS
-from ftlm.reproduction.simulated_arm import ARMS, StageNumber, demo_run, thinned
-from ftlm.reproduction.stage_result import PAIR, PRIORS, RIVAL_ALPHA, TRACE_EVERY, Stage
+from ftlm.reproduction.simulated_arm import ARM_VARIANTS, StageNumber, decimate_run, demo_run
+from ftlm.reproduction.stage_result import MULTI_INNOVATION_LABELS, PRIOR_COVARIANCES, RIVAL_ALPHA, TRACE_EVERY, Stage
 from ftlm.simulation.discretization import default_m, prepare
 from ftlm.simulation.simulate import explicit_euler
-from ftlm.structure.order_grid import Lattice
+from ftlm.structure.order_grid import OrderGrid
 from ftlm.structure.structure import Structure
 from ftlm.validation.comparison import Comparison, compare_means, finite, metrics
 
 #: Largest and smallest number of seeds, and most evaluations of one optimizer on one angle over all seeds.
-MOST_SEEDS, FEWEST_SEEDS, EVALUATIONS = 10, 3, 40_000
+MAX_SEEDS, MIN_SEEDS, MAX_EVALUATIONS = 10, 3, 40_000
 #: Default smallest increment of the order grid, on every arm: the paper's grid has 60 000 candidates per angle, as many
 #: evaluations per seed, and takes minutes.
 CONTEST_STEP = 0.1
 
 
 @dataclass(frozen=True)
-class LikeForLike:
+class OptimizerComparison:
     """Results on one equation: multi-innovation with p = 7 by K0, genetic algorithm, differential evolution."""
 
     settings: Genetic
@@ -46,26 +46,26 @@ class LikeForLike:
     evolution: GeneticRun
 
 
-def rivals_lattice(step: float, smallest: float = CONTEST_STEP) -> Lattice:
+def rivals_lattice(step: float, smallest: float = CONTEST_STEP) -> OrderGrid:
     """Return the order grid of the comparison, given the increment of the main grid."""
-    return Lattice(step=max(step, smallest), alpha=RIVAL_ALPHA)
+    return OrderGrid(increment=max(step, smallest), alpha=RIVAL_ALPHA)
 
 
 def seeds_for(candidates: int) -> tuple[int, ...]:
     """Return ten seeds, or as many as the budget of evaluations allows."""
-    return tuple(range(min(MOST_SEEDS, max(FEWEST_SEEDS, EVALUATIONS // max(candidates, 1)))))
+    return tuple(range(min(MAX_SEEDS, max(MIN_SEEDS, MAX_EVALUATIONS // max(candidates, 1)))))
 
 
-def like_for_like(
+def compare_optimizers(
     run: Run,
     single: Structure,
-    lattice: Lattice,
+    lattice: OrderGrid,
     asked: Genetic | None = None,
     *,
     seeds: Sequence[int] | None = None,
     threads: int | None = None,
     progress: Callable[[int, int], None] | None = None,
-) -> LikeForLike:
+) -> OptimizerComparison:
     """Compare multi-innovation with a genetic algorithm and differential evolution at equal budgets per seed.
 
     Parameters
@@ -102,9 +102,9 @@ def like_for_like(
             threads=threads,
             progress=progress,
         )
-        for prior in PRIORS
+        for prior in PRIOR_COVARIANCES
     }
-    count = searches[PRIORS[0]].candidates
+    count = searches[PRIOR_COVARIANCES[0]].candidates
     settings = asked or Genetic(seeds=tuple(seeds or seeds_for(count)))
     settings = replace(settings, evaluations=settings.evaluations or max(count, 2 * settings.population))
     records = prepare([run], blind, None, power_of_two=True)
@@ -112,13 +112,13 @@ def like_for_like(
         search(records, blind, lattice, settings, threads=threads, progress=progress)
         for search in (genetic_search, differential_evolution_search)
     ]
-    return LikeForLike(settings, count, searches, *rivals)
+    return OptimizerComparison(settings, count, searches, *rivals)
 
 
 #: An error has converged if it stays below the final error of p = 1 plus this share.
-ARRIVED = 0.02
+CONVERGENCE_MARGIN = 0.02
 #: Joint fits use every fourth sample: 8 ms on the virtual rig, a fifteenth of the fastest link mode's period.
-EVERY = 4
+ROW_STRIDE = 4
 #: Increment of the order grids.
 PANEL_STEP = 0.25
 
@@ -145,7 +145,7 @@ class Trial:
     output: str
     prior: float
     errors: dict[int, float]
-    arrived: dict[int, float]
+    convergence_steps: dict[int, float]
     nr: float
     manual: float
 
@@ -159,7 +159,7 @@ class Trial:
             "nr": finite(self.nr),
             "manual nr": finite(self.manual),
             "errors": {str(p): finite(v) for p, v in self.errors.items()},
-            "steps": {str(p): finite(v) for p, v in self.arrived.items()},
+            "steps": {str(p): finite(v) for p, v in self.convergence_steps.items()},
         }
 
 
@@ -203,7 +203,7 @@ class Contest:
 
 
 @dataclass(frozen=True)
-class Freed:
+class OrderComparison:
     """Integer and free orders of (14)-(15) on one record, both by joint output error from the currents alone.
 
     Parameters
@@ -223,9 +223,9 @@ class Freed:
     orders: dict[str, tuple[float, float, float]]
 
     @property
-    def away(self) -> list[str]:
+    def fractional_orders(self) -> list[str]:
         """Orders whose interval excludes the integer one."""
-        return [n for n, (_, low, high) in self.orders.items() if not low <= whole_order(n) <= high]
+        return [n for n, (_, low, high) in self.orders.items() if not low <= integer_order(n) <= high]
 
     def to_dict(self) -> dict[str, Any]:
         """Return the comparison for JSON."""
@@ -235,7 +235,7 @@ class Freed:
             "whole nr": {n: finite(v) for n, v in self.whole.items()},
             "free nr": {n: finite(v) for n, v in self.free.items()},
             "orders": {n: list(map(finite, v)) for n, v in self.orders.items()},
-            "not whole": self.away,
+            "not whole": self.fractional_orders,
         }
 
 
@@ -245,26 +245,28 @@ class Panel:
 
     trials: tuple[Trial, ...] = ()
     contests: tuple[Contest, ...] = ()
-    freed: tuple[Freed, ...] = ()
+    order_comparisons: tuple[OrderComparison, ...] = ()
 
-    def beside(self, other: Panel) -> Panel:
+    def merge_with(self, other: Panel) -> Panel:
         """Return the union of two panels."""
-        return Panel(self.trials + other.trials, self.contests + other.contests, self.freed + other.freed)
+        return Panel(
+            self.trials + other.trials, self.contests + other.contests, self.order_comparisons + other.order_comparisons
+        )
 
     def to_dict(self) -> dict[str, Any]:
         """Return all cases for JSON."""
         parts: tuple[tuple[str, Iterable[Any]], ...] = (
             ("trials", self.trials),
             ("contests", self.contests),
-            ("whole and free orders", self.freed),
+            ("whole and free orders", self.order_comparisons),
         )
         return {name: [item.to_dict() for item in items] for name, items in parts}
 
 
-def arrived_at(trace: Trace, end: float) -> float:
+def convergence_step(trace: MultiInnovationTrace, end: float) -> float:
     """First step from which an error stays within a share of a final error; infinite if never."""
     with np.errstate(invalid="ignore"):
-        away = np.flatnonzero(~(trace.error <= (1.0 + ARRIVED) * end))
+        away = np.flatnonzero(~(trace.error <= (1.0 + CONVERGENCE_MARGIN) * end))
     if not away.size:
         return float(trace.step[0])
     return float(trace.step[away[-1] + 1]) if away[-1] + 1 < trace.step.size else math.inf
@@ -289,12 +291,12 @@ def trials_of(stage: StageNumber, square: Run, arm: str, seed: int, threads: int
     manual, found = manual_nr(stage, run), []
     for output in structure.outputs:
         single = structure.equation(output)
-        for prior in PRIORS:
+        for prior in PRIOR_COVARIANCES:
             best = {
                 p: search_orders(
                     run,
                     single,
-                    Lattice(step=PANEL_STEP),
+                    OrderGrid(increment=PANEL_STEP),
                     coefficients="multi-innovation",
                     innovation_length=p,
                     prior_covariance=prior,
@@ -318,7 +320,7 @@ def trials_of(stage: StageNumber, square: Run, arm: str, seed: int, threads: int
                     output,
                     prior,
                     {p: s.score for p, s in best.items()},
-                    {p: arrived_at(t, end) for p, t in traces.items()},
+                    {p: convergence_step(t, end) for p, t in traces.items()},
                     nr,
                     manual[output],
                 )
@@ -326,19 +328,19 @@ def trials_of(stage: StageNumber, square: Run, arm: str, seed: int, threads: int
     return found
 
 
-def contest(made: LikeForLike, output: str, arm: str, step: float) -> Contest:
+def contest(made: OptimizerComparison, output: str, arm: str, step: float) -> Contest:
     """Return the errors of all three optimizers."""
     lattice = {k: search.score for k, search in made.lattice.items()}
     return Contest(arm, output, made.candidates, step, lattice, made.genetic.errors, made.evolution.errors)
 
 
-def freed_of(
+def compare_orders(
     stage: StageNumber,
     square: Run,
     arm: str,
     threads: int | None,
     progress: Callable[[int, int], None] | None = None,
-) -> Freed:
+) -> OrderComparison:
     """Fit integer and free orders of one stage of a simulated arm, which starts at rest, on a decimated run.
 
     Raises
@@ -348,19 +350,21 @@ def freed_of(
     """
     structure = replace(flexible_link(stage=stage, coupling="simulated"), initial="rest")
     own = square.select(list(structure.signals))
-    run = thinned(own, EVERY)
-    whole = structure.with_orders({n: whole_order(n) for n in structure.order_names})
+    run = decimate_run(own, ROW_STRIDE)
+    whole = structure.with_orders({n: integer_order(n) for n in structure.order_names})
     # Whole orders on an arm that has none let coefficients go where their squares are no numbers.
     with np.errstate(over="ignore", invalid="ignore", divide="ignore"):
         fits = [identify(run, item, threads=threads, progress=progress) for item in (whole, structure)]
     m = default_m([own], power_of_two=True)
     coarse, fine = (compare_means(replace(fit.model, m=m), own) for fit in fits)
-    return _freed(arm, stage, coarse, fine, fits[1])
+    return _order_comparison(arm, stage, coarse, fine, fits[1])
 
 
-def _freed(arm: str, stage: int, whole: Comparison, free: Comparison, fit: Identification) -> Freed:
+def _order_comparison(
+    arm: str, stage: int, whole: Comparison, free: Comparison, fit: Identification
+) -> OrderComparison:
     nr, free_nr = ({o: f.nr for o, f in c.output_error.items()} for c in (whole, free))
-    return Freed(arm, stage, nr, free_nr, {n: (v, *fit.intervals[n]) for n, v in fit.orders.items()})
+    return OrderComparison(arm, stage, nr, free_nr, {n: (v, *fit.intervals[n]) for n, v in fit.orders.items()})
 
 
 def panel_of(stages: Sequence[Stage], square: Run, arm: str, seed: int, threads: int | None) -> Panel:
@@ -372,7 +376,7 @@ def panel_of(stages: Sequence[Stage], square: Run, arm: str, seed: int, threads:
         if stage.traces:
             trials += trials_of(stage.number, square, arm, seed, threads)
         for output, rival in stage.rivals.items():
-            lattice = dict(zip(PRIORS, (rival.models[n] for n in PAIR), strict=True))
+            lattice = dict(zip(PRIOR_COVARIANCES, (rival.models[n] for n in MULTI_INNOVATION_LABELS), strict=True))
             errors = {k: c.estimation.output_error[output].error for k, c in lattice.items()}
             contests.append(
                 Contest(
@@ -386,8 +390,8 @@ def panel_of(stages: Sequence[Stage], square: Run, arm: str, seed: int, threads:
                 )
             )
         whole, free = (stage.candidates[n] for n in ("integer, identified", "output error"))
-        if free.result is not None and free.result.joint is not None:
-            freed.append(_freed(arm, stage.number, whole.estimation, free.estimation, free.result))
+        if free.result is not None and free.result.fit is not None:
+            freed.append(_order_comparison(arm, stage.number, whole.estimation, free.estimation, free.result))
     return Panel(tuple(trials), tuple(contests), tuple(freed))
 
 
@@ -399,7 +403,7 @@ def simulated_panel(
     threads: int | None,
     *,
     genetic: Genetic | None = None,
-    lattice: Lattice | None = None,
+    lattice: OrderGrid | None = None,
     begin: Callable[[str], None] = lambda _: None,
     progress: Callable[[int, int], None] | None = None,
 ) -> Panel:
@@ -409,9 +413,9 @@ def simulated_panel(
     """
     trials: list[Trial] = []
     contests: list[Contest] = []
-    freed: list[Freed] = []
+    freed: list[OrderComparison] = []
     for seed in seeds:
-        run = demo_run("square", noise=noise, seed=seed, parameters=ARMS[arm])
+        run = demo_run("square", noise=noise, seed=seed, parameters=ARM_VARIANTS[arm])
         begin("trials")
         trials += trials_of(stage, run, arm, seed, threads)
         if lattice is None or seed != seeds[0]:
@@ -420,8 +424,10 @@ def simulated_panel(
         own = run.select(list(structure.signals))
         for output in structure.outputs:
             begin("rivals")
-            made = like_for_like(own, structure.equation(output), lattice, genetic, threads=threads, progress=progress)
-            contests.append(contest(made, output, arm, lattice.step))
+            made = compare_optimizers(
+                own, structure.equation(output), lattice, genetic, threads=threads, progress=progress
+            )
+            contests.append(contest(made, output, arm, lattice.increment))
         begin("freed")
-        freed.append(freed_of(stage, run, arm, threads, progress))
+        freed.append(compare_orders(stage, run, arm, threads, progress))
     return Panel(tuple(trials), tuple(contests), tuple(freed))

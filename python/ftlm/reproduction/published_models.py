@@ -18,20 +18,20 @@ from ftlm.plot.comparison_charts import pulse_times
 from ftlm.reproduction import published_values as printed
 from ftlm.reproduction.published_values import implied_spreads, papers_record
 from ftlm.reproduction.simulated_arm import StageNumber, demo_run
-from ftlm.reproduction.stage_result import PRIORS
+from ftlm.reproduction.stage_result import PRIOR_COVARIANCES
 from ftlm.structure.equation import Equation, Term
 from ftlm.structure.order import Order
-from ftlm.structure.order_grid import Lattice
+from ftlm.structure.order_grid import OrderGrid
 from ftlm.structure.structure import Structure
 from ftlm.utils.validation import Floats
 from ftlm.validation.comparison import compare_means, finite
 
 #: Increment and radius [increments] of the order grid around the printed orders.
-STEP, AROUND = 0.05, 2
+SEARCH_INCREMENT, SEARCH_RADIUS_STEPS = 0.05, 2
 
 
 @dataclass(frozen=True)
-class Ran:
+class PrintedModelRun:
     """Simulation of one printed model of one angle under the paper's current from rest.
 
     Parameters
@@ -57,19 +57,19 @@ class Ran:
     output: str
     p: int
     stability: Stability
-    moved: float
-    alone: float
-    implied: float
+    angle_deviation: float
+    single_equation_deviation: float
+    implied_deviation: float
     time: Floats
     response: Floats
     arm: Floats
-    returned: dict[float, dict[str, float]]
+    returned_coefficients: dict[float, dict[str, float]]
     orders: dict[float, dict[str, float]]
 
     @property
-    def too_small(self) -> float:
+    def deviation_ratio(self) -> float:
         """Ratio of the implied to the simulated standard deviation."""
-        return self.implied / self.moved if self.moved else np.inf
+        return self.implied_deviation / self.angle_deviation if self.angle_deviation else np.inf
 
     def to_dict(self) -> dict[str, Any]:
         """Return the simulation for JSON."""
@@ -78,11 +78,11 @@ class Ran:
             "p": self.p,
             "stability": str(self.stability),
             "unstable poles": finite(self.stability.unstable_poles),
-            "moved": finite(self.moved),
-            "moved, one angle": finite(self.alone),
-            "implied": self.implied,
-            "implied / moved": finite(self.too_small),
-            "returned": {f"{k:g}": v for k, v in self.returned.items()},
+            "moved": finite(self.angle_deviation),
+            "moved, one angle": finite(self.single_equation_deviation),
+            "implied": self.implied_deviation,
+            "implied / moved": finite(self.deviation_ratio),
+            "returned": {f"{k:g}": v for k, v in self.returned_coefficients.items()},
             "orders": {f"{k:g}": v for k, v in self.orders.items()},
         }
 
@@ -92,7 +92,7 @@ def printed_numbers(stage: StageNumber, p: int) -> tuple[dict[str, float], dict[
     orders: dict[str, float] = {}
     coefficients: dict[str, float] = {}
     for k in (1, 2):
-        row, n = printed.FRACTIONAL[f"theta{stage}{k}"][p], 2 * stage - 2 + k
+        row, n = printed.FRACTIONAL_ROWS[f"theta{stage}{k}"][p], 2 * stage - 2 + k
         orders |= {f"{name}{n}": float(v) for name, v in row.orders.items()}
         coefficients |= {f"{name}{n}": float(v) for name, v in row.coefficients.items()}
     return orders, coefficients
@@ -103,18 +103,18 @@ def printed_model(stage: StageNumber, p: int) -> Model:
     orders, coefficients = printed_numbers(stage, p)
     structure = flexible_link(stage=stage, form="published", coupling="simulated", laws=())
     known = structure.with_orders(orders).with_coefficients(coefficients)
-    return Model(known, orders=orders, m=printed.POINTS)
+    return Model(known, orders=orders, m=printed.PULSE_COUNT)
 
 
 def one_angle(output: str, p: int) -> Model:
     """Model of the printed row by (26): every term but the current's contains the angle itself."""
-    row = printed.FRACTIONAL[output][p]
+    row = printed.FRACTIONAL_ROWS[output][p]
     terms = [
         Term(output, Order(float(row.orders[order])), float(row.coefficients[letter]))
         for letter, order in zip("abd", ("beta", "gamma", "mu"), strict=True)
     ]
     terms.append(Term(f"I{output[-2]}", Order(), float(row.coefficients["g"])))
-    return Model(Structure((Equation(output, Order(float(row.orders["alpha"])), tuple(terms)),)), m=printed.POINTS)
+    return Model(Structure((Equation(output, Order(float(row.orders["alpha"])), tuple(terms)),)), m=printed.PULSE_COUNT)
 
 
 def papers_current(stage: StageNumber) -> Run:
@@ -122,7 +122,7 @@ def papers_current(stage: StageNumber) -> Run:
     return demo_run("square", noise=0.0).select([f"I{stage}", f"theta{stage}1", f"theta{stage}2"])
 
 
-def ran(stage: StageNumber, threads: int | None = None) -> list[Ran]:
+def run_printed_models(stage: StageNumber, threads: int | None = None) -> list[PrintedModelRun]:
     """Simulate every printed fractional model of a stage, and identify each from its own response."""
     drive, found = papers_current(stage), []
     spreads = implied_spreads()
@@ -137,7 +137,7 @@ def ran(stage: StageNumber, threads: int | None = None) -> list[Ran]:
             response = free.simulated[output][0]
             single = compare_means(one_angle(output, p), drive.select([f"I{stage}", output]))
             found.append(
-                Ran(
+                PrintedModelRun(
                     output,
                     p,
                     verdict,
@@ -146,20 +146,24 @@ def ran(stage: StageNumber, threads: int | None = None) -> list[Ran]:
                     spreads[output][1],
                     pulse_times(free),
                     response,
-                    _core.pulse_means(scaled[output], printed.POINTS, False),
-                    *_returned(own, structure.equation(output), printed_numbers(stage, p)[0], p, threads),
+                    _core.pulse_means(scaled[output], printed.PULSE_COUNT, False),
+                    *_reidentify(own, structure.equation(output), printed_numbers(stage, p)[0], p, threads),
                 )
             )
     return found
 
 
-def _returned(
+def _reidentify(
     run: Run, single: Structure, orders: dict[str, float], p: int, threads: int | None
 ) -> tuple[dict[float, dict[str, float]], dict[float, dict[str, float]]]:
     """Coefficients at the model's own orders, and for the largest p the best orders around them, by K0."""
     own = {n: orders[n] for n in single.order_names}
     wide = {
-        n: [round(v + k * STEP, 9) for k in range(-AROUND, AROUND + 1) if v + k * STEP < 2.0 or n.startswith("alpha")]
+        n: [
+            round(v + k * SEARCH_INCREMENT, 9)
+            for k in range(-SEARCH_RADIUS_STEPS, SEARCH_RADIUS_STEPS + 1)
+            if v + k * SEARCH_INCREMENT < 2.0 or n.startswith("alpha")
+        ]
         for n, v in own.items()
     }
     wide |= {n: [v] for n, v in own.items() if n.startswith("alpha")}
@@ -169,19 +173,19 @@ def _returned(
             return search_orders(
                 run,
                 single,
-                Lattice(step=STEP, orders=axes),
+                OrderGrid(increment=SEARCH_INCREMENT, orders=axes),
                 coefficients="multi-innovation",
                 innovation_length=p,
                 prior_covariance=prior,
-                m=printed.POINTS,
+                m=printed.PULSE_COUNT,
                 keep=1,
                 threads=threads,
             ).model
         except FtlmError:  # no candidate has a finite error
             return None
 
-    coefficients = {k: best({n: [v] for n, v in own.items()}, k) for k in PRIORS}
-    searched = {k: best(wide, k) for k in PRIORS} if p == printed.INNOVATION_LENGTHS[-1] else {}
+    coefficients = {k: best({n: [v] for n, v in own.items()}, k) for k in PRIOR_COVARIANCES}
+    searched = {k: best(wide, k) for k in PRIOR_COVARIANCES} if p == printed.INNOVATION_LENGTHS[-1] else {}
     return (
         {k: dict(m.coefficients) for k, m in coefficients.items() if m is not None},
         {k: {n: m.orders[n] for n in own} for k, m in searched.items() if m is not None},

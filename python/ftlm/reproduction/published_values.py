@@ -18,7 +18,7 @@ from ftlm.arm.flexible_link import flexible_link
 from ftlm.data.run import Run
 from ftlm.errors import InternalError
 from ftlm.fractional_calculus import haar_transform
-from ftlm.order_search.options import COMPARED_LENGTHS
+from ftlm.order_search.options import COMPARED_INNOVATION_LENGTHS
 from ftlm.reproduction.simulated_arm import PAPERS_ARM, demo_run
 from ftlm.simulation.discretization import record, sensor_series
 from ftlm.utils.formatting import Exact
@@ -26,15 +26,15 @@ from ftlm.utils.validation import Floats
 from ftlm.validation.comparison import Metrics, finite, metrics
 
 #: The paper's p, its number of block pulses, and its four angles in the order n = 1 … 4.
-INNOVATION_LENGTHS = COMPARED_LENGTHS
-POINTS = 2048
-OUTPUTS = ("theta11", "theta12", "theta21", "theta22")
+INNOVATION_LENGTHS = COMPARED_INNOVATION_LENGTHS
+PULSE_COUNT = 2048
+ANGLE_NAMES = ("theta11", "theta12", "theta21", "theta22")
 #: Letters of the orders and of the coefficients, in the order of the tables' columns.
-ORDERS, COEFFICIENTS = ("gamma", "alpha", "beta", "mu"), ("a", "b", "d", "g")
+ORDER_LETTERS, COEFFICIENT_LETTERS = ("gamma", "alpha", "beta", "mu"), ("a", "b", "d", "g")
 
 
 @dataclass(frozen=True)
-class Printed:
+class PublishedRow:
     """Row of a printed table: parameters by letter, and criteria (45), (46), (47), None if absent."""
 
     orders: Mapping[str, float]
@@ -44,58 +44,60 @@ class Printed:
     nr: float | None = None
 
 
-def _row(orders: tuple[float | None, ...], coefficients: tuple[float | None, ...], *criteria: float) -> Printed:
+def _row(orders: tuple[float | None, ...], coefficients: tuple[float | None, ...], *criteria: float) -> PublishedRow:
     def present(letters: tuple[str, ...], values: tuple[float | None, ...]) -> dict[str, float]:
         return {letter: Exact(v) for letter, v in zip(letters, values, strict=True) if v is not None}
 
-    return Printed(present(ORDERS, orders), present(COEFFICIENTS, coefficients), *map(Exact, criteria))
+    return PublishedRow(
+        present(ORDER_LETTERS, orders), present(COEFFICIENT_LETTERS, coefficients), *map(Exact, criteria)
+    )
 
 
-_WHOLE = (1.0, 2.0, None, 1.0)
-_HUB, _LINK = (1.9, 2.0, 1.85, 1.8), (1.95, 2.0, 1.9, 1.85)
+_INTEGER_ORDERS = (1.0, 2.0, None, 1.0)
+_HUB_ORDERS, _LINK_ORDERS = (1.9, 2.0, 1.85, 1.8), (1.95, 2.0, 1.9, 1.85)
 #: Integer-order rows of Tables 4 and 5.
-INTEGER: dict[str, Printed] = {
-    "theta11": _row(_WHOLE, (628.89, -62.956, None, 140.47), 640.31, 0.3829, 4.2028),
-    "theta12": _row(_WHOLE, (-863.33, 62.956, None, -140.47), 23.764, 0.0205, 3.4665),
-    "theta21": _row(_WHOLE, (2271.12, -496.76, 28.35, 288.12), 242.16, 0.2312, 1.6330),
-    "theta22": _row(_WHOLE, (-3336.18, 496.76, -41.65, -288.12), 244.79, 0.1045, 29.967),
+INTEGER_ROWS: dict[str, PublishedRow] = {
+    "theta11": _row(_INTEGER_ORDERS, (628.89, -62.956, None, 140.47), 640.31, 0.3829, 4.2028),
+    "theta12": _row(_INTEGER_ORDERS, (-863.33, 62.956, None, -140.47), 23.764, 0.0205, 3.4665),
+    "theta21": _row(_INTEGER_ORDERS, (2271.12, -496.76, 28.35, 288.12), 242.16, 0.2312, 1.6330),
+    "theta22": _row(_INTEGER_ORDERS, (-3336.18, 496.76, -41.65, -288.12), 244.79, 0.1045, 29.967),
 }
 #: Fractional rows of Tables 4 and 5, by angle and innovation length.
-FRACTIONAL: dict[str, dict[int, Printed]] = {
+FRACTIONAL_ROWS: dict[str, dict[int, PublishedRow]] = {
     "theta11": {
-        1: _row(_HUB, (-0.5002, 0.0253, 0.0186, 0.0345), 58.973, 0.0336, 0.3683),
-        3: _row(_HUB, (-0.7798, 0.0339, 0.0214, 0.0115), 37.764, 0.0212, 0.2323),
-        5: _row(_HUB, (-0.8789, 0.0321, 0.0155, 0.0029), 32.426, 0.0186, 0.2045),
-        7: _row(_HUB, (-0.9302, 0.0277, 0.0077, -0.0015), 30.561, 0.0180, 0.1974),
+        1: _row(_HUB_ORDERS, (-0.5002, 0.0253, 0.0186, 0.0345), 58.973, 0.0336, 0.3683),
+        3: _row(_HUB_ORDERS, (-0.7798, 0.0339, 0.0214, 0.0115), 37.764, 0.0212, 0.2323),
+        5: _row(_HUB_ORDERS, (-0.8789, 0.0321, 0.0155, 0.0029), 32.426, 0.0186, 0.2045),
+        7: _row(_HUB_ORDERS, (-0.9302, 0.0277, 0.0077, -0.0015), 30.561, 0.0180, 0.1974),
     },
     "theta12": {
-        1: _row(_LINK, (-0.7308, 0.0039, -0.4494, -0.0016), 1.5643, 0.00097, 0.1653),
-        3: _row(_LINK, (-0.9449, 0.0016, -0.2617, -0.0018), 1.4834, 0.00092, 0.1559),
-        5: _row(_LINK, (-1.1164, 0.0011, -0.0825, -0.0018), 1.3957, 0.00087, 0.1465),
-        7: _row(_LINK, (-1.2655, 0.0008, 0.0779, -0.0017), 1.3136, 0.00081, 0.1378),
+        1: _row(_LINK_ORDERS, (-0.7308, 0.0039, -0.4494, -0.0016), 1.5643, 0.00097, 0.1653),
+        3: _row(_LINK_ORDERS, (-0.9449, 0.0016, -0.2617, -0.0018), 1.4834, 0.00092, 0.1559),
+        5: _row(_LINK_ORDERS, (-1.1164, 0.0011, -0.0825, -0.0018), 1.3957, 0.00087, 0.1465),
+        7: _row(_LINK_ORDERS, (-1.2655, 0.0008, 0.0779, -0.0017), 1.3136, 0.00081, 0.1378),
     },
     "theta21": {
-        1: _row(_HUB, (-0.8114, 0.0108, 0.0067, 0.0228), 81.229, 0.0447, 0.3155),
-        3: _row(_HUB, (-1.0049, 0.0043, -0.0028, 0.0395), 57.369, 0.0329, 0.2322),
-        5: _row(_HUB, (-1.0556, 0.0048, -0.0146, 0.0439), 54.504, 0.0321, 0.2267),
-        7: _row(_HUB, (-1.0791, 0.0144, -0.0266, 0.0459), 53.989, 0.0320, 0.2266),
+        1: _row(_HUB_ORDERS, (-0.8114, 0.0108, 0.0067, 0.0228), 81.229, 0.0447, 0.3155),
+        3: _row(_HUB_ORDERS, (-1.0049, 0.0043, -0.0028, 0.0395), 57.369, 0.0329, 0.2322),
+        5: _row(_HUB_ORDERS, (-1.0556, 0.0048, -0.0146, 0.0439), 54.504, 0.0321, 0.2267),
+        7: _row(_HUB_ORDERS, (-1.0791, 0.0144, -0.0266, 0.0459), 53.989, 0.0320, 0.2266),
     },
     "theta22": {
-        1: _row(_LINK, (-0.5149, 0.0053, -0.4219, -0.0006), 1.1985, 0.00072, 0.2051),
-        3: _row(_LINK, (-0.6531, 0.0026, -0.4494, -0.0009), 1.0105, 0.00062, 0.1781),
-        5: _row(_LINK, (-0.7226, 0.0019, -0.4173, 0.0010), 0.9917, 0.00061, 0.1756),
-        7: _row(_LINK, (-0.7787, 0.0017, -0.3759, 0.0010), 0.9791, 0.00060, 0.1737),
+        1: _row(_LINK_ORDERS, (-0.5149, 0.0053, -0.4219, -0.0006), 1.1985, 0.00072, 0.2051),
+        3: _row(_LINK_ORDERS, (-0.6531, 0.0026, -0.4494, -0.0009), 1.0105, 0.00062, 0.1781),
+        5: _row(_LINK_ORDERS, (-0.7226, 0.0019, -0.4173, 0.0010), 0.9917, 0.00061, 0.1756),
+        7: _row(_LINK_ORDERS, (-0.7787, 0.0017, -0.3759, 0.0010), 0.9791, 0.00060, 0.1737),
     },
 }
 #: Table 6: the genetic algorithm.
-GENETIC: dict[str, Printed] = {
+GENETIC_ROWS: dict[str, PublishedRow] = {
     "theta11": _row((1.9299, 1.9722, 1.8977, 1.8655), (-0.2832, 4.8206, -4.1504, 0.0112)),
     "theta12": _row((1.9621, 1.9722, 1.9299, 1.8977), (-0.0159, 0.0238, 0.5145, 0.0172)),
     "theta21": _row((1.9299, 1.9722, 1.8977, 1.8655), (-0.4537, -9.0544, 9.5132, 0.0006)),
     "theta22": _row((1.9621, 1.9722, 1.9299, 1.8977), (-0.0231, -0.0009, 0.2365, 0.0012)),
 }
 #: Table 7: (error, RMSE, NR) of the genetic algorithm and of multi-innovation.
-RIVALS: dict[str, tuple[tuple[float, float, float], tuple[float, float, float]]] = {
+TABLE_7_CRITERIA: dict[str, tuple[tuple[float, float, float], tuple[float, float, float]]] = {
     "theta11": ((70.844, 0.0401, 0.3554), (30.561, 0.0180, 0.1974)),
     "theta12": ((6.8453, 0.0042, 0.1812), (1.3136, 0.0008, 0.1378)),
     "theta21": ((65.306, 0.0395, 0.2270), (53.989, 0.0320, 0.2266)),
@@ -122,27 +124,27 @@ TABLE_3: dict[str, tuple[float, str]] = {
 
 def last_orders(output: str) -> dict[str, float]:
     """Orders of an angle's row of p = 7 by name, such as alpha1."""
-    index = 1 + OUTPUTS.index(output)
-    return {f"{n}{index}": v for n, v in FRACTIONAL[output][INNOVATION_LENGTHS[-1]].orders.items()}
+    index = 1 + ANGLE_NAMES.index(output)
+    return {f"{n}{index}": v for n, v in FRACTIONAL_ROWS[output][INNOVATION_LENGTHS[-1]].orders.items()}
 
 
 #: Angles in the terms a, b and d of an equation: its own angle, or the other one of its stage.
-READINGS = {
+TERM_INTERPRETATIONS = {
     "(22)–(25)": "as printed there",
     "(26), one angle": "every term has the angle itself",
     "own angle in a": "the angle itself in a, the other one in b and d",
     "a and b exchanged": "the orders of (22)–(25), the columns a and b of the table exchanged",
 }
 #: Values of K0: eight per decade.
-SCAN = tuple(float(v) for v in np.logspace(-3, 5, 65))
+PRIOR_GRID = tuple(float(v) for v in np.logspace(-3, 5, 65))
 #: Grid of orders around the printed ones, in the paper's increments, for the rank of the printed orders.
-LOW, HIGH, STEP = 1.6, 1.95, 0.05
+MIN_GRID_ORDER, MAX_GRID_ORDER, GRID_INCREMENT = 1.6, 1.95, 0.05
 #: Largest ratio to a printed coefficient that counts as agreement, with equal signs.
-NEAR = 1.25
+MAX_COEFFICIENT_RATIO = 1.25
 
 
 @dataclass(frozen=True)
-class Reading:
+class Interpretation:
     """Interpretation of the unstated settings of the paper.
 
     Parameters
@@ -201,7 +203,7 @@ class AsPrinted:
     """
 
     output: str
-    reading: Reading
+    reading: Interpretation
     rows: dict[int, Row]
     away: float
     away_at_one: float
@@ -211,28 +213,30 @@ class AsPrinted:
     scale: float
 
     @property
-    def alike(self) -> list[str]:
+    def matching_trends(self) -> list[str]:
         """Coefficients that rise and fall with p as the printed ones do."""
-        table = FRACTIONAL[self.output]
+        table = FRACTIONAL_ROWS[self.output]
 
         def course(rows: Mapping[int, Any], letter: str) -> list[float]:
             return np.sign(np.diff([rows[p].coefficients[letter] for p in INNOVATION_LENGTHS])).tolist()  # type: ignore[no-any-return]
 
-        return [c for c in COEFFICIENTS if course(self.rows, c) == course(table, c)]
+        return [c for c in COEFFICIENT_LETTERS if course(self.rows, c) == course(table, c)]
 
     @property
     def ratios(self) -> dict[str, list[float]]:
         """Ratio to the printed value by p, for every coefficient and NR."""
-        table = FRACTIONAL[self.output]
+        table = FRACTIONAL_ROWS[self.output]
         columns = {
-            c: [r.coefficients[c] / table[p].coefficients[c] for p, r in self.rows.items()] for c in COEFFICIENTS
+            c: [r.coefficients[c] / table[p].coefficients[c] for p, r in self.rows.items()] for c in COEFFICIENT_LETTERS
         }
         return columns | {"NR": [r.equation.nr / float(table[p].nr or 1.0) for p, r in self.rows.items()]}
 
     @property
-    def near(self) -> bool:
+    def is_close(self) -> bool:
         """Whether all coefficients have the printed sign and are, as NR is, within 25 % of the printed values."""
-        return all(1.0 / NEAR <= q <= NEAR for column in self.ratios.values() for q in column)
+        return all(
+            1.0 / MAX_COEFFICIENT_RATIO <= q <= MAX_COEFFICIENT_RATIO for column in self.ratios.values() for q in column
+        )
 
     def to_dict(self) -> dict[str, Any]:
         """Return the comparison for JSON."""
@@ -248,7 +252,7 @@ class AsPrinted:
             "among": self.among,
             "best orders": self.best,
             "scale": self.scale,
-            "columns of the printed course": self.alike,
+            "columns of the printed course": self.matching_trends,
             "ours / printed": self.ratios,
             "rows": {
                 str(p): {"coefficients": r.coefficients, "equation_error": r.equation.to_dict()}
@@ -299,7 +303,7 @@ class _Angle:
         time, haar = zip(*parts, strict=True)
         return np.stack(time, axis=1), np.stack(haar, axis=1)
 
-    def solved(self, haar: Floats, priors: Sequence[float], p: int) -> list[Floats]:
+    def solve_coefficients(self, haar: Floats, priors: Sequence[float], p: int) -> list[Floats]:
         """Return the closed form of (44): least squares with weight min(p, M - i + 1) of row i, and a prior."""
         weights = np.minimum(p, self.m - np.arange(self.m)).astype(np.float64)
         weighted = haar * weights[:, None]
@@ -311,7 +315,7 @@ class _Angle:
 
 def implied_spreads() -> dict[str, tuple[float, float]]:
     """Standard deviations that Table 7 implies by RMSE / NR, for the genetic algorithm and for multi-innovation."""
-    return {o: (g[1] / g[2], m[1] / m[2]) for o, (g, m) in RIVALS.items()}
+    return {o: (g[1] / g[2], m[1] / m[2]) for o, (g, m) in TABLE_7_CRITERIA.items()}
 
 
 def papers_record() -> tuple[Run, dict[str, float]]:
@@ -323,7 +327,7 @@ def papers_record() -> tuple[Run, dict[str, float]]:
     return Run.from_arrays(step=run.step, inputs=inputs, outputs=outputs, units=dict(run.units), name="scaled"), scales
 
 
-def as_printed(outputs: Sequence[str] = OUTPUTS) -> dict[str, AsPrinted]:
+def as_printed(outputs: Sequence[str] = ANGLE_NAMES) -> dict[str, AsPrinted]:
     """Recompute Tables 4 and 5 by the closest interpretation, angle by angle.
 
     Parameters
@@ -336,13 +340,13 @@ def as_printed(outputs: Sequence[str] = OUTPUTS) -> dict[str, AsPrinted]:
     for output in outputs:
         stage: Literal[1, 2] = 1 if output[-2] == "1" else 2
         structure = flexible_link(stage=stage, form="published", coupling="measured", laws=(), sensor_filter="stock")
-        own = record(run, structure, POINTS, filtered=False)
+        own = record(run, structure, PULSE_COUNT, filtered=False)
         plain = {o: own.of(o) for o in structure.outputs}
         hub, deflection = structure.outputs
-        filter_series = sensor_series(structure, POINTS, own.step)
+        filter_series = sensor_series(structure, PULSE_COUNT, own.step)
         behind = plain[deflection]
         if filter_series is not None:
-            behind = _core.series_multiply(filter_series, behind, POINTS)
+            behind = _core.series_multiply(filter_series, behind, PULSE_COUNT)
         # The implied deviation is that of the angle as it was logged.
         behind = behind * float(np.std(plain[deflection])) / float(np.std(behind))
         seen = {False: plain, True: {hub: plain[hub], deflection: behind}}
@@ -353,37 +357,37 @@ def as_printed(outputs: Sequence[str] = OUTPUTS) -> dict[str, AsPrinted]:
 
 
 def _nearest(output: str, angles: Mapping[bool, _Angle], scale: float) -> AsPrinted:
-    table, orders = FRACTIONAL[output], FRACTIONAL[output][1].orders
-    best: tuple[float, Reading, dict[int, Row]] | None = None
+    table, orders = FRACTIONAL_ROWS[output], FRACTIONAL_ROWS[output][1].orders
+    best: tuple[float, Interpretation, dict[int, Row]] | None = None
     at_one = math.inf
     deflection = output.endswith("2")
-    for filtered, terms in product((False, True) if deflection else (False,), READINGS):
+    for filtered, terms in product((False, True) if deflection else (False,), TERM_INTERPRETATIONS):
         angle = angles[filtered]
         time, haar = angle.regressors(terms, orders)
-        priors = (*SCAN, 1.0)
-        solved = {p: angle.solved(haar, priors, p) for p in INNOVATION_LENGTHS}
+        priors = (*PRIOR_GRID, 1.0)
+        solved = {p: angle.solve_coefficients(haar, priors, p) for p in INNOVATION_LENGTHS}
         for k, prior in enumerate(priors):
             x = {p: solved[p][k] for p in INNOVATION_LENGTHS}
             figures = {p: metrics(angle.y, time @ x[p]) for p in INNOVATION_LENGTHS}
             for flipped in (False, True):
                 signs = np.array([-1.0 if flipped and place == "own" else 1.0 for place in angle.places(terms)])
                 rows = {
-                    p: Row(dict(zip(COEFFICIENTS, (signs * x[p]).tolist(), strict=True)), figures[p])
+                    p: Row(dict(zip(COEFFICIENT_LETTERS, (signs * x[p]).tolist(), strict=True)), figures[p])
                     for p in INNOVATION_LENGTHS
                 }
-                away = _away(rows, table)
+                away = _log_distance(rows, table)
                 if prior == 1.0:
                     at_one = min(at_one, away)
                 if best is None or away < best[0]:
-                    best = away, Reading(terms, filtered, flipped, prior), rows
+                    best = away, Interpretation(terms, filtered, flipped, prior), rows
     if best is None:
         raise InternalError(f"no reading of {output} was tried; please report it")
     away, reading, rows = best
-    rank, among, first = _ranked(angles[reading.filtered], reading, orders)
+    rank, among, first = _rank_orders(angles[reading.filtered], reading, orders)
     return AsPrinted(output, reading, rows, math.exp(away), math.exp(at_one), rank, among, first, scale)
 
 
-def _away(rows: Mapping[int, Row], table: Mapping[int, Printed]) -> float:
+def _log_distance(rows: Mapping[int, Row], table: Mapping[int, PublishedRow]) -> float:
     """Mean absolute logarithm of the ratios to the printed a and NR; a reversed sign of a counts as a decade."""
     logs = []
     for p, row in rows.items():
@@ -393,14 +397,19 @@ def _away(rows: Mapping[int, Row], table: Mapping[int, Printed]) -> float:
     return sum(logs) / len(logs)
 
 
-def _ranked(angle: _Angle, reading: Reading, orders: Mapping[str, float]) -> tuple[int, int, dict[str, float]]:
+def _rank_orders(
+    angle: _Angle, reading: Interpretation, orders: Mapping[str, float]
+) -> tuple[int, int, dict[str, float]]:
     """Rank of the printed orders among all neighboring ones at the largest p, their number, and the best orders."""
-    values = [round(LOW + k * STEP, 9) for k in range(round((HIGH - LOW) / STEP) + 1)]
+    values = [
+        round(MIN_GRID_ORDER + k * GRID_INCREMENT, 9)
+        for k in range(round((MAX_GRID_ORDER - MIN_GRID_ORDER) / GRID_INCREMENT) + 1)
+    ]
     errors: dict[tuple[float, ...], float] = {}
     for beta, gamma, mu in product(values, values, values):
         at = {"alpha": float(orders["alpha"]), "beta": beta, "gamma": gamma, "mu": mu}
         time, haar = angle.regressors(reading.terms, at)
-        (x,) = angle.solved(haar, (reading.prior,), INNOVATION_LENGTHS[-1])
+        (x,) = angle.solve_coefficients(haar, (reading.prior,), INNOVATION_LENGTHS[-1])
         errors[beta, gamma, mu] = float(np.sum(np.abs(angle.y - time @ x)))
     own = errors[tuple(round(float(orders[n]), 9) for n in ("beta", "gamma", "mu"))]
     first = min(errors, key=lambda k: errors[k])

@@ -12,32 +12,41 @@ from pathlib import Path
 import numpy as np
 from markupsafe import Markup
 
-from ftlm.estimation.result import Judged
+from ftlm.estimation.result import IdentificationRecord
 from ftlm.model.model import Model
 from ftlm.order_search.result import search_summary
 from ftlm.plot.comparison_charts import comparison_charts, pulse_times
 from ftlm.plot.model_charts import bode_charts, pole_charts, response_frequencies
-from ftlm.report.html_report import behaviour_tables, estimates_table, first_warnings, grouped_warnings, verdict_box
-from ftlm.report.text_summary import behaviour_in_words, concerns_in_words, equations_in_words
+from ftlm.report.html_report import behavior_tables, estimates_table, first_warnings, grouped_warnings, verdict_box
+from ftlm.report.text_summary import behavior_lines, equation_lines, finding_lines
 from ftlm.report.typesetting import equation_html
 from ftlm.reproduction import figures, tables
-from ftlm.reproduction.claims import Recomputed, claims, spread_in_words
-from ftlm.reproduction.cross_validation import KINDS, MARGIN, WHOLE, WITHOUT, Deflection, UnseenOrders, Verdict, percent
+from ftlm.reproduction.claims import ReproductionData, claims, deviation_in_words
+from ftlm.reproduction.cross_validation import (
+    FREE_ORDERS_BY_KIND,
+    INTEGER_KIND,
+    MIN_FIT_GAIN,
+    WITHOUT_RATE_LABEL,
+    Deflection,
+    UnseenOrders,
+    Verdict,
+    percent,
+)
 from ftlm.reproduction.demo import Demo
 from ftlm.reproduction.figures import convergence_chart, derivative_chart
-from ftlm.reproduction.stage_models import BEST, COARSE
+from ftlm.reproduction.stage_models import COARSE_INCREMENT, REFINED_CANDIDATES
 from ftlm.reproduction.stage_result import TRACE_EVERY, Stage
 from ftlm.reproduction.tables import PaperRow, four_digits, letter_of, paper_table, paper_table_text
-from ftlm.structure.equation import numeric
+from ftlm.structure.equation import format_equation
 from ftlm.svg.bar_chart import bar_chart
-from ftlm.svg.figure import SMALL, Figure
+from ftlm.svg.figure import SMALL_WIDTH_PX, Figure
 from ftlm.svg.heat_map import heat_map
 from ftlm.svg.html_page import Section, Table, write_page
 from ftlm.svg.line_chart import line_chart
 from ftlm.utils.files import check_free
-from ftlm.utils.formatting import SUPERSCRIPTS, Cell, Exact, number, symbol, symbol_html, unbounded, wrapped
+from ftlm.utils.formatting import SUPERSCRIPT_DIGITS, Cell, Exact, format_bound, number, symbol, symbol_html, wrap_text
 
-PAPER = (
+PAPER_REFERENCE = (
     "Wang, Li, Li, Liang, Gao: Establishment and Identification of Fractional-Order Model for Structurally Symmetric "
     "Flexible Two-Link Manipulator System, Symmetry 2025, 17, 1072, doi:10.3390/sym17071072"
 )
@@ -46,7 +55,7 @@ PAPER = (
 def stage_section(
     heading: str,
     joint: Model,
-    results: Mapping[str, Judged | None],
+    results: Mapping[str, IdentificationRecord | None],
     shown: Sequence[Table],
     charts: Sequence[Figure],
     *notes: str,
@@ -66,11 +75,11 @@ def stage_section(
 
 def typeset(words: str) -> str:
     """Typeset numbers in a text: powers of ten, minus signs, K₀."""
-    powers = re.sub(r"(?<=\d)e([+-]\d+)\b", lambda e: f"·10{str(int(e[1])).translate(SUPERSCRIPTS)}", words)
+    powers = re.sub(r"(?<=\d)e([+-]\d+)\b", lambda e: f"·10{str(int(e[1])).translate(SUPERSCRIPT_DIGITS)}", words)
     return re.sub(r"(?<![\w.])-(?=\d)", "−", powers).replace("K0", "K₀")
 
 
-def _verdict_section(found: Recomputed) -> Section:
+def _verdict_section(found: ReproductionData) -> Section:
     """Section with one line per verdict, and the evidence in a collapsed part."""
     told = claims(found)
     rows: list[list[Cell]] = [
@@ -100,27 +109,27 @@ def _verdict_section(found: Recomputed) -> Section:
         warnings=[missing] * (found.sine is None),
         fold="The numbers behind every verdict",
         folded_paragraphs=behind,
-        folded=[tables.panel_table(found), tables.whole_table(found)],
+        folded=[tables.panel_table(found), tables.order_comparison_table(found)],
     )
 
 
-def _ran_section(found: Recomputed) -> Section:
+def _ran_section(found: ReproductionData) -> Section:
     words = "The paper's errors are said to be those of the models' responses."
     if found.ran:
         words += (
             " The angles that they were identified from, by RMSE / NR, move more than the printed models under the "
-            f"paper's own current, by factors {spread_in_words(found)}."
+            f"paper's own current, by factors {deviation_in_words(found)}."
         )
     return Section(
         "The printed models, run",
         [words],
-        figures=figures.ran_charts(found),
+        figures=figures.printed_model_charts(found),
         fold="All printed models",
-        folded=[tables.ran_table(found)],
+        folded=[tables.printed_runs_table(found)],
     )
 
 
-def _printed_section(found: Recomputed) -> Section:
+def _printed_section(found: ReproductionData) -> Section:
     far = ", ".join(f"{t.away:.2f} ({symbol(o)})" for o, t in found.as_printed.items())
     others = "; ".join(
         f"{number(t.ratios['b'][-1], 3)}, {number(t.ratios['d'][-1], 3)}, {number(t.ratios['g'][-1], 3)} ({symbol(o)})"
@@ -139,7 +148,7 @@ def _printed_section(found: Recomputed) -> Section:
     return Section("As printed (Tables 4 and 5)", words, fold="Ours beside printed", folded=shown)
 
 
-def _stage_section(found: Recomputed, stage: Stage) -> Section:
+def _stage_section(found: ReproductionData, stage: Stage) -> Section:
     number, joint = stage.number, stage.candidates["output error"]
     title = f"Table {3 + number}. Identified models of stage {number}, square input"
     estimates = estimates_table(joint.result, found.truth.get(number, {}))
@@ -166,7 +175,7 @@ def _warnings_table(stage: int, warned: Sequence[str]) -> Table:
     return Table(f"Warnings of the fits of stage {stage}", ("model", "warning"), rows, wrap=True)
 
 
-def _rival_section(found: Recomputed) -> Section:
+def _rival_section(found: ReproductionData) -> Section:
     words = (
         "All search the same record by the same criterion, (45) of the free run; either rival may evaluate as many "
         "candidates as the lattice has. They vary orders and coefficients; multi-innovation takes the coefficients of "
@@ -184,7 +193,7 @@ def _rival_section(found: Recomputed) -> Section:
     )
 
 
-def _weak_section(found: Recomputed) -> Section:
+def _weak_section(found: ReproductionData) -> Section:
     words = (
         "Recursion (44) is least squares with weights: row i counts min(p, M − i + 1) times, against a prior that "
         "holds the coefficients near 0 with covariance K0. So p is a weight of the data against the prior. With a "
@@ -203,7 +212,7 @@ def _weak_section(found: Recomputed) -> Section:
     )
 
 
-def _near_section(found: Recomputed) -> Section:
+def _near_section(found: ReproductionData) -> Section:
     words = (
         "With α − ν small, I^(α−ν) y is nearly y itself. A few such terms reproduce any smooth signal on the "
         "right-hand side, whatever the machine is; only the free run shows what the equation knows."
@@ -218,7 +227,7 @@ def _near_section(found: Recomputed) -> Section:
     )
 
 
-def _derivative_section(found: Recomputed) -> Section:
+def _derivative_section(found: ReproductionData) -> Section:
     words = (
         "Eliminating the hub angle's highest derivative from (15) by (17) differentiates the current as well, by the "
         "order α₂ − μ₂ + γ₁ − α₁, which (19) and (21) leave out. It vanishes for whole orders. Without it a fractional "
@@ -231,7 +240,7 @@ def _derivative_section(found: Recomputed) -> Section:
     return Section("The dropped derivative", [words], figures=charts)
 
 
-def _landscape_section(found: Recomputed) -> Section:
+def _landscape_section(found: ReproductionData) -> Section:
     present = {n: stage.landscape for n, stage in found.stages.items() if stage.landscape is not None}
     words = [
         f"Stage {n}: the two orders that this run tells apart least are {symbol(landscape.names[0])} "
@@ -241,7 +250,7 @@ def _landscape_section(found: Recomputed) -> Section:
     return Section("Order landscape", words, figures=[*map(heat_map, present.values())], small=True)
 
 
-def _bode_section(found: Recomputed) -> Section:
+def _bode_section(found: ReproductionData) -> Section:
     charts = []
     for stage in found.stages.values():
         model = stage.candidates["output error"].model
@@ -250,18 +259,20 @@ def _bode_section(found: Recomputed) -> Section:
     return Section("Frequency response", [words], figures=charts, small=True)
 
 
-def _runs_section(found: Recomputed) -> Section:
+def _runs_section(found: ReproductionData) -> Section:
     rows: list[list[Cell]] = []
     for run in found.runs:
         currents = (f"{symbol(n)} ±{np.max(np.abs(run[n])):.3g} {run.units[n]}" for n in run.inputs)
         rows.append([run.name, run.length, Exact(run.step), run.duration, ", ".join(currents)])
     first = next(iter(found.stages.values()))
     notes = [
-        f"M = {first.candidates['p = 7'].estimation.m} block pulses, order lattice in steps of {found.lattice.step:g}, "
+        f"M = {first.candidates['p = 7'].estimation.m} block pulses, order lattice in steps of "
+        f"{found.lattice.increment:g}, "
         f"α from {found.lattice.alpha[0]:g} to {found.lattice.alpha[1]:g}, K₀ = 1, rows in Haar coordinates from "
         f"coarse to fine. Convergence is computed at every {TRACE_EVERY}nd step. Instrumental variables are searched "
         "two steps around the orders of least squares. With K₀ = 1 deflections hardly move, and no bound excludes a "
-        f"candidate: lattices finer than {COARSE:g} are searched in steps of that for them, then around the {BEST} "
+        f"candidate: lattices finer than {COARSE_INCREMENT:g} are searched in steps of that for them, then around "
+        f"the {REFINED_CANDIDATES} "
         "best. Equations (22)–(25) are fitted by output error from the numbers of (14)–(15); automatic starts end in "
         "optima that rounding chooses between.",
         "Explicit Euler steps at the step of the run, 0.002 s on the virtual rig, as in the paper.",
@@ -271,7 +282,7 @@ def _runs_section(found: Recomputed) -> Section:
     return Section("Runs and settings", notes, tables=[runs])
 
 
-def reproduction_page(found: Recomputed, path: str | os.PathLike[str], *, force: bool = False) -> Path:
+def reproduction_page(found: ReproductionData, path: str | os.PathLike[str], *, force: bool = False) -> Path:
     """Write the reproduction as one HTML page; see :meth:`ftlm.Reproduction.page`."""
     check_free(path, force=force)
     sections = [
@@ -309,7 +320,8 @@ def reproduction_page(found: Recomputed, path: str | os.PathLike[str], *, force:
     )
     lead = (
         f"Section 5 of the paper, recomputed on {origin} beside what the paper prints. {shown}Numbers in rows marked "
-        f"“printed” are the paper's; every other number, figure and verdict on this page is computed. {PAPER}."
+        "“printed” are the paper's; every other number, figure and verdict on this page is computed. "
+        f"{PAPER_REFERENCE}."
     )
     return write_page(path, title="The paper reproduced", sections=sections, lead=lead, force=force)
 
@@ -323,7 +335,7 @@ def fits_text(fits: Mapping[str, Sequence[float]], label: int, widths: Sequence[
     return lines
 
 
-def reproduction_text(found: Recomputed) -> str:
+def reproduction_text(found: ReproductionData) -> str:
     """Summary for a terminal: verdicts with their main number, and fits."""
     lines = []
     for claim in claims(found):
@@ -341,28 +353,28 @@ def reproduction_text(found: Recomputed) -> str:
         }
         lines += fits_text(fits, 26, [16] * 4)
         best = stage.candidates["output error"].model
-        lines += [f"  {numeric(e, best.structure.acting('.6g'))}" for e in best.equations]
+        lines += [f"  {format_equation(e, best.structure.describe_inputs('.6g'))}" for e in best.equations]
     lines += [f"note: {n}" for n in found.notes]
     return "\n".join(lines)
 
 
 #: Structure in the charts: elasticity and damping fractional, as in the paper.
-SHOWN = "both fractional"
+CHARTED_KIND = "both fractional"
 #: Subject and both endings of a verdict for each kind.
-WHAT = {
+VERDICT_PHRASES = {
     "fractional elasticity": ("a fractional order of the elasticity", "earns its place", "does not earn its place"),
     "fractional damping": ("a fractional order of the damping", "earns its place", "does not earn its place"),
-    SHOWN: ("fractional orders", "earn their place", "do not earn their place"),
+    CHARTED_KIND: ("fractional orders", "earn their place", "do not earn their place"),
 }
 #: Verdict in a table cell.
-SHORT = {True: "yes", False: "no", None: "cannot be told"}
+VERDICT_CELLS = {True: "yes", False: "no", None: "cannot be told"}
 #: Points of a line.
 LINE_POINTS = 700
 
 
 def sentence(output: str, verdict: Verdict) -> str:
     """Return a verdict as a sentence."""
-    what, yes, no = WHAT[verdict.kind]
+    what, yes, no = VERDICT_PHRASES[verdict.kind]
     if verdict.earns is None:
         return f"{symbol(output)}: whether {what} {yes} cannot be told."
     return f"{symbol(output)}: {what} {yes if verdict.earns else no}."
@@ -379,16 +391,16 @@ def unseen_charts(found: UnseenOrders, deflection: Deflection) -> list[Figure]:
     names = [run.name or "" for run in found.runs]
     for run, judged in zip(names, names[1:] + names[:1], strict=True):
         output = deflection.output
-        whole = deflection.fits[WHOLE][run]
-        at = whole.compared[judged]
+        whole = deflection.fits[INTEGER_KIND][run]
+        at = whole.comparisons[judged]
         lines = [("measured", at.measured[output][0])]
         told = []
-        for kind in (WHOLE, SHOWN):
+        for kind in (INTEGER_KIND, CHARTED_KIND):
             fitted = deflection.fits[kind].get(run)
             if fitted is None:
                 told.append(f"{kind}: no fit")
                 continue
-            lines.append((kind, fitted.compared[judged].simulated[output][0]))
+            lines.append((kind, fitted.comparisons[judged].simulated[output][0]))
             told.append(f"{kind} {percent(fitted.fit(judged))} % with {fitted.numbers} numbers")
         words = "; ".join(told)
         charts.append(
@@ -399,20 +411,20 @@ def unseen_charts(found: UnseenOrders, deflection: Deflection) -> list[Figure]:
                 x_label="time [s]",
                 y_label=f"{symbol(output)} [rad]",
                 points=LINE_POINTS,
-                width=SMALL,
+                width=SMALL_WIDTH_PX,
                 caption=f"{words[0].upper()}{words[1:]}.",
             )
         )
     return charts
 
 
-def _each(found: UnseenOrders) -> list[tuple[str, Deflection]]:
+def _all_deflections(found: UnseenOrders) -> list[tuple[str, Deflection]]:
     """Return every structure with its heading; those without the rate follow those with it."""
     out = []
     for output, deflection in found.deflections.items():
         out.append((symbol(output), deflection))
         if deflection.before is not None:
-            out.append((f"{symbol(output)}, {WITHOUT}", deflection.before))
+            out.append((f"{symbol(output)}, {WITHOUT_RATE_LABEL}", deflection.before))
     return out
 
 
@@ -424,7 +436,11 @@ def places_table(found: UnseenOrders) -> Table | None:
         if deflection.before is not None:
             headings[len(rows)] = symbol(output)
             pair = (deflection.before, deflection)
-            rows += [[kind, *(SHORT[d.verdict(kind).earns] for d in pair)] for kind in KINDS if kind != WHOLE]
+            rows += [
+                [kind, *(VERDICT_CELLS[d.verdict(kind).earns] for d in pair)]
+                for kind in FREE_ORDERS_BY_KIND
+                if kind != INTEGER_KIND
+            ]
     if not rows:
         return None
     return Table(
@@ -443,7 +459,7 @@ def fits_table(found: UnseenOrders) -> Table:
     pairs = [(run, other) for run in names for other in names]
     rows: list[list[Cell]] = []
     headings = {}
-    for heading, deflection in _each(found):
+    for heading, deflection in _all_deflections(found):
         headings[len(rows)] = heading
         for kind, each in deflection.fits.items():
             numbers = next((f.numbers for f in each.values()), None)
@@ -472,25 +488,29 @@ def estimates_table_unseen_page(deflection: Deflection, told: str = "") -> Table
         for run, fitted in each.items():
             headings[len(rows)] = f"{kind}, fitted to {run}"
             for name, (value, low, high) in fitted.estimates.items():
-                rows.append([symbol_html(name), value, *(v if math.isfinite(v) else unbounded(v) for v in (low, high))])
+                rows.append(
+                    [symbol_html(name), value, *(v if math.isfinite(v) else format_bound(v) for v in (low, high))]
+                )
     title = f"{symbol(deflection.output)}{told}: estimates and their 95 % intervals"
     return Table(title, ("number", "estimate", "from", "to"), rows, headings=headings)
 
 
-def _first_section(found: UnseenOrders) -> Section:
-    verdicts = [_verdict(o, d.verdict(SHOWN)) for o, d in found.deflections.items()]
+def _unseen_section(found: UnseenOrders) -> Section:
+    verdicts = [_verdict(o, d.verdict(CHARTED_KIND)) for o, d in found.deflections.items()]
     charts = [chart for d in found.deflections.values() for chart in unseen_charts(found, d)]
     return Section("On runs that were not fitted to", verdicts, figures=charts, small=True)
 
 
 def _deflection_section(deflection: Deflection) -> Section:
-    parts = [("", deflection)] + ([] if deflection.before is None else [(f", {WITHOUT}", deflection.before)])
+    parts = [("", deflection)] + ([] if deflection.before is None else [(f", {WITHOUT_RATE_LABEL}", deflection.before)])
     results = {
         f"{k}, {run}{told}": f.result for told, d in parts for k, each in d.fits.items() for run, f in each.items()
     }
     failed = [f"{kind}, {run}{told}: {words}" for told, d in parts for (kind, run), words in d.failed.items()]
-    last = next(iter(deflection.fits[WHOLE].values())).result.model
-    first, run = next((f.result.model, run) for run, f in {**deflection.fits[WHOLE], **deflection.fits[SHOWN]}.items())
+    last = next(iter(deflection.fits[INTEGER_KIND].values())).result.model
+    first, run = next(
+        (f.result.model, run) for run, f in {**deflection.fits[INTEGER_KIND], **deflection.fits[CHARTED_KIND]}.items()
+    )
     equations = [equation_html(e) for e in dict.fromkeys((*last.equations, *first.equations))]
     words = f"With whole orders and with both free, fitted to {run}:"
     return Section(
@@ -511,7 +531,7 @@ def _method_section(found: UnseenOrders) -> Section:
         + (" Both deflections passed the 2 Hz low-pass of the arm's stock model." if found.filtered else ""),
         "All structures have the same terms. Whole orders: elasticity of order 0, damping of order 1.",
         f"An order earns its place where every fitted run's 95 % interval excludes the whole one, the runs' intervals "
-        f"have a value in common, no unseen run loses {MARGIN:g} points of fit and the middle one gains as much. "
+        f"have a value in common, no unseen run loses {MIN_FIT_GAIN:g} points of fit and the middle one gains as much. "
         "It does not where no unseen run gains that, or no interval excludes the whole order and the middle run gains "
         "less. The rest cannot be told, as where a fit is worse on its own run than the whole orders that it contains.",
         *found.notes,
@@ -542,10 +562,10 @@ def unseen_page(found: UnseenOrders, path: str | os.PathLike[str], *, force: boo
         The file exists and ``force`` is not set, or cannot be written.
     """
     check_free(path, force=force)
-    alone = [_verdict(o, v) for o, d in found.deflections.items() for v in d.verdicts if v.kind != SHOWN]
+    alone = [_verdict(o, v) for o, d in found.deflections.items() for v in d.verdicts if v.kind != CHARTED_KIND]
     places = places_table(found)
     sections = [
-        _first_section(found),
+        _unseen_section(found),
         Section("One order at a time", alone, tables=[*([] if places is None else [places]), fits_table(found)]),
         *(_deflection_section(d) for d in found.deflections.values()),
         _method_section(found),
@@ -567,12 +587,12 @@ def unseen_text(found: UnseenOrders) -> str:
     names = [run.name or "" for run in found.runs]
     for output, deflection in found.deflections.items():
         if deflection.before is not None:
-            lines += ["", f"{symbol(output)}, {WITHOUT}:"]
+            lines += ["", f"{symbol(output)}, {WITHOUT_RATE_LABEL}:"]
             lines += [f"    {sentence(output, verdict)}" for verdict in deflection.before.verdicts]
-    for heading, deflection in _each(found):
+    for heading, deflection in _all_deflections(found):
         lines += ["", f"{heading}: fit of the free run in percent, fitted to the first, judged on the second"]
         lines.append(" " * 24 + "numbers".rjust(8) + "".join(f"{a} → {b}".rjust(18) for a in names for b in names))
-        lines += [_line(kind, deflection, names) for kind in KINDS]
+        lines += [_line(kind, deflection, names) for kind in FREE_ORDERS_BY_KIND]
     return "\n".join([*lines, *(f"note: {n}" for n in found.notes)])
 
 
@@ -583,7 +603,7 @@ def _line(kind: str, deflection: Deflection, names: Sequence[str]) -> str:
     return kind.ljust(24) + numbers.rjust(8) + "".join(text.rjust(18) for text in shown)
 
 
-NOTE = (
+TABLE_NOTE = (
     "Equation error: measured signals on the right-hand side. Free run: output error, the other output measured; for "
     "the integer-order model explicit Euler at 2 ms from the current alone, as published, and for output error the "
     "coupled response to the current alone. Output error has the arm as it is, (14)–(15): its deflection hangs on the "
@@ -633,12 +653,12 @@ def demo_text(demo: Demo) -> str:
     ]
     for stage, results in demo.results.items():
         best = results["output error"]
-        checked = demo.checked[stage]
-        estimates = {**best.orders, **best.joint_values}
+        checked = demo.validations[stage]
+        estimates = {**best.orders, **best.parameter_values}
         near = sum(abs(v - demo.truth[stage][n]) <= 2 * best.standard_errors[n] for n, v in estimates.items())
-        lines += wrapped(f"Stage {stage}, output error: {checked.verdict}")
-        lines += [f"  {line}" for line in equations_in_words(best.model)]
-        lines += [line for line in behaviour_in_words(best.model) if "mode" in line or "integrates" in line][:3]
+        lines += wrap_text(f"Stage {stage}, output error: {checked.verdict}")
+        lines += [f"  {line}" for line in equation_lines(best.model)]
+        lines += [line for line in behavior_lines(best.model) if "mode" in line or "integrates" in line][:3]
         lines += [f"  {near} of {len(estimates)} numbers within two standard errors of the arm's own", ""]
     outputs = [r.output for stage in demo.rows for r in demo.rows[stage] if r.label == SHOWN_MODELS[0]]
     lines.append(f"{'free run, fit %':<16}" + "".join(f"{o:>16}" for o in outputs))
@@ -658,7 +678,7 @@ def demo_text(demo: Demo) -> str:
         "Fits of pulse means, as in the paper, whose p weighs a prior near zero as well.",
     ]
     said = [w for results in demo.results.values() for w in results["output error"].warnings]
-    lines += concerns_in_words(said, how="-v")
+    lines += finding_lines(said, how="-v")
     others = sum(
         len(r.warnings) for results in demo.results.values() for n, r in results.items() if n != "output error"
     )
@@ -680,7 +700,7 @@ def demo_details(demo: Demo) -> str:
         outputs = dict.fromkeys(r.output for r in rows)
         lines.append(" " * 24 + "".join(f"{o + ' square':>18}{o + ' sine':>16}" for o in outputs))
         lines += fits_text(fits, 24, (18, 16) * len(outputs))
-    lines += ["", NOTE, "", "Which way a link bends: correlation of the deflection with its current"]
+    lines += ["", TABLE_NOTE, "", "Which way a link bends: correlation of the deflection with its current"]
     lines.append(
         " " * 24
         + "".join(f"{words:>26}" for words in ("simulated arm", "(14)–(15) identified", "the same in (22)–(25)"))
@@ -690,7 +710,7 @@ def demo_details(demo: Demo) -> str:
     lines.append("")
     for stage, results in demo.results.items():
         best = results["output error"]
-        estimates = {**best.orders, **(best.joint.coefficients if best.joint is not None else {})}
+        estimates = {**best.orders, **(best.fit.coefficients if best.fit is not None else {})}
         lines.append(f"Stage {stage}, output error: estimate ± standard error (truth of the simulated arm)")
         for n, v in estimates.items():
             lines.append(f"  {n:<8}{v:>12.6g} ± {best.standard_errors[n]:<9.2g} ({demo.truth[stage][n]:.6g})")
@@ -711,15 +731,15 @@ def demo_page(demo: Demo, path: str | os.PathLike[str], *, force: bool = False) 
     """
     boxes = Markup("").join(
         verdict_box(checked.verdict, f"Stage {stage}, output error: ")
-        for stage, checked in demo.checked.items()
+        for stage, checked in demo.validations.items()
         if checked.verdict is not None
     )
-    sections = [_first_section_demo_page(demo)]
+    sections = [_demo_section(demo)]
     for stage, results in demo.results.items():
         best, paper = results["output error"], results["p = 7"]
         compared = {
             "output error, square run": best.comparison,
-            "output error, sine run": demo.checked[stage],
+            "output error, sine run": demo.validations[stage],
             "multi-innovation, p = 7, square run": paper.comparison,
         }
         units = best.model.units
@@ -730,8 +750,8 @@ def demo_page(demo: Demo, path: str | os.PathLike[str], *, force: bool = False) 
             figures.append(convergence_chart(demo.traces[output], title, log_x=False))
         figures.append(derivative_chart(demo.derived[stage]))
         table = paper_table(paper_rows(demo, stage), title=f"Stage {stage}, square current")
-        tables = [*behaviour_tables(best.model), estimates_table(best, demo.truth[stage]), table]
-        whole = stage_section(f"Stage {stage}", best.model, results, tables, figures, NOTE)
+        tables = [*behavior_tables(best.model), estimates_table(best, demo.truth[stage]), table]
+        whole = stage_section(f"Stage {stage}", best.model, results, tables, figures, TABLE_NOTE)
         # What is said of the model that is meant to be used comes first; the paper's methods have the rest.
         shown, left = first_warnings(best.warnings)
         others = grouped_warnings({n: r for n, r in results.items() if n != "output error"})
@@ -745,7 +765,7 @@ def demo_page(demo: Demo, path: str | os.PathLike[str], *, force: bool = False) 
     return write_page(path, title="ftlm demo", sections=sections, lead=lead, force=force, verdict=boxes)
 
 
-def _first_section_demo_page(demo: Demo) -> Section:
+def _demo_section(demo: Demo) -> Section:
     """Fits of all models on the validation run as bars, one chart per output."""
     figures = []
     for stage in demo.rows:
@@ -762,7 +782,7 @@ def _first_section_demo_page(demo: Demo) -> Section:
                     title=f"Fit of the free run of {symbol(output)}",
                     x_label="fit [%]",
                     high=100.0,
-                    width=SMALL,
+                    width=SMALL_WIDTH_PX,
                 )
             )
     return Section("Which model predicts", figures=figures, small=True)

@@ -16,32 +16,32 @@ from ftlm.data.run import Run
 from ftlm.errors import DataError, ModelError
 from ftlm.estimation.genetic import Genetic
 from ftlm.model.model import Model
-from ftlm.progress import left_in_words
-from ftlm.reproduction.claims import Claim, Recomputed, claims
+from ftlm.progress import format_time_left
+from ftlm.reproduction.claims import Claim, ReproductionData, claims
 from ftlm.reproduction.optimizer_comparison import CONTEST_STEP, Panel, panel_of, rivals_lattice, simulated_panel
-from ftlm.reproduction.published_models import Ran, ran
+from ftlm.reproduction.published_models import PrintedModelRun, run_printed_models
 from ftlm.reproduction.published_values import AsPrinted, as_printed
 from ftlm.reproduction.report import reproduction_page
-from ftlm.reproduction.simulated_arm import ARMS, MAIN, STAGES, StageNumber, demo_run
-from ftlm.reproduction.stage_models import Preset, StageWork, Steps, Whole, seconds_of, seconds_of_all
+from ftlm.reproduction.simulated_arm import ARM_VARIANTS, MAIN_ARM, STAGE_NUMBERS, StageNumber, demo_run
+from ftlm.reproduction.stage_models import Preset, StageWork, TotalProgress, WorkerProgress, seconds_of, seconds_of_all
 from ftlm.reproduction.stage_result import TRACE_EVERY, Stage
-from ftlm.structure.order_grid import Lattice
+from ftlm.structure.order_grid import OrderGrid
 from ftlm.utils.files import check_folder, write_atomically
-from ftlm.utils.resources import expected
-from ftlm.utils.validation import check_threads, listed, nearest, real_number, whole_number
+from ftlm.utils.resources import estimate_duration
+from ftlm.utils.validation import check_threads, join_names, nearest, real_number, whole_number
 
 #: Candidates that an order search keeps; the tables need only the best.
-KEEP = 1
+TOP_CANDIDATES = 1
 #: File of the tables, which is always saved.
-TABLES = "tables.json"
+TABLES_FILE = "tables.json"
 #: Name of the given runs in verdicts.
-MEASURED = "as measured"
-ALWAYS_SAVED = ("square.csv", "sine.csv", TABLES)
+MEASURED_LABEL = "as measured"
+ALWAYS_SAVED = ("square.csv", "sine.csv", TABLES_FILE)
 #: Polling interval for Ctrl-C [s].
-LOOK = 0.1
+INTERRUPT_POLL_S = 0.1
 
 
-class Reproduction(Recomputed):
+class Reproduction(ReproductionData):
     """Reproduction of section 5 of the paper.
 
     Parameters
@@ -119,15 +119,15 @@ class Reproduction(Recomputed):
         for name, model in models.items():
             model.save(where / name, force=force)
         text = json.dumps(self.to_dict(), indent=1, ensure_ascii=False, allow_nan=False)
-        write_atomically(where / TABLES, text.encode(), force=force)
-        return [where / name for name in (*runs, *models, TABLES)]
+        write_atomically(where / TABLES_FILE, text.encode(), force=force)
+        return [where / name for name in (*runs, *models, TABLES_FILE)]
 
     def to_dict(self) -> dict[str, Any]:
         """Return all numbers of the tables and the verdicts for JSON."""
         return {
             "runs": [run.name for run in self.runs],
             "simulated": self.simulated,
-            "lattice": {"step": self.lattice.step, "alpha": list(self.lattice.alpha)},
+            "lattice": {"step": self.lattice.increment, "alpha": list(self.lattice.alpha)},
             "claims": [c.to_dict() for c in self.claims],
             "as printed": {o: a.to_dict() for o, a in self.as_printed.items()},
             "printed models run": [r.to_dict() for r in self.ran],
@@ -200,9 +200,9 @@ def reproduce(
         A sine run without a square run, unknown arms, an invalid step or number of records.
     """
     simulated = square is None
-    others, lattice = _others(arms, records), Lattice(step=step)
+    others, lattice = _other_arms(arms, records), OrderGrid(increment=step)
     for each in (step, real_number("rivals_step", rivals_step)):
-        Lattice(step=each).values(flexible_link(stage=1, form="published", coupling="measured", laws=()))
+        OrderGrid(increment=each).values(flexible_link(stage=1, form="published", coupling="measured", laws=()))
     if square is None:
         if sine is not None:
             raise ModelError("a sine run is given without a square run; give both, or neither")
@@ -211,29 +211,31 @@ def reproduce(
     numbers = stages_of(square, sine)
     more = (len(others), records) if simulated else ()
     seconds = seconds_of_all(step, len(numbers), *more, rivals_step=rivals_step)
-    about = left_in_words(expected(seconds, min(check_threads(threads), len(STAGES)))).removesuffix(" left")
+    about = format_time_left(estimate_duration(seconds, min(check_threads(threads), len(STAGE_NUMBERS)))).removesuffix(
+        " left"
+    )
     say(f"this takes {about}")
-    preset = Preset(lattice, KEEP, TRACE_EVERY, alike=True, rivals_step=rivals_step)
-    own = MAIN if simulated else MEASURED
+    preset = Preset(lattice, TOP_CANDIDATES, TRACE_EVERY, common_pulses=True, rivals_step=rivals_step)
+    own = MAIN_ARM if simulated else MEASURED_LABEL
     seeds = [seed + k for k in range(records)]
     run, other = square, sine
 
     def stage_of(number: StageNumber) -> Job:
-        def job(steps: Steps) -> Made:
+        def job(steps: WorkerProgress) -> StageOutcome:
             work = StageWork(number, run, other, preset, threads, say, steps, simulated=simulated)
-            stage = work.reproduced(genetic)
+            stage = work.compute_stage(genetic)
             work.begin(f"stage {number}: the paper's printed models under its own current", "printed")
-            rows = ran(number, threads)
+            rows = run_printed_models(number, threads)
             work.begin(f"stage {number}: verdicts, both ends of K0", "trials")
             panel = panel_of([stage], run, own, seed, threads)
-            return Made(stage, rows, as_printed(stage.outputs), panel, work.notes)
+            return StageOutcome(stage, rows, as_printed(stage.outputs), panel, work.notes)
 
         return job
 
     def panel_on(arm: str, number: StageNumber) -> Job:
-        def job(steps: Steps) -> Panel:
+        def job(steps: WorkerProgress) -> Panel:
             say(f"verdicts: the arm “{arm}”, stage {number}")
-            of_more = seeds[1:] if arm == MAIN else seeds
+            of_more = seeds[1:] if arm == MAIN_ARM else seeds
 
             def begin(name: str) -> None:
                 steps.begin(seconds_of(name, step, rivals_step))
@@ -247,18 +249,18 @@ def reproduce(
                 genetic=genetic,
                 begin=begin,
                 progress=steps,
-                lattice=None if arm == MAIN else rivals_lattice(step, rivals_step),
+                lattice=None if arm == MAIN_ARM else rivals_lattice(step, rivals_step),
             )
 
         return job
 
-    pairs = [(arm, n) for arm in ([MAIN, *others] if simulated else []) for n in numbers]
+    pairs = [(arm, n) for arm in ([MAIN_ARM, *others] if simulated else []) for n in numbers]
     jobs: list[Job] = [*(stage_of(n) for n in numbers), *(panel_on(*pair) for pair in pairs)]
-    ended = side_by_side(jobs, 1 if threads == 1 else len(STAGES), seconds, progress)
-    made: list[Made] = [m for m in ended if isinstance(m, Made)]
+    ended = run_jobs(jobs, 1 if threads == 1 else len(STAGE_NUMBERS), seconds, progress)
+    made: list[StageOutcome] = [m for m in ended if isinstance(m, StageOutcome)]
     panel = Panel()
     for part in (*(m.panel for m in made), *(p for p in ended if isinstance(p, Panel))):
-        panel = panel.beside(part)
+        panel = panel.merge_with(part)
     return Reproduction(
         square,
         sine,
@@ -273,40 +275,40 @@ def reproduce(
 
 
 @dataclass(frozen=True)
-class Made:
+class StageOutcome:
     """Results of one stage of the estimation run."""
 
     stage: Stage
-    rows: list[Ran]
+    rows: list[PrintedModelRun]
     printed: dict[str, AsPrinted]
     panel: Panel
     notes: list[str]
 
 
 #: Job of a worker, called with its progress.
-Job = Callable[[Steps], Made | Panel]
+Job = Callable[[WorkerProgress], StageOutcome | Panel]
 
 
-def _others(arms: Sequence[str] | None, records: int) -> list[str]:
+def _other_arms(arms: Sequence[str] | None, records: int) -> list[str]:
     """Return the arms besides the first."""
     if isinstance(arms, str):
         raise ModelError(f"arms = {arms!r} is a text; give a list of names, such as [{arms!r}]")
     for name in arms or ():
-        if name not in ARMS:
-            raise ModelError(f"arm {name!r} is not known{nearest(name, ARMS)}; use {listed(ARMS)}")
+        if name not in ARM_VARIANTS:
+            raise ModelError(f"arm {name!r} is not known{nearest(name, ARM_VARIANTS)}; use {join_names(ARM_VARIANTS)}")
     if (whole_number(records) or 0) < 1:
         raise ModelError(f"records = {records!r} is no whole number from 1")
-    return [name for name in (ARMS if arms is None else dict.fromkeys(arms)) if name != MAIN]
+    return [name for name in (ARM_VARIANTS if arms is None else dict.fromkeys(arms)) if name != MAIN_ARM]
 
 
-def side_by_side(
+def run_jobs(
     jobs: Sequence[Job], workers: int, seconds: float, progress: Callable[[int, int], None] | None
-) -> list[Made | Panel]:
+) -> list[StageOutcome | Panel]:
     """Run all jobs in parallel and return their results; single-core fits overlap with parallel searches."""
-    stop, whole = threading.Event(), Whole(seconds, progress)
+    stop, whole = threading.Event(), TotalProgress(seconds, progress)
 
-    def done_by(job: Job) -> Made | Panel:
-        steps = Steps(whole, stop)
+    def done_by(job: Job) -> StageOutcome | Panel:
+        steps = WorkerProgress(whole, stop)
         result = job(steps)
         steps.begin(0.0)
         return result
@@ -318,10 +320,10 @@ def side_by_side(
     with ThreadPoolExecutor(workers, thread_name_prefix="ftlm-stage") as pool:
         under_way = [pool.submit(done_by, job) for job in jobs]
         try:
-            done: set[Future[Made | Panel]] = set()
+            done: set[Future[StageOutcome | Panel]] = set()
             # A wait without an end would not be interrupted by Ctrl-C everywhere.
             while len(done) < len(jobs) and not any(f.exception() for f in done):
-                done, _ = wait(under_way, timeout=LOOK, return_when=FIRST_EXCEPTION)
+                done, _ = wait(under_way, timeout=INTERRUPT_POLL_S, return_when=FIRST_EXCEPTION)
         finally:
             stop.set()
             for future in under_way:
@@ -340,7 +342,7 @@ def stages_of(square: Run, sine: Run | None) -> list[StageNumber]:
     DataError
         No complete stage, or a sine run without a signal of one.
     """
-    wanted = {n: (f"I{n}", f"theta{n}1", f"theta{n}2") for n in STAGES}
+    wanted = {n: (f"I{n}", f"theta{n}1", f"theta{n}2") for n in STAGE_NUMBERS}
     found = [n for n, names in wanted.items() if all(s in square.signals for s in names)]
     if not found:
         listed = ", ".join(square.signals)

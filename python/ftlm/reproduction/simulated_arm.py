@@ -11,32 +11,32 @@ from ftlm.arm.flexible_link import Form, link_model
 from ftlm.data.run import Run
 from ftlm.errors import ModelError
 from ftlm.model.model import Model
-from ftlm.rig.arm_parameters import SETS, ArmParameters, StageParameters
+from ftlm.rig.arm_parameters import PARAMETER_SETS, ArmParameters, StageParameters
 from ftlm.rig.recording import record
 
 StageNumber = Literal[1, 2]
-STAGES: tuple[StageNumber, StageNumber] = (1, 2)
+STAGE_NUMBERS: tuple[StageNumber, StageNumber] = (1, 2)
 #: Input shapes of the paper with their current amplitudes [A].
-AMPLITUDES = {"square": 0.3, "sine": 0.6}
+CURRENT_AMPLITUDES_A = {"square": 0.3, "sine": 0.6}
 #: Arm of the demonstration: effective coefficients, fractional damping of the links, linear.
-PARAMETERS = ArmParameters.of("linear")
+DEMO_PARAMETERS = ArmParameters.of("linear")
 #: Default seed of the noise.
-SEED = 1
+DEFAULT_SEED = 1
 
 
-def _whole(stage: StageParameters, *, friction: bool) -> StageParameters:
+def _with_integer_orders(stage: StageParameters, *, friction: bool) -> StageParameters:
     """Return a stage with the maker's integer orders, with or without Coulomb friction."""
     return replace(stage, gamma=1.0, beta=0.0, mu=1.0, coulomb=stage.coulomb if friction else 0.0)
 
 
-def _whole_arm(*, friction: bool, coupling: float) -> ArmParameters:
-    rubbing = SETS["effective"]
+def _integer_order_arm(*, friction: bool, coupling: float) -> ArmParameters:
+    rubbing = PARAMETER_SETS["effective"]
     # Stage 1 of the maker's file has no link damping.
-    first = replace(_whole(rubbing.stage1, friction=friction), d=0.0)
+    first = replace(_with_integer_orders(rubbing.stage1, friction=friction), d=0.0)
     return replace(
-        PARAMETERS,
+        DEMO_PARAMETERS,
         stage1=first,
-        stage2=_whole(rubbing.stage2, friction=friction),
+        stage2=_with_integer_orders(rubbing.stage2, friction=friction),
         coupling=coupling,
         name="whole orders",
     )
@@ -44,18 +44,21 @@ def _whole_arm(*, friction: bool, coupling: float) -> ArmParameters:
 
 #: Arms for verdicts: that of the demonstration, one with Coulomb friction and stage coupling, and both with the maker's
 #: integer orders. Gauges are exact in all; every angle has the same noise.
-ARMS: dict[str, ArmParameters] = {
-    "fractional": PARAMETERS,
+ARM_VARIANTS: dict[str, ArmParameters] = {
+    "fractional": DEMO_PARAMETERS,
     "fractional, friction": replace(
-        PARAMETERS, stage1=SETS["effective"].stage1, stage2=SETS["effective"].stage2, coupling=1.0
+        DEMO_PARAMETERS,
+        stage1=PARAMETER_SETS["effective"].stage1,
+        stage2=PARAMETER_SETS["effective"].stage2,
+        coupling=1.0,
     ),
-    "whole orders": _whole_arm(friction=False, coupling=0.0),
-    "whole orders, friction": _whole_arm(friction=True, coupling=1.0),
+    "whole orders": _integer_order_arm(friction=False, coupling=0.0),
+    "whole orders, friction": _integer_order_arm(friction=True, coupling=1.0),
 }
 #: Key of the demonstration's arm.
-MAIN = "fractional"
+MAIN_ARM = "fractional"
 #: Guess of the paper's arm: integer orders, friction, uncoupled stages as in its equations.
-PAPERS_ARM = _whole_arm(friction=True, coupling=0.0)
+PAPERS_ARM = _integer_order_arm(friction=True, coupling=0.0)
 
 
 def demo_plant(stage: int, *, form: Form = "lagrange") -> Model:
@@ -83,7 +86,7 @@ def demo_plant(stage: int, *, form: Form = "lagrange") -> Model:
 
 def parameters_of(stage: int) -> StageParameters:
     """Parameters of one stage of the demonstration's arm."""
-    return PARAMETERS.stage1 if stage == 1 else PARAMETERS.stage2
+    return DEMO_PARAMETERS.stage1 if stage == 1 else DEMO_PARAMETERS.stage2
 
 
 def truth_of(stage: int) -> dict[str, float]:
@@ -100,8 +103,8 @@ def demo_run(
     duration: float = 10.0,
     step: float = 0.002,
     noise: float = 1e-4,
-    seed: int = SEED,
-    parameters: ArmParameters = PARAMETERS,
+    seed: int = DEFAULT_SEED,
+    parameters: ArmParameters = DEMO_PARAMETERS,
 ) -> Run:
     """Run of the virtual rig under the paper's inputs: linear arm with encoders, and noise on every angle.
 
@@ -133,18 +136,18 @@ def demo_run(
     """
     if not (np.isfinite(noise) and noise >= 0):
         raise ModelError(f"noise = {noise} rad is not a non-negative number")
-    if shape not in AMPLITUDES:
+    if shape not in CURRENT_AMPLITUDES_A:
         raise ModelError(f"shape = {shape!r} is not known; use 'square' or 'sine'")
     recorded = record(
         input=shape,
-        amplitude=AMPLITUDES[shape],
+        amplitude=CURRENT_AMPLITUDES_A[shape],
         duration=duration,
         limit=duration,
         rate=1.0 / step,
         seed=seed,
         parameters=parameters,
     )
-    rng = np.random.default_rng([seed, list(AMPLITUDES).index(shape)])
+    rng = np.random.default_rng([seed, list(CURRENT_AMPLITUDES_A).index(shape)])
     angles = [f"theta{stage}{k}" for stage in (1, 2) for k in (1, 2)]
     return Run.from_arrays(
         step=step,
@@ -155,7 +158,7 @@ def demo_run(
     )
 
 
-def thinned(run: Run, every: int) -> Run:
+def decimate_run(run: Run, every: int) -> Run:
     """Decimate a run; zero-order-hold inputs are averaged over each interval, which preserves their effect."""
     rows = run.length // every
     data = {}

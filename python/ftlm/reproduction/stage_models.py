@@ -10,29 +10,36 @@ from typing import Any
 import numpy as np
 
 from ftlm import _core
-from ftlm.arm.flexible_link import flexible_link, link_model, order_law, whole_order
+from ftlm.arm.flexible_link import flexible_link, integer_order, link_model, order_law
 from ftlm.data.run import Run
 from ftlm.errors import ConvergenceError, ModelError
 from ftlm.estimation.cost_surface import output_error_landscape
-from ftlm.estimation.estimators import by_output_error
+from ftlm.estimation.estimators import estimate_output_error
 from ftlm.estimation.free_parameters import FreeProblem
 from ftlm.estimation.genetic import Genetic, GeneticRun
-from ftlm.estimation.identify import identify, judged
-from ftlm.estimation.linear import Trace, multi_innovation_trace
+from ftlm.estimation.identify import assess_fit, identify
+from ftlm.estimation.linear import MultiInnovationTrace, multi_innovation_trace
 from ftlm.estimation.result import Identification, Task
 from ftlm.model.model import Model
 from ftlm.order_search.result import SearchResult
 from ftlm.order_search.search import search_orders
 from ftlm.plot.comparison_charts import pulse_times
-from ftlm.progress import Course, Stoppable
+from ftlm.progress import ShareTracker, Stoppable
 from ftlm.reproduction import published_values as printed
-from ftlm.reproduction.optimizer_comparison import CONTEST_STEP, like_for_like, rivals_lattice, seeds_for
-from ftlm.reproduction.simulated_arm import StageNumber, thinned
-from ftlm.reproduction.stage_result import PAIR, WEAK_PRIOR, Candidate, Derived, Rival, Stage
+from ftlm.reproduction.optimizer_comparison import CONTEST_STEP, compare_optimizers, rivals_lattice, seeds_for
+from ftlm.reproduction.simulated_arm import StageNumber, decimate_run
+from ftlm.reproduction.stage_result import (
+    MULTI_INNOVATION_LABELS,
+    WEAK_PRIOR,
+    Candidate,
+    DroppedDerivative,
+    Rival,
+    Stage,
+)
 from ftlm.simulation.discretization import default_m, prepare
 from ftlm.simulation.initial_conditions import starts_at_rest
 from ftlm.simulation.simulate import explicit_euler
-from ftlm.structure.order_grid import Lattice
+from ftlm.structure.order_grid import OrderGrid
 from ftlm.structure.structure import Structure
 from ftlm.svg.heat_map import Landscape
 from ftlm.utils.validation import check_threads
@@ -41,7 +48,7 @@ from ftlm.validation.comparison import Comparison, compare_means, metrics
 #: Processor time of each step of a stage on one core of the reference machine of base/pace.py [s]: searches with the
 #: paper's increment, optimizers with theirs, fits on the virtual rig's 5000 samples. These are three quarters of the
 #: measured times, which included other load.
-STEPS: Mapping[str, float] = {
+STEP_DURATIONS_S: Mapping[str, float] = {
     "whole orders": 1.5,
     "search": 1.4,
     "instrumental": 2.0,
@@ -58,9 +65,9 @@ STEPS: Mapping[str, float] = {
 
 
 #: Candidates of the optimizer comparison at its default increment.
-CANDIDATES = 3800
+CONTEST_CANDIDATES = 3800
 #: Number of executions of each step, for a stage of the estimation run and for a stage of another arm.
-OF_STAGE = {
+STEPS_PER_STAGE = {
     "whole orders": 1,
     "search": 5,
     "instrumental": 1,
@@ -73,30 +80,30 @@ OF_STAGE = {
     "printed": 1,
     "trials": 1,
 }
-OF_ARM = {"trials": 0, "rivals": 2, "freed": 1}
+STEPS_PER_ARM = {"trials": 0, "rivals": 2, "freed": 1}
 
 
 def seconds_of(step: str, lattice_step: float, rivals_step: float = CONTEST_STEP) -> float:
     """Processor time of a step [s]; searches grow with the inverse fourth power of the increment."""
     if step == "rivals":
-        candidates = round(CANDIDATES * (CONTEST_STEP / max(lattice_step, rivals_step)) ** 4)
+        candidates = round(CONTEST_CANDIDATES * (CONTEST_STEP / max(lattice_step, rivals_step)) ** 4)
         evaluations = candidates * len(seeds_for(candidates))
-        return STEPS[step] * evaluations / (CANDIDATES * len(seeds_for(CANDIDATES)))
-    return STEPS[step] * float((0.05 / lattice_step) ** 4 if step == "search" else 1.0)
+        return STEP_DURATIONS_S[step] * evaluations / (CONTEST_CANDIDATES * len(seeds_for(CONTEST_CANDIDATES)))
+    return STEP_DURATIONS_S[step] * float((0.05 / lattice_step) ** 4 if step == "search" else 1.0)
 
 
 def seconds_of_all(
     lattice_step: float, stages: int, arms: int = 0, records: int = 1, *, rivals_step: float = CONTEST_STEP
 ) -> float:
     """Processor time of the whole reproduction [s]."""
-    counts = dict(OF_STAGE)
-    for step, count in OF_ARM.items():
+    counts = dict(STEPS_PER_STAGE)
+    for step, count in STEPS_PER_ARM.items():
         counts[step] = counts.get(step, 0) + arms * count
     counts["trials"] += (arms + 1) * records - 1
     return stages * sum(count * seconds_of(step, lattice_step, rivals_step) for step, count in counts.items())
 
 
-class Whole:
+class TotalProgress:
     """Share of all completed work, reported by several workers to one receiver.
 
     Parameters
@@ -108,29 +115,29 @@ class Whole:
     """
 
     def __init__(self, seconds: float, told: Callable[[int, int], None] | None) -> None:
-        self._seconds, self._course, self._lock = max(seconds, 1e-9), Course(told), threading.Lock()
+        self._seconds, self._course, self._lock = max(seconds, 1e-9), ShareTracker(told), threading.Lock()
         self._done = 0.0
         self._under_way: dict[object, float] = {}
 
-    def at(self, worker: object, seconds: float) -> None:
+    def report_step(self, worker: object, seconds: float) -> None:
         """Report the progress of a worker within its step."""
         with self._lock:
             self._under_way[worker] = seconds
-            self._course.at((self._done + sum(self._under_way.values())) / self._seconds)
+            self._course.advance_to((self._done + sum(self._under_way.values())) / self._seconds)
 
-    def ended(self, worker: object, seconds: float) -> None:
+    def finish_step(self, worker: object, seconds: float) -> None:
         """Report that a worker has finished a step."""
         with self._lock:
             self._under_way.pop(worker, None)
             self._done += seconds
-            self._course.at((self._done + sum(self._under_way.values())) / self._seconds)
+            self._course.advance_to((self._done + sum(self._under_way.values())) / self._seconds)
 
     def end(self) -> None:
         """Report that all work is finished, including skipped steps."""
-        self._course.at(1.0)
+        self._course.advance_to(1.0)
 
 
-class Steps(Stoppable):
+class WorkerProgress(Stoppable):
     """Progress of one worker through its steps; searches and fits call it with (done, total).
 
     Parameters
@@ -141,14 +148,14 @@ class Steps(Stoppable):
         Event that ends the work with KeyboardInterrupt at its next report.
     """
 
-    def __init__(self, whole: Whole, stop: threading.Event) -> None:
+    def __init__(self, whole: TotalProgress, stop: threading.Event) -> None:
         super().__init__(None, stop)
         self._whole, self._step, self._within = whole, 0.0, 0.0
 
     def begin(self, seconds: float) -> None:
         """Finish the previous step, and start one with this processor time."""
         super().__call__(0, 0)
-        self._whole.ended(self, self._step)
+        self._whole.finish_step(self, self._step)
         self._step, self._within = seconds, 0.0
 
     def __call__(self, done: int, total: int, pruned: int | None = None) -> None:
@@ -157,20 +164,20 @@ class Steps(Stoppable):
         share = done / max(total, 1)
         if share < self._within:
             self._step, passed = 0.5 * self._step, 0.5 * self._step
-            self._whole.ended(self, passed)
+            self._whole.finish_step(self, passed)
         self._within = share
-        self._whole.at(self, self._step * share)
+        self._whole.report_step(self, self._step * share)
 
 
 #: Radius [increments] of the search by instrumental variables around the orders of least squares; every candidate needs
 #: several simulations.
-AROUND = 2
+INSTRUMENTAL_RADIUS_STEPS = 2
 #: Runs with more samples than the first number are decimated to at most the second for joint fits, whose cost grows
 #: with the samples. The arm's modes are two decades below the reduced rate.
 MOST_ROWS, JOINT_ROWS = 6000, 2500
 #: Increment of a first search on finer grids, among orders of multi-innovation that no bound excludes, and number of
 #: the best candidates around which the grid's own increment follows.
-COARSE, BEST = 0.1, 10
+COARSE_INCREMENT, REFINED_CANDIDATES = 0.1, 10
 #: Samples of fits with integer orders, whose systematic residuals do not shrink with more samples.
 WHOLE_ROWS = 1250
 
@@ -179,12 +186,12 @@ WHOLE_ROWS = 1250
 class Preset:
     """Settings that differ between the reproduction and the demonstration."""
 
-    lattice: Lattice
-    keep: int  # rows of an order search
+    lattice: OrderGrid
+    top: int  # rows of an order search
     trace_every: int  # steps between two points of a convergence curve
     # Whether all models are judged alike, on the paper's pulses (a sum over other pulses is another number) and from
     # the currents alone as well, or each as its method worked.
-    alike: bool
+    common_pulses: bool
     rivals_step: float = CONTEST_STEP  # of the lattice that the rivals are held against
 
 
@@ -222,16 +229,16 @@ class StageWork:
     def begin(self, words: str, step: str) -> None:
         """Announce the next step and its share of the whole."""
         self.say(words)
-        if isinstance(self.progress, Steps):
-            self.progress.begin(seconds_of(step, self.preset.lattice.step, self.preset.rivals_step))
+        if isinstance(self.progress, WorkerProgress):
+            self.progress.begin(seconds_of(step, self.preset.lattice.increment, self.preset.rivals_step))
 
-    def reproduced(self, genetic: Genetic | None) -> Stage:
+    def compute_stage(self, genetic: Genetic | None) -> Stage:
         """Compute all results of section 5 for a stage."""
         exact = self.manual("integer, exact")
-        candidates = {"integer, Euler": self.stepped("integer, Euler", exact), "integer, exact": exact}
+        candidates = {"integer, Euler": self.euler_candidate("integer, Euler", exact), "integer, exact": exact}
         candidates["integer, identified"] = self.best(
             "integer, identified",
-            self.coupled.with_orders({n: whole_order(n) for n in self.coupled.order_names}),
+            self.coupled.with_orders({n: integer_order(n) for n in self.coupled.order_names}),
             "whole orders",
             WHOLE_ROWS,
         )
@@ -242,8 +249,8 @@ class StageWork:
             "published, output error", self.published, near=candidates["output error"].model
         )
         self.begin(f"stage {self.number}: convergence", "traces")
-        traces: dict[str, dict[int, Trace]] = {}
-        weak: dict[str, dict[int, Trace]] = {}
+        traces: dict[str, dict[int, MultiInnovationTrace]] = {}
+        weak: dict[str, dict[int, MultiInnovationTrace]] = {}
         if prepare([self.on], self.measured, None, power_of_two=True)[0].initial == "rest":
             traces = self.traces(candidates)
             # All p at the orders of the largest.
@@ -266,20 +273,20 @@ class StageWork:
             weak,
             ends,
             self.rivals(genetic),
-            self.near(),
+            self.printed_order_candidate(),
             self.by_equation(),
-            self.derived(candidates["output error"].model),
+            self.dropped_derivative(candidates["output error"].model),
             self.landscape(candidates["output error"].result),
         )
 
     def landscape(self, result: Identification | None) -> Landscape | None:
         """Cost surface around the joint fit over its two most correlated orders."""
         self.begin(f"stage {self.number}: the landscape of its orders", "landscape")
-        return None if result is None or result.joint is None else output_error_landscape(result)
+        return None if result is None or result.fit is None else output_error_landscape(result)
 
     def candidate(self, label: str, model: Model, result: Identification | None = None) -> Candidate:
         """Return a model with both errors on both runs, and its simulation from the currents alone."""
-        alike = self.preset.alike
+        alike = self.preset.common_pulses
         m = default_m([self.on], power_of_two=True) if alike else model.m
         model = model if model.m == m else replace(model, m=m)
         estimation = compare_means(model, self.on)
@@ -291,7 +298,7 @@ class StageWork:
             alone = {run.name: compare_means(coupled, run).output_error for run in runs}
         return Candidate(label, model, estimation, validation, alone, result)
 
-    def identified(self, label: str, run: Run, structure: Structure, **options: Any) -> Candidate:
+    def identify_candidate(self, label: str, run: Run, structure: Structure, **options: Any) -> Candidate:
         """Identify a candidate by one of the methods."""
         result = identify(run, structure, threads=self.threads, progress=self.progress, **options)
         return self.candidate(label, result.model, result)
@@ -300,7 +307,7 @@ class StageWork:
         """Return the maker's integer-order model."""
         return self.candidate(label, link_model(stage=self.number, form="published"))
 
-    def stepped(self, label: str, exact: Candidate) -> Candidate:
+    def euler_candidate(self, label: str, exact: Candidate) -> Candidate:
         """Return the same model simulated by explicit Euler, as in the paper."""
         on = self._by_euler(exact.model, self.on, exact.estimation)
         alone = {self.on.name: on.output_error}
@@ -318,7 +325,7 @@ class StageWork:
             with np.errstate(over="ignore", invalid="ignore"):
                 finite = bool(np.all(np.isfinite(samples)))
             means[name] = _core.pulse_means(samples, exact.m, False) if finite else np.full(exact.m, np.inf)
-        if self.preset.alike:
+        if self.preset.common_pulses:
             errors = {n: metrics(exact.measured[n][0], mean) for n, mean in means.items()}
         else:
             errors = {n: metrics(run[n], samples) for n, samples in responses.items()}
@@ -339,16 +346,16 @@ class StageWork:
         found = {}
         for label, options in kinds.items():
             self.begin(f"stage {self.number}: orders on the lattice, {label}", "search")
-            if self.preset.alike:
-                found[label] = self.searched(label, self.preset.lattice, **options)
+            if self.preset.common_pulses:
+                found[label] = self.search_candidate(label, self.preset.lattice, **options)
                 continue
             method = {"method": options["coefficients"], **{n: v for n, v in options.items() if n != "coefficients"}}
-            found[label] = self.identified(
-                label, self.on, self.measured, lattice=self.preset.lattice, keep=self.preset.keep, **method
+            found[label] = self.identify_candidate(
+                label, self.on, self.measured, lattice=self.preset.lattice, keep=self.preset.top, **method
             )
         return found
 
-    def searched(self, label: str, lattice: Lattice, **options: Any) -> Candidate:
+    def search_candidate(self, label: str, lattice: OrderGrid, **options: Any) -> Candidate:
         """Return the best orders of each equation by itself, without the statistics of an identification."""
         orders: dict[str, float] = {}
         coefficients: dict[str, float] = {}
@@ -363,44 +370,44 @@ class StageWork:
         about = {"origin": label, "run": self.on.name}
         return self.candidate(label, Model(known, orders=orders, units=units, about=about))
 
-    def _best_orders(self, single: Structure, own: Lattice, options: Mapping[str, Any]) -> SearchResult:
+    def _best_orders(self, single: Structure, own: OrderGrid, options: Mapping[str, Any]) -> SearchResult:
         """Return the best candidate of an order grid.
 
         With K0 = 1 a deflection hardly moves. The errors of all candidates are close to those of a zero output, so no
         bound excludes any, and each would have to be simulated completely.
         """
 
-        def searched(lattice: Lattice, keep: int) -> SearchResult:
+        def run_search(lattice: OrderGrid, keep: int) -> SearchResult:
             return search_orders(
                 self.on, single, lattice, keep=keep, threads=self.threads, progress=self.progress, **options
             )
 
         own_terms = sum(t.signal == single.outputs[0] for t in single.equations[0].terms)
         heavy = own_terms > 1 and options.get("coefficients") == "multi-innovation"
-        if not (heavy and own.step < COARSE and not own.orders):
-            return searched(own, 1)
+        if not (heavy and own.increment < COARSE_INCREMENT and not own.orders):
+            return run_search(own, 1)
         ends = [
-            searched(replace(own, orders=around(row.orders, own, single)), 1)
-            for row in searched(replace(own, step=COARSE), BEST).table
+            run_search(replace(own, orders=grid_values_around(row.orders, own, single)), 1)
+            for row in run_search(replace(own, increment=COARSE_INCREMENT), REFINED_CANDIDATES).table
         ]
         return min(ends, key=lambda end: end.score)
 
     def instrumental(self, start: Candidate) -> Candidate:
         """Search by instrumental variables on the part of the grid around the orders of another model."""
         self.begin(f"stage {self.number}: orders by instrumental variables", "instrumental")
-        step, top = self.preset.lattice.step, self.preset.lattice.alpha[1]
+        step, top = self.preset.lattice.increment, self.preset.lattice.alpha[1]
         axes = {}
         for name, value in start.model.orders.items():
-            steps = 1 if name.startswith("alpha") else AROUND
+            steps = 1 if name.startswith("alpha") else INSTRUMENTAL_RADIUS_STEPS
             near = [round(value + k * step, 9) for k in range(-steps, steps + 1)]
             axes[name] = [v for v in near if 0 <= v <= top]
-        return self.identified(
+        return self.identify_candidate(
             "instrumental variables",
             self.on,
             self.measured,
             method="instrumental-variables",
-            lattice=Lattice(step=step, orders=axes),
-            keep=self.preset.keep,
+            lattice=OrderGrid(increment=step, orders=axes),
+            keep=self.preset.top,
         )
 
     def joint(
@@ -411,7 +418,7 @@ class StageWork:
         self.begin(f"stage {self.number}: {words}", step)
         run = self.on
         if rows is not None and run.length >= 2 * rows:
-            run = thinned(run, run.length // rows)
+            run = decimate_run(run, run.length // rows)
         elif run.length > MOST_ROWS:
             every = -(-run.length // JOINT_ROWS)
             self.notes.append(
@@ -419,19 +426,19 @@ class StageWork:
                 f"{every * run.step:.6g} s apart, with the means of held currents in between; all models are compared "
                 "on the same block pulses of the whole run"
             )
-            run = thinned(run, every)
+            run = decimate_run(run, every)
         if near is None:
-            return self.identified(label, run, structure)
+            return self.identify_candidate(label, run, structure)
         # Of the published form standard errors alone are looked at. Its automatic starts end in optima of their own,
         # which rounding chooses between; the numbers of (14)-(15) lead to the one that leaves the noise.
         begin = self.published_values(near)
         if not self.simulated:
             try:
-                return self.identified(label, run, structure, intervals="quadratic", start=begin)
+                return self.identify_candidate(label, run, structure, intervals="quadratic", start=begin)
             except ModelError:
                 # Out of the bounds that (22)-(25) have.
-                return self.identified(label, run, structure, intervals="quadratic")
-        fit = by_output_error(
+                return self.identify_candidate(label, run, structure, intervals="quadratic")
+        fit = estimate_output_error(
             Task((run,), structure),
             None,
             check_threads(self.threads),
@@ -440,7 +447,7 @@ class StageWork:
             begin=begin,
             alone=True,
         )
-        result = judged(fit)
+        result = assess_fit(fit)
         return self.candidate(label, result.model, result)
 
     def best(
@@ -462,14 +469,16 @@ class StageWork:
             )
         return self.joint(label, replace(structure, coupling="measured"), f"{words}by output error", rows, near)
 
-    def traces(self, candidates: Mapping[str, Candidate], prior: float = 1.0) -> dict[str, dict[int, Trace]]:
+    def traces(
+        self, candidates: Mapping[str, Candidate], prior: float = 1.0
+    ) -> dict[str, dict[int, MultiInnovationTrace]]:
         """Convergence of every equation with every p, at the orders of the model of that p."""
         return {
             output: {p: self._trace(output, candidates[f"p = {p}"], p, prior) for p in printed.INNOVATION_LENGTHS}
             for output in self.measured.outputs
         }
 
-    def _trace(self, output: str, at: Candidate, p: int, prior: float) -> Trace:
+    def _trace(self, output: str, at: Candidate, p: int, prior: float) -> MultiInnovationTrace:
         single = self.measured.equation(output)
         single = single.with_orders({n: at.model.orders[n] for n in single.order_names})
         return multi_innovation_trace(
@@ -478,13 +487,15 @@ class StageWork:
 
     def rivals(self, genetic: Genetic | None) -> dict[str, Rival]:
         """Compare the optimizers on each equation at equal budgets."""
-        lattice = rivals_lattice(self.preset.lattice.step, self.preset.rivals_step)
+        lattice = rivals_lattice(self.preset.lattice.increment, self.preset.rivals_step)
         found = {}
         for output in self.measured.outputs:
             single = self.measured.equation(output)
             self.begin(f"stage {self.number}: the rivals on {output}", "rivals")
             try:
-                made = like_for_like(self.on, single, lattice, genetic, threads=self.threads, progress=self.progress)
+                made = compare_optimizers(
+                    self.on, single, lattice, genetic, threads=self.threads, progress=self.progress
+                )
             except ModelError as error:
                 self.notes.append(f"Tables 6 and 7 and Figure 11 are left out: {error}")
                 return {}
@@ -497,26 +508,28 @@ class StageWork:
             ends: dict[str, GeneticRun | SearchResult] = {
                 "genetic": made.genetic,
                 "differential evolution": made.evolution,
-                **dict(zip(PAIR, made.lattice.values(), strict=True)),
+                **dict(zip(MULTI_INNOVATION_LABELS, made.lattice.values(), strict=True)),
             }
-            candidates = {n: self.candidate(n, _known(single, end.orders, end.coefficients)) for n, end in ends.items()}
+            candidates = {
+                n: self.candidate(n, _known_model(single, end.orders, end.coefficients)) for n, end in ends.items()
+            }
             found[output] = Rival(
-                made.candidates, lattice.step, made.settings.population, made.genetic, made.evolution, candidates
+                made.candidates, lattice.increment, made.settings.population, made.genetic, made.evolution, candidates
             )
         return found
 
-    def near(self) -> Candidate:
+    def printed_order_candidate(self) -> Candidate:
         """Return the model with the printed orders and least-squares coefficients on this run."""
         orders: dict[str, float] = {}
         for output in self.measured.outputs:
             orders |= printed.last_orders(output)
-        axes = Lattice(step=self.preset.lattice.step, orders={n: [v] for n, v in orders.items()})
-        return self.searched("printed orders", axes, coefficients="least-squares")
+        axes = OrderGrid(increment=self.preset.lattice.increment, orders={n: [v] for n, v in orders.items()})
+        return self.search_candidate("printed orders", axes, coefficients="least-squares")
 
     def by_equation(self) -> Candidate:
         """Return the least-squares model with the orders of the smallest equation error."""
         self.begin(f"stage {self.number}: orders by the equation error", "equation")
-        return self.searched(
+        return self.search_candidate(
             "smallest equation error",
             self.preset.lattice,
             coefficients="least-squares",
@@ -550,13 +563,13 @@ class StageWork:
         free = FreeProblem.of(replace(self.published, initial="rest")).names
         return {n: v for n, v in known.items() if n in free} | {f"r{self.number}": -known[d] / known[h]}
 
-    def derived(self, model: Model) -> Derived:
+    def dropped_derivative(self, model: Model) -> DroppedDerivative:
         """Compare the deflection by (14)-(15) with that by (22)-(25) at equal parameters."""
         output, other = self.measured.outputs[1], self.in_published_form(model)
         whole, published = (compare_means(m, self.on) for m in (model, other))
         drive = f"I{self.number}"
         current = _core.pulse_means(self.on[drive], whole.m, self.on.intersample[drive] == "zoh")
-        return Derived(
+        return DroppedDerivative(
             output,
             order_law(self.number, "derived")["input"].at(other.orders),
             pulse_times(whole),
@@ -567,12 +580,12 @@ class StageWork:
         )
 
 
-def around(orders: Mapping[str, float], lattice: Lattice, single: Structure) -> dict[str, list[float]]:
+def grid_values_around(orders: Mapping[str, float], lattice: OrderGrid, single: Structure) -> dict[str, list[float]]:
     """Grid values less than two coarse increments away from these orders."""
     values = lattice.values(single)
-    return {n: [v for v in values[n] if abs(v - at) < 2 * COARSE - 1e-9] for n, at in orders.items()}
+    return {n: [v for v in values[n] if abs(v - at) < 2 * COARSE_INCREMENT - 1e-9] for n, at in orders.items()}
 
 
-def _known(item: Structure, orders: Mapping[str, float], coefficients: Mapping[str, float]) -> Model:
+def _known_model(item: Structure, orders: Mapping[str, float], coefficients: Mapping[str, float]) -> Model:
     """Return a model of one equation with given parameters."""
     return Model(item.with_orders(orders).with_coefficients(coefficients), orders=dict(orders))

@@ -8,7 +8,7 @@ from typing import Any
 import numpy as np
 
 from ftlm.estimation.genetic import GeneticRun
-from ftlm.estimation.linear import Trace
+from ftlm.estimation.linear import MultiInnovationTrace
 from ftlm.estimation.result import Identification
 from ftlm.model.model import Model
 from ftlm.reproduction.simulated_arm import StageNumber
@@ -21,9 +21,9 @@ TRACE_EVERY = 2
 #: Prior covariance so large that the data alone decide.
 WEAK_PRIOR = 1e10
 #: Both values of K0: the paper's identity, and a weak prior.
-PRIORS = (1.0, WEAK_PRIOR)
+PRIOR_COVARIANCES = (1.0, WEAK_PRIOR)
 #: Labels of multi-innovation in the optimizer comparison, by K0.
-PAIR = ("p = 7", "p = 7, weak prior")
+MULTI_INNOVATION_LABELS = ("p = 7", "p = 7, weak prior")
 #: Highest orders of the optimizer comparison: they contain those printed for both methods, and all candidates can be
 #: evaluated.
 RIVAL_ALPHA = (1.95, 2.0)
@@ -121,7 +121,7 @@ class Rival:
 
 
 @dataclass(frozen=True)
-class Derived:
+class DroppedDerivative:
     """Effect of the derivative of the current that (19) drops on the simulated deflection, at equal parameters."""
 
     output: str
@@ -171,13 +171,13 @@ class Stage:
 
     number: StageNumber
     candidates: dict[str, Candidate]
-    traces: dict[str, dict[int, Trace]]
-    weak_traces: dict[str, dict[int, Trace]]
+    traces: dict[str, dict[int, MultiInnovationTrace]]
+    weak_traces: dict[str, dict[int, MultiInnovationTrace]]
     weak: dict[str, dict[int, dict[str, float]]]
     rivals: dict[str, Rival]
     near: Candidate
     by_equation: Candidate
-    derived: Derived
+    derived: DroppedDerivative
     landscape: Landscape | None
 
     @property

@@ -10,25 +10,42 @@ from typing import Any
 import numpy as np
 from markupsafe import Markup
 
-from ftlm.arm.flexible_link import PARAMETERS
+from ftlm.arm.flexible_link import PARAMETER_SETS
 from ftlm.errors import ModelError
 from ftlm.model.model import Model
 from ftlm.reproduction import published_values as printed
-from ftlm.reproduction.claims import Recomputed, printed_saturation, table_3_coefficients
-from ftlm.reproduction.published_values import COEFFICIENTS, ORDERS, READINGS, implied_spreads
-from ftlm.reproduction.stage_result import PAIR, PRIORS, RIVAL_ALPHA, WEAK_PRIOR, Candidate, Stage
+from ftlm.reproduction.claims import ReproductionData, printed_saturation, table_3_coefficients
+from ftlm.reproduction.published_values import COEFFICIENT_LETTERS, ORDER_LETTERS, TERM_INTERPRETATIONS, implied_spreads
+from ftlm.reproduction.stage_result import (
+    MULTI_INNOVATION_LABELS,
+    PRIOR_COVARIANCES,
+    RIVAL_ALPHA,
+    WEAK_PRIOR,
+    Candidate,
+    Stage,
+)
 from ftlm.structure.equation import Equation
 from ftlm.svg.html_page import NOT_IN_MODEL, Table
-from ftlm.utils.formatting import DIGITS, DIVERGED, SUPERSCRIPTS, Cell, Exact, number, shortened, symbol, symbol_html
+from ftlm.utils.formatting import (
+    DIVERGED_TEXT,
+    SIGNIFICANT_DIGITS,
+    SUPERSCRIPT_DIGITS,
+    Cell,
+    Exact,
+    number,
+    symbol,
+    symbol_html,
+    truncate_text,
+)
 from ftlm.validation.comparison import Comparison, Metrics
 
 #: Order of each coefficient's term in the paper's equations (22)-(25).
 ORDER_OF = {"a": "beta", "b": "gamma", "d": "mu"}
 #: Heads of the columns of parameters and criteria, and groups of the parameter columns.
-ORDER_HEADS = tuple(map(symbol_html, ORDERS))
-HEADS = (*ORDER_HEADS, *map(symbol_html, COEFFICIENTS))
-CRITERIA = ("error (45)", "RMSE", "NR")
-GROUPS = (("", 1), ("orders", 4), ("coefficients", 4))
+ORDER_HEADS = tuple(map(symbol_html, ORDER_LETTERS))
+NUMBER_HEADS = (*ORDER_HEADS, *map(symbol_html, COEFFICIENT_LETTERS))
+CRITERION_HEADS = ("error (45)", "RMSE", "NR")
+COLUMN_GROUPS = (("", 1), ("orders", 4), ("coefficients", 4))
 
 
 @dataclass(frozen=True)
@@ -67,7 +84,7 @@ def letters_of(item: Equation) -> tuple[dict[str, float], dict[str, float]]:
     orders, coefficients = {"alpha": item.order.constant}, {}
     for term in item.terms:
         letter = letter_of(term.name or "")
-        if letter in COEFFICIENTS:
+        if letter in COEFFICIENT_LETTERS:
             coefficients[letter] = float(term.coefficient) + 0.0
         if letter in ORDER_OF:
             orders[ORDER_OF[letter]] = term.order.constant
@@ -81,7 +98,10 @@ def four_digits(orders: Mapping[str, float]) -> dict[str, float]:
 
 def number_cells(orders: Mapping[str, float], coefficients: Mapping[str, float]) -> list[Cell]:
     """Cells under `NUMBER_HEADS`: orders in full, coefficients as estimates."""
-    return [*(Exact(orders[n]) if n in orders else None for n in ORDERS), *map(coefficients.get, COEFFICIENTS)]
+    return [
+        *(Exact(orders[n]) if n in orders else None for n in ORDER_LETTERS),
+        *map(coefficients.get, COEFFICIENT_LETTERS),
+    ]
 
 
 def criteria_cells(figures: Metrics | None) -> list[Cell]:
@@ -130,52 +150,56 @@ def paper_table(rows: Sequence[PaperRow], *, title: str = "Identified models") -
     ]
     return Table(
         title,
-        ("model", *HEADS, *CRITERIA, *CRITERIA),
+        ("model", *NUMBER_HEADS, *CRITERION_HEADS, *CRITERION_HEADS),
         cells,
-        groups=(*GROUPS, ("equation error", 3), ("output error (free run)", 3)),
+        groups=(*COLUMN_GROUPS, ("equation error", 3), ("output error (free run)", 3)),
         headings={i: symbol_html(output) for i, output in _beginnings(rows).items()},
     )
 
 
 #: Column widths of the text: label, four orders, four coefficients, twice error, RMSE, NR. Together 119 of 120.
-_LABEL, _TEXT_WIDTHS = 17, (5,) * 4 + (9,) * 4 + (8, 8, 7) * 2
+_LABEL_WIDTH, _TEXT_WIDTHS = 17, (5,) * 4 + (9,) * 4 + (8, 8, 7) * 2
 
 
 def paper_table_text(rows: Sequence[PaperRow]) -> str:
     """Return the same table as text of 120 columns; numbers lose digits in narrow columns."""
-    heads = [*map(symbol, (*ORDERS, *COEFFICIENTS)), *("error", "RMSE", "NR") * 2]
-    left, right = sum(_TEXT_WIDTHS[:8]) + _LABEL, sum(_TEXT_WIDTHS[8:11])
+    heads = [*map(symbol, (*ORDER_LETTERS, *COEFFICIENT_LETTERS)), *("error", "RMSE", "NR") * 2]
+    left, right = sum(_TEXT_WIDTHS[:8]) + _LABEL_WIDTH, sum(_TEXT_WIDTHS[8:11])
     groups = (f" {words} ".center(right - 1, "-").rjust(right) for words in ("equation error", "free run"))
     lines = [
         " " * left + "".join(groups),
-        "model".ljust(_LABEL) + "".join(h.rjust(w) for h, w in zip(heads, _TEXT_WIDTHS, strict=True)),
+        "model".ljust(_LABEL_WIDTH) + "".join(h.rjust(w) for h, w in zip(heads, _TEXT_WIDTHS, strict=True)),
     ]
     starts, infinite = _beginnings(rows), False
     for i, (label, *cells) in enumerate(paper_table(rows).rows):
         if i in starts:
             lines.append(symbol(starts[i]))
-        numbers = "".join(_fitted(v, width - 1).rjust(width) for v, width in zip(cells, _TEXT_WIDTHS, strict=True))
-        lines.append(f"  {shortened(str(label), _LABEL - 3)}".ljust(_LABEL) + numbers)
+        numbers = "".join(
+            _fit_to_width(v, width - 1).rjust(width) for v, width in zip(cells, _TEXT_WIDTHS, strict=True)
+        )
+        lines.append(f"  {truncate_text(str(label), _LABEL_WIDTH - 3)}".ljust(_LABEL_WIDTH) + numbers)
         infinite = infinite or any(isinstance(v, float) and not math.isfinite(v) for v in cells)
     if infinite:
-        lines.append(f"∞: {DIVERGED}, the response leaves the range of numbers")
+        lines.append(f"∞: {DIVERGED_TEXT}, the response leaves the range of numbers")
     return "\n".join(lines)
 
 
-def _fitted(value: Cell, width: int) -> str:
+def _fit_to_width(value: Cell, width: int) -> str:
     """Format a number with as many of its five digits as fit."""
     if value is None or isinstance(value, str):
         return NOT_IN_MODEL
     if not math.isfinite(value):
         return "?" if math.isnan(value) else "∞"
-    texts = [f"{value:.{digits}g}".replace("e-0", "e-").replace("e+0", "e") for digits in range(DIGITS, 0, -1)]
+    texts = [
+        f"{value:.{digits}g}".replace("e-0", "e-").replace("e+0", "e") for digits in range(SIGNIFICANT_DIGITS, 0, -1)
+    ]
     return next((t for t in texts if len(t) <= width), texts[-1])
 
 
-WEAK = f"10{str(round(math.log10(WEAK_PRIOR))).translate(SUPERSCRIPTS)}"
+WEAK_PRIOR_TEXT = f"10{str(round(math.log10(WEAK_PRIOR))).translate(SUPERSCRIPT_DIGITS)}"
 PRINTED_NOTE = "Rows in which “printed” stands are the paper's numbers, from the authors' arm; all others are computed."
 #: Table 1: symbols, descriptions, and names in ftlm.
-SYMBOLS = (
+SYMBOL_ROWS = (
     ("θ₁₁, θ₂₁", "hub angles: how far each motor has turned", "theta11, theta21 [rad]"),
     ("θ₁₂, θ₂₂", "deflection angles: how far each link bends at its root", "theta12, theta22 [rad]"),
     ("I₁, I₂", "motor currents", "I1, I2 [A]"),
@@ -193,7 +217,7 @@ SYMBOLS = (
     ("D^μ θ₁₂, D^μ θ₂₂", "derivative of the deflection in the link's friction", "mu2, mu4 (mu1, mu3 follow)"),
 )
 #: Table 2: the seven steps with their functions.
-STEPS = (
+PROCEDURE_STEPS = (
     ("Record currents and angles", "rig.record, load", "Run: point samples with units"),
     (
         "Choose M, make the operational matrix",
@@ -222,7 +246,7 @@ def by_angle(title: str, columns: Sequence[str], rows: Mapping[str, Sequence[Seq
     return Table(title, columns, flat, headings=headings, **rest)
 
 
-def as_printed(words: str) -> Markup:
+def printed_head(words: str) -> Markup:
     """Return the head of a row of printed values."""
     return Markup("<em>printed: {}</em>").format(words)
 
@@ -235,12 +259,14 @@ def equation_of(candidate: Candidate, output: str) -> Equation:
 def computed_cells(candidate: Candidate, output: str) -> list[Cell]:
     """Orders and significant coefficients of one equation."""
     orders, coefficients = letters_of(equation_of(candidate, output))
-    return number_cells(four_digits(orders), {n: v for n, v in coefficients.items() if told(candidate, output, n)})
+    return number_cells(
+        four_digits(orders), {n: v for n, v in coefficients.items() if is_significant(candidate, output, n)}
+    )
 
 
-def told(candidate: Candidate, output: str, letter: str) -> bool:
+def is_significant(candidate: Candidate, output: str, letter: str) -> bool:
     """Whether a coefficient is at least as large as its standard error."""
-    name = f"{letter}{printed.OUTPUTS.index(output) + 1}"
+    name = f"{letter}{printed.ANGLE_NAMES.index(output) + 1}"
     error = 0.0 if candidate.result is None else candidate.result.standard_errors.get(name, 0.0)
     return not error > abs(candidate.model.coefficients.get(name, math.inf))
 
@@ -249,20 +275,20 @@ def model_table(stage: Stage, title: str) -> Table:
     """Table 4 or 5, with computed and printed rows."""
     rows: dict[str, list[list[Cell]]] = {}
     for output in stage.outputs:
-        beside = {"integer, Euler": printed.INTEGER[output]}
-        beside |= {f"p = {p}": row for p, row in printed.FRACTIONAL[output].items()}
+        beside = {"integer, Euler": printed.INTEGER_ROWS[output]}
+        beside |= {f"p = {p}": row for p, row in printed.FRACTIONAL_ROWS[output].items()}
         rows[output] = []
         for label, c in stage.candidates.items():
             errors = criteria_cells(c.estimation.output_error.get(output))
             rows[output].append([label, *computed_cells(c, output), *errors])
             if (row := beside.get(label)) is not None:
                 numbers = number_cells(row.orders, row.coefficients)
-                rows[output].append([as_printed(label.partition(",")[0]), *numbers, row.error, row.rmse, row.nr])
+                rows[output].append([printed_head(label.partition(",")[0]), *numbers, row.error, row.rmse, row.nr])
     return by_angle(
         title,
-        ("model", *HEADS, *CRITERIA),
+        ("model", *NUMBER_HEADS, *CRITERION_HEADS),
         rows,
-        groups=(*GROUPS, ("output error (free run)", 3)),
+        groups=(*COLUMN_GROUPS, ("output error (free run)", 3)),
         note="Free runs are driven as the method drives them: rows of p, least squares and instrumental variables "
         "by the current and the measured other angle; the manual's integer model (by explicit Euler at the run's step, "
         "and exactly), whole orders identified and output error by the current alone. The last two are (14)–(15), "
@@ -289,7 +315,7 @@ def fits_table(stage: Stage) -> Table:
     )
 
 
-def near_table(found: Recomputed) -> Table:
+def near_table(found: ReproductionData) -> Table:
     """Table of both errors at the printed orders, and at those of the smallest equation error."""
     rows: list[list[Cell]] = []
     for stage in found.stages.values():
@@ -310,14 +336,14 @@ def near_table(found: Recomputed) -> Table:
 
 def symbols_table() -> Table:
     """Table 1."""
-    return Table("Table 1. Symbols", ("symbol", "what it is", "name here"), SYMBOLS, wrap=True)
+    return Table("Table 1. Symbols", ("symbol", "what it is", "name here"), SYMBOL_ROWS, wrap=True)
 
 
 def steps_table() -> Table:
     """Table 2, every step with its function."""
     rows = [
         [f"{k}. {step}", Markup(", ").join(Markup("<code>{}</code>").format(f) for f in functions.split(", ")), how]
-        for k, (step, functions, how) in enumerate(STEPS, 1)
+        for k, (step, functions, how) in enumerate(PROCEDURE_STEPS, 1)
     ]
     title = "Table 2. The seven steps, and the functions of ftlm that do them"
     return Table(title, ("step", "function", "how"), rows, wrap=True)
@@ -338,7 +364,7 @@ def parameters_table() -> Table:
         fields = hub_and_link.get(stem.rstrip("_"))
         effective = None
         if fields is not None:
-            effective = Exact(getattr(PARAMETERS["effective"][stage], fields[place[0] - 1 if place else 0]))
+            effective = Exact(getattr(PARAMETER_SETS["effective"][stage], fields[place[0] - 1 if place else 0]))
         shown = Markup("<i>{}</i><sub>{}</sub>").format(name[0], name.partition("_")[2])
         rows.append([shown, Exact(value), unit, effective, value / effective if effective else None])
     return Table(
@@ -368,18 +394,18 @@ def integer_table() -> Table:
     )
 
 
-def saturation_table(found: Recomputed) -> Table:
+def saturation_table(found: ReproductionData) -> Table:
     """Coefficient a by innovation length p, with the paper's prior and with a weak one."""
     rows: dict[str, list[list[Cell]]] = {output: [] for _, output in found.angles}
     for stage, output in found.angles:
         of_p = {p: stage.candidates[f"p = {p}"] for p in printed.INNOVATION_LENGTHS}
         orders = {p: letters_of(equation_of(c, output))[0] for p, c in of_p.items()}
         x, c, _ = printed_saturation(output)
-        name = f"a{printed.OUTPUTS.index(output) + 1}"
+        name = f"a{printed.ANGLE_NAMES.index(output) + 1}"
         for p, candidate in of_p.items():
             alike = "yes" if orders[p] == orders[printed.INNOVATION_LENGTHS[-1]] else "no"
             weak = stage.weak[output][p][name] if stage.weak else None
-            stated = printed.FRACTIONAL[output][p].coefficients["a"]
+            stated = printed.FRACTIONAL_ROWS[output][p].coefficients["a"]
             rows[output].append([f"p = {p}", candidate.model.coefficients[name], alike, weak, stated, x * p / (p + c)])
     prior = Markup("<i>K</i><sub>0</sub> = {}")
     return by_angle(
@@ -388,7 +414,7 @@ def saturation_table(found: Recomputed) -> Table:
             "innovation length",
             prior.format("1"),
             "orders of p = 7",
-            prior.format(WEAK),
+            prior.format(WEAK_PRIOR_TEXT),
             "printed",
             Markup("<i>x p</i> / (<i>p</i> + <i>c</i>)"),
         ),
@@ -398,23 +424,27 @@ def saturation_table(found: Recomputed) -> Table:
     )
 
 
-def genetic_table(found: Recomputed) -> Table:
+def genetic_table(found: ReproductionData) -> Table:
     """Table 6."""
     rows: list[list[Cell]] = []
     for output, rival in found.rivals.items():
-        angle, row = symbol_html(output), printed.GENETIC[output]
+        angle, row = symbol_html(output), printed.GENETIC_ROWS[output]
         best = Markup("{}, best of {} seeds").format(angle, len(rival.genetic_run.errors))
         rows.append([best, *computed_cells(rival.genetic, output)])
-        rows.append([as_printed(angle), *number_cells(row.orders, row.coefficients)])
+        rows.append([printed_head(angle), *number_cells(row.orders, row.coefficients)])
     title = "Table 6. Orders and coefficients by the genetic algorithm"
-    return Table(title, ("angle", *HEADS), rows, groups=GROUPS, note=PRINTED_NOTE)
+    return Table(title, ("angle", *NUMBER_HEADS), rows, groups=COLUMN_GROUPS, note=PRINTED_NOTE)
 
 
 #: Labels of the models beside the other optimizers.
-RIVALS = {"genetic": "genetic algorithm", PAIR[0]: "p = 7, K₀ = 1", PAIR[1]: f"p = 7, K₀ = {WEAK}"}
+RIVAL_LABELS = {
+    "genetic": "genetic algorithm",
+    MULTI_INNOVATION_LABELS[0]: "p = 7, K₀ = 1",
+    MULTI_INNOVATION_LABELS[1]: f"p = 7, K₀ = {WEAK_PRIOR_TEXT}",
+}
 
 
-def rivals_table(found: Recomputed) -> Table:
+def rivals_table(found: ReproductionData) -> Table:
     """Table 7 at equal budgets."""
     rows: dict[str, list[list[Cell]]] = {}
     for output, rival in found.rivals.items():
@@ -423,13 +453,15 @@ def rivals_table(found: Recomputed) -> Table:
             own, other = candidate.estimation, candidate.validation
             unseen = criteria_cells(None if other is None else other.output_error[output])
             spread = float(np.std(own.measured[output][0]))
-            rows[output].append([RIVALS.get(label, label), *criteria_cells(own.output_error[output]), *unseen, spread])
+            rows[output].append(
+                [RIVAL_LABELS.get(label, label), *criteria_cells(own.output_error[output]), *unseen, spread]
+            )
         for k, label in enumerate(("genetic algorithm", "multi-innovation")):
-            criteria, implied = map(Exact, printed.RIVALS[output][k]), implied_spreads()[output][k]
-            rows[output].append([as_printed(label), *criteria, None, None, None, implied])
+            criteria, implied = map(Exact, printed.TABLE_7_CRITERIA[output][k]), implied_spreads()[output][k]
+            rows[output].append([printed_head(label), *criteria, None, None, None, implied])
     return by_angle(
         "Table 7. Multi-innovation and its rivals: the same record, the same number of candidates",
-        ("algorithm", *CRITERIA, *CRITERIA, "σ of the angle"),
+        ("algorithm", *CRITERION_HEADS, *CRITERION_HEADS, "σ of the angle"),
         rows,
         groups=(("", 1), ("square, identified from", 3), ("sine, never seen", 3), ("", 1)),
         note="Free runs, driven by the current and the measured other angle. All keep to α from "
@@ -438,7 +470,7 @@ def rivals_table(found: Recomputed) -> Table:
     )
 
 
-def seeds_table(found: Recomputed) -> Table:
+def seeds_table(found: ReproductionData) -> Table:
     """Error (45) of each optimizer and seed, with the number of evaluations."""
     seeds = list(dict.fromkeys(seed for rival in found.rivals.values() for seed in rival.genetic_run.errors))
     rows: dict[str, list[list[Cell]]] = {}
@@ -450,60 +482,71 @@ def seeds_table(found: Recomputed) -> Table:
     return by_angle("Error (45) by seed", heads, rows)
 
 
-def bounds_table(found: Recomputed) -> Table:
+def bounds_table(found: ReproductionData) -> Table:
     """Table of the bounds of both optimizers."""
     rows: list[list[Cell]] = []
     for output, rival in found.rivals.items():
         bounds = {letter_of(n): b for n, b in rival.genetic_run.bounds.items()}
-        orders = [" … ".join(number(Exact(end), 4) for end in bounds[n]) for n in printed.ORDERS]
-        rows.append([symbol_html(output), *orders, *(f"±{number(bounds[n][1], 4)}" for n in printed.COEFFICIENTS)])
+        orders = [" … ".join(number(Exact(end), 4) for end in bounds[n]) for n in printed.ORDER_LETTERS]
+        rows.append(
+            [symbol_html(output), *orders, *(f"±{number(bounds[n][1], 4)}" for n in printed.COEFFICIENT_LETTERS)]
+        )
     return Table(
         "Bounds of both rivals",
-        ("angle", *HEADS),
+        ("angle", *NUMBER_HEADS),
         rows,
         note="Orders in steps of 0.001, on the interval of the lattice. Coefficients: four times what makes a term "
         "alone as large as the output; the maker's values are not in them.",
     )
 
 
-def printed_reading_table(found: Recomputed, stage: Stage) -> Table:
+def printed_reading_table(found: ReproductionData, stage: Stage) -> Table:
     """Table 4 or 5 as the paper computed it: recomputed, printed, and their ratio."""
     rows: dict[str, list[list[Cell]]] = {}
     for output in stage.outputs:
         made = found.as_printed[output]
         rows[output] = []
         for p, row in made.rows.items():
-            stated = printed.FRACTIONAL[output][p]
+            stated = printed.FRACTIONAL_ROWS[output][p]
             figures = row.equation
-            ours = [*map(row.coefficients.get, printed.COEFFICIENTS), figures.error, figures.rmse, figures.nr]
-            theirs = [*map(stated.coefficients.get, printed.COEFFICIENTS), stated.error, stated.rmse, stated.nr]
+            ours = [*map(row.coefficients.get, printed.COEFFICIENT_LETTERS), figures.error, figures.rmse, figures.nr]
+            theirs = [*map(stated.coefficients.get, printed.COEFFICIENT_LETTERS), stated.error, stated.rmse, stated.nr]
             rows[output].append([f"p = {p}", *ours])
-            rows[output].append([as_printed(f"p = {p}"), *theirs])
+            rows[output].append([printed_head(f"p = {p}"), *theirs])
             ratios = [None if a is None or not b else number(a / b, 3) for a, b in zip(ours, theirs, strict=True)]
             rows[output].append(["ours / printed", *ratios])
     readings = "; ".join(
-        f"{symbol(o)}: {found.as_printed[o].reading} ({READINGS[found.as_printed[o].reading.terms]})"
+        f"{symbol(o)}: {found.as_printed[o].reading} ({TERM_INTERPRETATIONS[found.as_printed[o].reading.terms]})"
         for o in stage.outputs
     )
     scales = ", ".join(f"{symbol(o)} by {found.as_printed[o].scale:.3g}" for o in stage.outputs)
     return by_angle(
         f"Table {3 + stage.number} as printed: multi-innovation at the printed orders, equation errors",
-        ("row", *map(symbol_html, printed.COEFFICIENTS), *CRITERIA),
+        ("row", *map(symbol_html, printed.COEFFICIENT_LETTERS), *CRITERION_HEADS),
         rows,
         note=f"Nearest reading: {readings}. The simulated arm has whole orders and Coulomb friction; its angles are "
         f"scaled to the deviations that the printed RMSE / NR imply ({scales}). " + PRINTED_NOTE,
     )
 
 
-def ran_table(found: Recomputed) -> Table:
+def printed_runs_table(found: ReproductionData) -> Table:
     """Table of the printed models under the paper's own current."""
     rows: dict[str, list[list[Cell]]] = {}
     for r in found.ran:
-        a = f"a{printed.OUTPUTS.index(r.output) + 1}"
-        back = [r.returned.get(prior, {}).get(a) for prior in PRIORS]
-        stated = printed.FRACTIONAL[r.output][r.p].coefficients["a"]
+        a = f"a{printed.ANGLE_NAMES.index(r.output) + 1}"
+        back = [r.returned_coefficients.get(prior, {}).get(a) for prior in PRIOR_COVARIANCES]
+        stated = printed.FRACTIONAL_ROWS[r.output][r.p].coefficients["a"]
         rows.setdefault(r.output, []).append(
-            [f"p = {r.p}", Exact(r.stability.unstable_poles), r.moved, r.alone, r.implied, r.too_small, stated, *back]
+            [
+                f"p = {r.p}",
+                Exact(r.stability.unstable_poles),
+                r.angle_deviation,
+                r.single_equation_deviation,
+                r.implied_deviation,
+                r.deviation_ratio,
+                stated,
+                *back,
+            ]
         )
     prior = Markup("<i>K</i><sub>0</sub> = {}")
     return by_angle(
@@ -517,7 +560,7 @@ def ran_table(found: Recomputed) -> Table:
             "times too small",
             "a printed",
             prior.format("1"),
-            prior.format(WEAK),
+            prior.format(WEAK_PRIOR_TEXT),
         ),
         rows,
         groups=(("", 7), ("a, identified from its own response", 2)),
@@ -526,12 +569,12 @@ def ran_table(found: Recomputed) -> Table:
     )
 
 
-def whole_table(found: Recomputed) -> Table:
+def order_comparison_table(found: ReproductionData) -> Table:
     """Table of integer and free orders on every arm."""
     rows: list[list[Cell]] = []
-    for f in found.panel.freed:
+    for f in found.panel.order_comparisons:
         for output in f.free:
-            away = ", ".join(f"{symbol(n)} {f.orders[n][0]:.3g}" for n in f.away) or "none"
+            away = ", ".join(f"{symbol(n)} {f.orders[n][0]:.3g}" for n in f.fractional_orders) or "none"
             rows.append([f"{f.arm}, {symbol(output)}", f.whole[output], f.free[output], away])
     return Table(
         "Whole and free orders of (14)–(15), from the current alone",
@@ -541,7 +584,7 @@ def whole_table(found: Recomputed) -> Table:
     )
 
 
-def panel_table(found: Recomputed) -> Table:
+def panel_table(found: ReproductionData) -> Table:
     """Table of error and steps by p, arm, K0 and angle, on the first record of each arm."""
     rows: list[list[Cell]] = []
     seen = set()
@@ -550,8 +593,8 @@ def panel_table(found: Recomputed) -> Table:
         if key in seen:
             continue
         seen.add(key)
-        prior = "1" if t.prior == PRIORS[0] else WEAK
-        steps = [None if math.isinf(v) else Exact(v) for v in t.arrived.values()]
+        prior = "1" if t.prior == PRIOR_COVARIANCES[0] else WEAK_PRIOR_TEXT
+        steps = [None if math.isinf(v) else Exact(v) for v in t.convergence_steps.values()]
         rows.append([f"{t.arm}, {symbol(t.output)}, K₀ = {prior}", *t.errors.values(), *steps, t.nr, t.manual])
     p = [f"p = {p}" for p in printed.INNOVATION_LENGTHS]
     return Table(

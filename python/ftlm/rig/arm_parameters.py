@@ -1,4 +1,4 @@
-"""Parameters of the simulated arm: named sets, and files that change some of their numbers."""
+"""Parameters of the simulated arm: named sets and TOML files."""
 
 from __future__ import annotations
 
@@ -16,33 +16,33 @@ from ftlm.errors import DataError, ModelError
 from ftlm.model.model import Model
 from ftlm.rig.rig import COMMAND_SCALE, CURRENT_LIMIT, ENCODER_SCALE, SENSE_SCALE, STRAIN_SCALE
 from ftlm.simulation.discretization import equation_tuple
-from ftlm.utils.validation import listed, nearest, shown
+from ftlm.utils.validation import join_names, nearest, short_repr
 
-#: Of the arm, in the order that the core numbers them.
-SIGNALS = ("theta11", "theta12", "theta21", "theta22", "I1", "I2")
-#: The maker's file: link 1 is 0.202 m long and turns 0.170434 kg m^2 with all that it carries; on link 2, which turns
-#: 0.0064387 kg m^2, 0.157 kg sit 0.20185 m out; of hub 2's 0.00301955 kg m^2 a rotor of 1.03e-6 behind a gear of
-#: 50 is 0.002575 and leans on link 1 with a fiftieth of that alone.
+#: Signals of the arm, in the order of their indices in the core.
+ARM_SIGNALS = ("theta11", "theta12", "theta21", "theta22", "I1", "I2")
+#: Manufacturer's data: length of link 1 0.202 m; inertia of link 1 with everything it carries 0.170434 kg m^2; inertia
+#: of link 2 0.0064387 kg m^2; mass of 0.157 kg at 0.20185 m on link 2. Hub 2 has 0.00301955 kg m^2, of which 0.002575
+#: are the rotor of 1.03e-6 kg m^2 behind a gear of 50; it couples to link 1 with one fiftieth of that.
 INERTIA_RATIO = 0.00301955 / 0.170434
-REACH = 0.157 * 0.202 * 0.20185 / 0.0064387
-TURNED = (0.00301955 - 0.002575 + 0.002575 / 50.0) / 0.00301955
-#: Longest step of the simulation inside a sample [s]: deflections are then within 2e-4 of their deviation, of stage 1
-#: within 1e-5.
-SUBSTEP = 1e-4
+LINK_COUPLING_RATIO = 0.157 * 0.202 * 0.20185 / 0.0064387
+ROTATING_INERTIA_SHARE = (0.00301955 - 0.002575 + 0.002575 / 50.0) / 0.00301955
+#: Longest simulation step within a sample [s]; the error of deflections is then below 2e-4 of their standard
+#: deviation, for joint 1 below 1e-5.
+MAX_SUBSTEP_S = 1e-4
 
 
 @dataclass(frozen=True)
 class StageParameters:
-    """One stage of the simulated arm: the free orders and coefficients of the law, and the hub's Coulomb friction.
+    """Parameters of one joint of the simulated arm: orders and coefficients of the law, and Coulomb friction.
 
     Parameters
     ----------
     a, b, d, g, r
-        Coefficients of the hub's equation and the inertia ratio r = (J_1 + J_2)/J_2, which give the deflection's.
+        Coefficients of the hub equation and inertia ratio r = (J_1 + J_2)/J_2; they determine the link equation.
     gamma, beta, mu
-        Free orders, such that every order of the law lies in [0, 3); both highest orders are 2.
+        Free orders; every order of the law must lie in [0, 3). Both highest orders are 2.
     coulomb
-        Friction as a motor current [A], 0 for none.
+        Coulomb friction as an equivalent motor current [A]; 0 for none.
     """
 
     a: float
@@ -56,12 +56,12 @@ class StageParameters:
     coulomb: float = 0.0
 
     def orders(self, stage: int) -> dict[str, float]:
-        """The five free orders, by the law's names."""
+        """Return the five free orders, by their names in the law."""
         h, k = 2 * stage - 1, 2 * stage
         return {f"alpha{h}": 2.0, f"alpha{k}": 2.0, f"gamma{h}": self.gamma, f"beta{k}": self.beta, f"mu{k}": self.mu}
 
     def coefficients(self, stage: int, form: Form = "lagrange") -> dict[str, float]:
-        """The coefficients of both equations, by the law's names."""
+        """Return the coefficients of both equations, by their names in the law."""
         h, k = 2 * stage - 1, 2 * stage
         hub = {f"a{h}": self.a, f"b{h}": self.b, f"d{h}": self.d, f"g{h}": self.g}
         if form == "lagrange":
@@ -72,49 +72,48 @@ class StageParameters:
 
 @dataclass(frozen=True)
 class ArmParameters:
-    """The simulated arm and its sensors.
+    """Parameters of the simulated arm and its sensors.
 
     Parameters
     ----------
     stage1, stage2
-        The stages.
+        Parameters of the two joints.
     coupling
-        0: stages apart; 1: stage 2 rides on link 1, as :func:`ftlm.flexible_link` has it under
-        ``cross_stage="inertial"``. In between the rates that link 1 hands on to stage 2 are so much smaller, in one and
-        the same kinetic energy.
+        Inertial coupling between the joints: 0 for none, 1 for joint 2 mounted on link 1, as in
+        :func:`ftlm.flexible_link` with ``cross_stage="inertial"``. Values in between scale the motion of link 1 that
+        acts on joint 2, consistently in the kinetic energy.
     inertia_ratio
-        J_21/J_12, J_12 with all that link 1 carries.
+        J_21/J_12, where J_12 includes everything that link 1 carries.
     reach
-        H/J_22, H the length of link 1 times the moment of mass of link 2: 1 where both links are equally long and the
-        mass is at the tip.
+        Coupling ratio H/J_22, where H is the length of link 1 times the first moment of mass of link 2. It is 1 for
+        equally long links with the mass at the tip.
     turned
-        Share of J_21 that turns with link 1. A rotor behind a gear does not, but for one part in its ratio.
+        Share of J_21 that rotates with link 1. A rotor behind a gear contributes only by the inverse of the gear ratio.
     current_offset
-        What drives each motor besides its command while the amplifiers are enabled [A]: of a run, not of the arm.
+        Current offset of each motor while the amplifiers are enabled [A]; a property of a run, not of the arm.
     strain_noise, current_noise
         Standard deviation of the noise on the gauges and on the current sense [V].
     strain_bias, current_bias
-        Their offsets [V].
+        Offsets of gauges and current sense [V].
     bits
-        Of the converters over ±10 V; 0 for none, which leaves the gauges exact.
+        Resolution of the converters over ±10 V [bit]; 0 for no quantization.
     encoder_scale
         Hub angle per count [rad].
     travel
         Hub angle at which a limit switch opens [rad].
     form
-        ``"lagrange"``: links hang on their hubs, the Euler-Lagrange equations (14)-(15); ``"published"``: (22)-(25) as
-        printed, whose links bend the wrong way, for what is set beside the paper's own numbers. These know the stages
-        apart alone.
+        ``"lagrange"``: Euler-Lagrange equations (14)-(15). ``"published"``: equations (22)-(25) as printed, whose
+        deflections have the wrong sign, for comparison with the paper; only without coupling of the joints.
     name
-        What files call them.
+        Name of the parameter set in files.
     """
 
     stage1: StageParameters
     stage2: StageParameters
     coupling: float = 1.0
     inertia_ratio: float = INERTIA_RATIO
-    reach: float = REACH
-    turned: float = TURNED
+    reach: float = LINK_COUPLING_RATIO
+    turned: float = ROTATING_INERTIA_SHARE
     current_offset: tuple[float, float] = (0.0, 0.0)
     strain_noise: tuple[float, float] = (0.015, 0.0134)
     current_noise: tuple[float, float] = (0.0012, 0.0012)
@@ -128,24 +127,27 @@ class ArmParameters:
 
     @classmethod
     def of(cls, given: str | os.PathLike[str] | ArmParameters) -> ArmParameters:
-        """A named set, a TOML file's, or what it is given.
+        """Return a named parameter set, the set of a TOML file, or the argument itself.
 
         Raises
         ------
         ModelError
-            A name that is not known, a key or a number in the file that cannot be used.
+            An unknown name, or an invalid key or number in the file.
         DataError
             A file that cannot be read.
         """
         if isinstance(given, ArmParameters):
             return given
-        if isinstance(given, str) and given in SETS:
-            return SETS[given]
+        if isinstance(given, str) and given in PARAMETER_SETS:
+            return PARAMETER_SETS[given]
         if not isinstance(given, (str, os.PathLike)):
-            raise ModelError(f"parameters is a {type(given).__name__}; use {listed(SETS)}, or a TOML file's path")
+            raise ModelError(
+                f"parameters is a {type(given).__name__}; use {join_names(PARAMETER_SETS)}, or a TOML file's path"
+            )
         if not os.fspath(given).endswith(".toml"):
             raise ModelError(
-                f"parameters = {shown(os.fspath(given))} is not known{nearest(given, SETS)}; use {listed(SETS)}, or a "
+                f"parameters = {short_repr(os.fspath(given))} is not known{nearest(given, PARAMETER_SETS)}; use "
+                f"{join_names(PARAMETER_SETS)}, or a "
                 "file whose name ends with .toml"
             )
         return cls._from_toml(Path(given))
@@ -157,9 +159,12 @@ class ArmParameters:
         except (OSError, UnicodeDecodeError, tomllib.TOMLDecodeError, RecursionError) as error:
             raise DataError(f"{str(path)!r} is not a TOML file that can be read ({error}); correct it") from None
         base = told.pop("base", "effective")
-        if base not in SETS:
-            raise ModelError(f"{path.name}: base = {base!r} is not known{nearest(base, SETS)}; use {listed(SETS)}")
-        start = SETS[base]
+        if base not in PARAMETER_SETS:
+            raise ModelError(
+                f"{path.name}: base = {base!r} is not known{nearest(base, PARAMETER_SETS)}; use "
+                f"{join_names(PARAMETER_SETS)}"
+            )
+        start = PARAMETER_SETS[base]
         stages = {}
         for name in ("stage1", "stage2"):
             table = told.pop(name, {})
@@ -170,16 +175,16 @@ class ArmParameters:
         return replace(start, **{**rest, **stages, "name": path.name[:100]})
 
     def to_dict(self) -> dict[str, Any]:
-        """For JSON."""
+        """Return the parameters as a JSON-compatible dictionary."""
         return {k: list(v) if isinstance(v, tuple) else v for k, v in asdict(self).items()}
 
-    def pushes(self) -> dict[str, float]:
-        """What the stages do to each other: coefficients of D^2 of the other stage's angles by the law's names.
+    def coupling_coefficients(self) -> dict[str, float]:
+        """Return the inertial coupling coefficients of D^2 of the other joint's angles, by their names in the law.
 
         Raises
         ------
         ModelError
-            Numbers out of range, or inertias with which the arm's kinetic energy is not positive.
+            Parameters out of range, or inertias for which the kinetic energy of the arm is not positive definite.
         """
         for name, highest in (("coupling", 1.0), ("turned", 1.0), ("inertia_ratio", math.inf), ("reach", math.inf)):
             value = getattr(self, name)
@@ -190,7 +195,7 @@ class ArmParameters:
         hub = self.coupling * self.turned * self.inertia_ratio
         arm = self.coupling * self.inertia_ratio / (self.stage2.r - 1.0) * (1.0 + self.reach)
         base, carried = -self.coupling * self.turned, -self.coupling * (1.0 + self.reach)
-        # The determinant of the inertias over that of the stages apart.
+        # Determinant of the inertia matrix, relative to that of uncoupled joints.
         if not 1.0 + hub * base + arm * carried > 0.0:
             raise ModelError(
                 f"inertia_ratio = {self.inertia_ratio:g} and reach = {self.reach:g} give stage 2 more inertia than "
@@ -200,17 +205,17 @@ class ArmParameters:
         return {"p2": -hub - arm, "q2": -arm, "p3": base, "q3": base, "p4": carried, "q4": carried}
 
     def model(self, *, friction: bool = False) -> Model:
-        """The arm as a model, both stages from their currents; with friction it is what :meth:`arm` integrates.
+        """Return the model of the arm from currents to angles; with friction it equals the simulation of :meth:`arm`.
 
         Parameters
         ----------
         friction
-            Whether hubs stick; of the Lagrange form.
+            Whether the hubs have Coulomb friction; only for the Lagrange form.
 
         Raises
         ------
         ModelError
-            Orders or coefficients that make no model, the published form with a coupling or with friction.
+            Invalid orders or coefficients, or the published form with coupling or friction.
         """
         if self.form == "published" and self.coupling != 0.0:
             raise ModelError(
@@ -225,7 +230,7 @@ class ArmParameters:
             friction=friction,
         )
         orders: dict[str, float] = {}
-        coefficients: dict[str, float] = self.pushes() if coupled else {}
+        coefficients: dict[str, float] = self.coupling_coefficients() if coupled else {}
         for j, stage in ((1, self.stage1), (2, self.stage2)):
             orders |= stage.orders(j)
             coefficients |= stage.coefficients(j, self.form)
@@ -235,10 +240,10 @@ class ArmParameters:
         return Model(structure.with_orders(known).with_coefficients(coefficients), orders=known)
 
     def arm(self, step: float, horizon: float) -> _core.VirtualArm:
-        """The simulated arm at rest, for runs of at most `horizon` s in samples of `step` s."""
+        """Return the simulated arm at rest, for runs of at most `horizon` s with samples of `step` s."""
         model = self.model()
         links = {
-            "equations": [equation_tuple(item, SIGNALS) for item in model.equations],
+            "equations": [equation_tuple(item, ARM_SIGNALS) for item in model.equations],
             "coulomb": [self.stage1.coulomb, self.stage2.coulomb],
         }
         sensors = {
@@ -255,7 +260,7 @@ class ArmParameters:
             "offset": self.current_offset,
             "travel": self.travel,
         }
-        return _core.VirtualArm(links, sensors, step, SUBSTEP, horizon)
+        return _core.VirtualArm(links, sensors, step, MAX_SUBSTEP_S, horizon)
 
 
 def _numbers(path: Path, where: str, table: Mapping[str, Any], kind: type[Any]) -> dict[str, Any]:
@@ -264,7 +269,7 @@ def _numbers(path: Path, where: str, table: Mapping[str, Any], kind: type[Any]) 
     for key, value in table.items():
         if key not in known:
             raise ModelError(
-                f"{path.name}: {key!r} in {where} is not known{nearest(key, known)}; known are {listed(known)}"
+                f"{path.name}: {key!r} in {where} is not known{nearest(key, known)}; known are {join_names(known)}"
             )
         if key == "form":
             if value not in ("lagrange", "published"):
@@ -299,17 +304,17 @@ _STAGE2 = StageParameters(
     mu=0.8,
     coulomb=0.1,
 )
-#: Both units of the real arm have these links, fitted on one run of each with whole orders: -K_s/J_2 = -164 and -418,
-#: -B_2/J_2 = -0.365 and -2.09, -0.170 from stage 2 to link 1 and -2.36 back; J_1/J_2 is the maker's. The order of the
-#: first link's stiffness, left free, goes to 0 within 0.01. benches/virtual_arm.py measures all of it again.
+#: Links of both units of the real arm, fitted with integer orders to one run each: -K_s/J_2 = -164 and -418, -B_2/J_2 =
+#: -0.365 and -2.09, coupling -0.170 from joint 2 to link 1 and -2.36 back; J_1/J_2 is the manufacturer's. The order of
+#: the stiffness term of link 1, if free, is estimated as 0 within 0.01. benches/virtual_arm.py repeats these fits.
 _SOFT1 = StageParameters(a=439.9, b=-17.4, d=0.979, g=112.6, r=_STAGE1.r, gamma=1.0, beta=0.0, mu=1.0, coulomb=0.179)
 _SOFT2 = StageParameters(a=891.0, b=-142.0, d=4.46, g=288.0, r=_STAGE2.r, gamma=1.0, beta=0.0, mu=1.0, coulomb=0.228)
-_MEASURED = ArmParameters(_SOFT1, _SOFT2, inertia_ratio=0.0327, reach=1.36, name="measured")
-#: "effective": the maker's effective parameters with fractional damping, friction, coupling and noise. "linear": the
-#: same two stages apart, without friction, noise and quantisation of the gauges. "measured": the unit of the real arm
-#: that ran under partial-state feedback, "measured-lqr" the one that ran under LQR. Torque, viscous and Coulomb
-#: friction of each hub are fitted on its own run; the former's tells those of hub 2 apart at the maker's torque alone.
-SETS: dict[str, ArmParameters] = {
+_MEASURED_ARM = ArmParameters(_SOFT1, _SOFT2, inertia_ratio=0.0327, reach=1.36, name="measured")
+#: "effective": manufacturer's effective parameters with fractional damping, friction, coupling and noise. "linear": the
+#: same joints without coupling, friction, noise and quantization of the gauges. "measured": real arm, unit under
+#: partial-state feedback; "measured-lqr": unit under LQR. Torque constant, viscous and Coulomb friction of each hub are
+#: fitted to its own run; for hub 2 of the first unit they are identifiable only at the manufacturer's torque.
+PARAMETER_SETS: dict[str, ArmParameters] = {
     "effective": ArmParameters(_STAGE1, _STAGE2),
     "linear": ArmParameters(
         replace(_STAGE1, coulomb=0.0),
@@ -322,9 +327,9 @@ SETS: dict[str, ArmParameters] = {
         bits=0,
         name="linear",
     ),
-    "measured": _MEASURED,
+    "measured": _MEASURED_ARM,
     "measured-lqr": replace(
-        _MEASURED,
+        _MEASURED_ARM,
         stage1=replace(_SOFT1, b=-25.6, g=120.0, coulomb=0.254),
         stage2=replace(_SOFT2, b=-18.7, g=196.5, coulomb=0.148),
         name="measured-lqr",

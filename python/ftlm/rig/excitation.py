@@ -1,4 +1,4 @@
-"""Inputs of an experiment: the current of both motors at every sample."""
+"""Motor-current signals of experiments."""
 
 from __future__ import annotations
 
@@ -12,38 +12,38 @@ import numpy as np
 
 from ftlm.errors import DataError, ModelError
 from ftlm.io.load import column_names, load
-from ftlm.rig.rig import CURRENT_LIMIT, LONGEST
-from ftlm.utils.validation import Floats, real_number, shown
+from ftlm.rig.rig import CURRENT_LIMIT, MAX_RUN_DURATION_S
+from ftlm.utils.validation import Floats, real_number, short_repr
 
-SHAPES = ("square", "sine", "chirp", "multisine", "prbs", "doublet", "csv")
-INPUTS = ("I1", "I2")
+SIGNAL_SHAPES = ("square", "sine", "chirp", "multisine", "prbs", "doublet", "csv")
+CURRENT_SIGNALS = ("I1", "I2")
 #: The paper's sine [rad/s].
-_SINE = 6.3
+_PAPER_SINE_RAD_S = 6.3
 
 
 @dataclass(frozen=True)
 class Excitation:
-    """A current for both motors.
+    """Motor-current signal of an experiment.
 
     Parameters
     ----------
     shape
-        One of SHAPES. ``"square"``: duty one half. ``"sine"``. ``"chirp"``: a sine whose frequency rises exponentially
-        over the band. ``"multisine"``: every multiple of 1/period in the band, with equal amplitudes and random phases.
-        ``"prbs"``: at random plus or minus, decided anew every `period`. ``"doublet"``: half a period plus, half minus,
-        then nothing. ``"csv"``: columns I1 and I2 [A] of a file, held from row to row.
+        One of SIGNAL_SHAPES. ``"square"``: duty cycle one half. ``"sine"``. ``"chirp"``: exponential frequency sweep
+        over the band. ``"multisine"``: all multiples of 1/period in the band, with equal amplitudes and random phases.
+        ``"prbs"``: random sign in every `period`. ``"doublet"``: half a period positive, half negative, then zero.
+        ``"csv"``: columns I1 and I2 [A] of a file, with zero-order hold.
     amplitude
         Largest current [A], of both motors or (stage 1, stage 2).
     period
-        [s]; default 2 for square, doublet and multisine (there 10), 2 pi/6.3 for sine, 0.1 for prbs.
+        Period [s]; default 2 for square and doublet, 10 for multisine, 2 pi/6.3 for sine, 0.1 for prbs.
     band
         Lowest and highest frequency of chirp and multisine [Hz].
     ramp
-        Time over which the amplitude grows from zero [s].
+        Duration of the linear ramp of the amplitude from zero [s].
     seed
-        Of prbs and multisine; the motors get different ones.
+        Random seed of prbs and multisine; the two motors get different signals.
     file
-        Of csv.
+        File with the currents for ``"csv"``.
     """
 
     shape: str = "square"
@@ -55,20 +55,20 @@ class Excitation:
     file: str | os.PathLike[str] | None = None
 
     def commands(self, rate: float, duration: float) -> Floats:
-        """Currents [A], shape (round(duration·rate) + 1, 2); the last row is zero.
+        """Return the currents [A], shape (round(duration·rate) + 1, 2); the last row is zero.
 
         Raises
         ------
         ModelError
-            A shape, amplitude, period or band that cannot be used; an amplitude over the amplifiers' limit.
+            An invalid shape, amplitude, period or band, or a current above the amplifier limit.
         DataError
             A file that cannot be used.
         """
         rows = round(duration * rate) + 1
         t = np.arange(rows) / rate
-        ramp = finite(self.ramp)
+        ramp = finite_number(self.ramp)
         if ramp is None or not 0 <= ramp <= duration:
-            raise ModelError(f"ramp = {shown(self.ramp)} s is outside [0, {duration:g}] s, the length of the run")
+            raise ModelError(f"ramp = {short_repr(self.ramp)} s is outside [0, {duration:g}] s, the length of the run")
         if self.shape == "csv":
             currents = self._file(t)
         else:
@@ -87,9 +87,9 @@ class Excitation:
 
     def _amplitudes(self) -> tuple[float, float]:
         given = self.amplitude if isinstance(self.amplitude, (tuple, list)) else (self.amplitude, self.amplitude)
-        pair = [a for a in map(finite, given) if a is not None and a >= 0]
+        pair = [a for a in map(finite_number, given) if a is not None and a >= 0]
         if len(given) != 2 or len(pair) != 2:
-            raise ModelError(f"amplitude = {shown(self.amplitude)} is not a current in A, or a pair of them")
+            raise ModelError(f"amplitude = {short_repr(self.amplitude)} is not a current in A, or a pair of them")
         for k, (value, limit) in enumerate(zip(pair, CURRENT_LIMIT, strict=True)):
             if value > limit:
                 raise ModelError(
@@ -98,17 +98,21 @@ class Excitation:
         return pair[0], pair[1]
 
     def _period(self, rate: float) -> float:
-        usual = {"sine": 2 * math.pi / _SINE, "prbs": 0.1, "multisine": 10.0}.get(self.shape, 2.0)
-        period = usual if self.period is None else finite(self.period)
+        usual = {"sine": 2 * math.pi / _PAPER_SINE_RAD_S, "prbs": 0.1, "multisine": 10.0}.get(self.shape, 2.0)
+        period = usual if self.period is None else finite_number(self.period)
         if period is None or not period * rate >= 2:
-            raise ModelError(f"period = {shown(self.period)} s is not a time of at least two samples ({2 / rate:g} s)")
-        if self.shape == "multisine" and period > LONGEST:
-            raise ModelError(f"period = {period:g} s of a multisine is longer than the longest run, {LONGEST:g} s")
+            raise ModelError(
+                f"period = {short_repr(self.period)} s is not a time of at least two samples ({2 / rate:g} s)"
+            )
+        if self.shape == "multisine" and period > MAX_RUN_DURATION_S:
+            raise ModelError(
+                f"period = {period:g} s of a multisine is longer than the longest run, {MAX_RUN_DURATION_S:g} s"
+            )
         return period
 
     def _shapes(self, t: Floats, rate: float, duration: float) -> Floats:
         period = self._period(rate)
-        # Half a sample of slack keeps rounding from moving an edge.
+        # A tolerance of half a sample prevents rounding from shifting an edge.
         phase = ((t + 0.5 / rate) % period) / period
         if self.shape == "square":
             one = np.where(phase < 0.5, 1.0, -1.0)
@@ -123,7 +127,7 @@ class Excitation:
         elif self.shape in ("prbs", "multisine"):
             return np.column_stack([self._random(t, rate, period, motor) for motor in (0, 1)])
         else:
-            raise ModelError(f"input = {self.shape!r} is not known; use one of {', '.join(SHAPES)}")
+            raise ModelError(f"input = {self.shape!r} is not known; use one of {', '.join(SIGNAL_SHAPES)}")
         return np.column_stack([one, one])
 
     def _random(self, t: Floats, rate: float, period: float, motor: int) -> Floats:
@@ -146,10 +150,10 @@ class Excitation:
 
     def _band(self, rate: float) -> tuple[float, float]:
         band = self.band
-        ends = [b for b in map(finite, band) if b is not None] if isinstance(band, (tuple, list)) else []
+        ends = [b for b in map(finite_number, band) if b is not None] if isinstance(band, (tuple, list)) else []
         if len(ends) != 2 or len(band) != 2 or not 0 < ends[0] < ends[1] <= rate / 2:
             raise ModelError(
-                f"band = {shown(band)} Hz is not two rising frequencies up to half the rate, {rate / 2:g} Hz"
+                f"band = {short_repr(band)} Hz is not two rising frequencies up to half the rate, {rate / 2:g} Hz"
             )
         return ends[0], ends[1]
 
@@ -157,25 +161,27 @@ class Excitation:
         if self.file is None:
             raise ModelError("input = 'csv' needs a file; give it as file= (--file)")
         names = column_names(self.file)
-        there = [name for name in INPUTS if names is not None and name in names]
-        # A run that ftlm wrote knows its signals; any other file is asked for the currents alone.
+        there = [name for name in CURRENT_SIGNALS if names is not None and name in names]
+        # A run written by ftlm is loaded whole; from any other file only the currents are read.
         run = load(self.file) if names is None else load(self.file, outputs=there) if there else None
-        if run is None or not any(name in run for name in INPUTS):
+        if run is None or not any(name in run for name in CURRENT_SIGNALS):
             raise DataError(f"{str(self.file)!r} has no column I1 or I2; name the currents [A] so")
         rows = np.minimum(np.floor(t / run.step + 1e-6).astype(np.int64), run.length - 1)
         past = t > run.duration + run.step * (1 - 1e-6)
-        currents = np.column_stack([(run[name] if name in run else np.zeros(run.length))[rows] for name in INPUTS])
+        currents = np.column_stack(
+            [(run[name] if name in run else np.zeros(run.length))[rows] for name in CURRENT_SIGNALS]
+        )
         currents[past] = 0.0
         return currents
 
     def to_dict(self) -> dict[str, Any]:
-        """For JSON."""
+        """Return the signal as a JSON-compatible dictionary."""
         told = asdict(self) | {"file": None if self.file is None else Path(self.file).name}
-        return {k: _plain(v) for k, v in told.items() if v is not None}
+        return {k: _to_json_value(v) for k, v in told.items() if v is not None}
 
 
-def finite(value: object) -> float | None:
-    """A finite real number, NumPy's too, as a float; None for anything else, a truth value among it."""
+def finite_number(value: object) -> float | None:
+    """Return a finite real number as a float; None for any other value, including bool."""
     try:
         number = real_number("", value)
     except ModelError:
@@ -183,8 +189,8 @@ def finite(value: object) -> float | None:
     return number if math.isfinite(number) else None
 
 
-def _plain(value: object) -> object:
-    """For JSON, which knows neither tuples nor NumPy's numbers."""
+def _to_json_value(value: object) -> object:
+    """Convert tuples and NumPy scalars to JSON types."""
     if isinstance(value, (tuple, list)):
-        return [_plain(v) for v in value]
+        return [_to_json_value(v) for v in value]
     return value.item() if isinstance(value, np.generic) else value

@@ -1,4 +1,4 @@
-"""A controller in the loop of a run: asked once a sample, and believed only where it answers with two currents."""
+"""Feedback control on a rig: a user's controller as command source, one call per sample."""
 
 from __future__ import annotations
 
@@ -18,17 +18,17 @@ from ftlm.errors import DataError, ModelError
 from ftlm.estimation.linear import Streaming
 from ftlm.rig.arm_parameters import ArmParameters
 from ftlm.rig.recording import Experiment, check_times
-from ftlm.rig.rig import LONGEST, Board, Rig
-from ftlm.utils.validation import Floats, check_seed, words_of
+from ftlm.rig.rig import MAX_RUN_DURATION_S, Board, Rig
+from ftlm.utils.validation import Floats, check_seed, error_text
 
-#: What is called once a sample: time [s], measured angles [rad] and reference [rad] in, two currents [A] out.
+#: Controller: function of time [s], measured angles [rad] and reference [rad] that returns two currents [A].
 Controller: TypeAlias = Callable[[float, Floats, Floats], Sequence[float] | Floats]
-#: Names of the reference in a run, of hub 1 and hub 2.
-REFERENCES = ("reference1", "reference2")
-#: Most characters, as JSON, of what a controller says of itself.
-SAID = 100_000
-#: Hub angle at which a limit switch opens, where the board does not say its own [rad].
-TRAVEL = (math.pi / 2, math.pi / 2)
+#: Signal names of the references of joints 1 and 2 in a run.
+REFERENCE_SIGNALS = ("reference1", "reference2")
+#: Bound on the JSON description of a controller in the metadata of a run.
+MAX_CONTROLLER_JSON_CHARACTERS = 100_000
+#: Default joint angle at which a limit switch opens [rad], if the board states none.
+DEFAULT_TRAVEL_RAD = (math.pi / 2, math.pi / 2)
 
 
 def control(
@@ -53,51 +53,50 @@ def control(
     live: Streaming | None = None,
     progress: Callable[[int, int], None] | None = None,
 ) -> Run:
-    """Close a loop on a rig: ask a controller once a sample, and record the run.
+    """Run a feedback controller on a rig, once per sample, and record the run.
 
-    The loop, its limits, its watchdog and its way out are those of :func:`ftlm.rig.record`. What a controller answers
-    to the sample at t acts from the next sample on: one sample of delay, always the same however long it takes within
-    its sample. The first command and the last are 0 A.
+    Limits, watchdog and shutdown are those of :func:`ftlm.rig.record`. The command computed from the sample at t is
+    applied at the next sample, a constant delay of one sample. The first and the last command are 0 A.
 
     Parameters
     ----------
     controller : callable
         ``controller(time, angles, reference)`` with the time [s], an array of theta11, theta12, theta21, theta22 [rad]
-        as they are recorded, and an array of the reference of both hubs [rad] at that time; it returns both currents
-        [A], within 0.94 and 1.2. What has a ``reset()`` is reset before the run, what has a ``to_dict()`` is told in
-        the run's `about`.
+        as recorded, and the reference of both joints [rad] at that time. It returns both currents [A], within 0.94 and
+        1.2. A ``reset()`` method is called before the run; the result of a ``to_dict()`` method is stored in the run's
+        `metadata`.
     reference : array_like
-        Hub angles [rad]: shape (rows, 2), one row a sample; or a pair that is held for `duration`.
+        Joint angles [rad]: shape (rows, 2), one row per sample; or a pair that is held for `duration`.
     rig : {"virtual", "q8"} or Board, default "virtual"
-        The simulated arm, the arm on a Q8-USB board, or a board of your own.
+        The simulated arm, the arm on a Q8-USB board, or a user-defined board.
     duration : float, optional
-        [s]; by default as long as the rows of the reference last.
+        Duration [s]; default that of the reference.
     limit, rate, seed, parameters, offset, paced, sensor_filter, watchdog, arm, card, out, force, live, progress
         See :func:`ftlm.rig.record`.
     name : str
-        Of the run.
+        Name of the run.
 
     Returns
     -------
     Run
-        As of :func:`ftlm.rig.record`, with the inputs reference1 and reference2 [rad].
+        Run as from :func:`ftlm.rig.record`, with the additional inputs reference1 and reference2 [rad].
 
     Raises
     ------
     ModelError
-        An argument that is out of range, a reference beyond the arm's travel, real hardware without ``arm=True``;
-        nothing has moved.
+        An argument out of range, a reference beyond the arm's travel, or hardware without ``arm=True``; the arm has not
+        moved.
     DataError
-        A reference that is no such array, a file that is there already; nothing has moved.
+        An invalid reference array, or a file that exists already; the arm has not moved.
     RigFault
-        The rig stopped the run, or the controller failed, or answered with anything but two finite currents within the
-        limits, or too late. 0 V was put out at once, or by the watchdog where it did not answer at all; the cause is in
-        words, what the controller raised is the fault's ``__cause__``, what was recorded is in `run` and in the file.
+        The rig stopped the run, or the controller raised, returned invalid or excessive currents, or was too late. 0 V
+        was written immediately, or by the watchdog if the controller did not return. The message states the cause,
+        ``__cause__`` is the exception of the controller, and `run` and the file hold the recorded samples.
 
     Notes
     -----
-    In real time an answer that takes longer than a sample is a missed deadline: 21 in a row, or one that makes a write
-    50 ms late, stop the run. As fast as possible nothing is late but for the watchdog, which then waits 2 s.
+    In real time a computation longer than one sample is a missed deadline. The run stops after 21 consecutive missed
+    deadlines, or when a write is 50 ms late. Without real time only the watchdog applies, with a timeout of 2 s.
     """
     if not callable(controller):
         raise ModelError(
@@ -108,20 +107,20 @@ def control(
     if duration is None:
         if given.ndim == 1:
             raise ModelError("a reference that is held needs duration= [s]; or give it as rows, one a sample")
-        _, _, rate = check_times(LONGEST, LONGEST, rate)
+        _, _, rate = check_times(MAX_RUN_DURATION_S, MAX_RUN_DURATION_S, rate)
         duration = (len(given) - 1) / rate
     duration, limit, rate = check_times(duration, limit, rate)
     seed = check_seed(seed)
-    told: dict[str, Any] = {"controller": _told(controller)}
+    told: dict[str, Any] = {"controller": _describe_controller(controller)}
 
-    def loop(board: Board) -> Loop:
+    def loop(board: Board) -> ControllerSource:
         own = getattr(board, "parameters", None)
-        travel = own.travel if isinstance(own, ArmParameters) else TRAVEL
+        travel = own.travel if isinstance(own, ArmParameters) else DEFAULT_TRAVEL_RAD
         rows = _rows(given, round(duration * rate) + 1, rate, travel)
         reset = getattr(controller, "reset", None)
         if callable(reset):
             reset()
-        return Loop(controller, rows, rate, getattr(board, "clock", time.perf_counter))
+        return ControllerSource(controller, rows, rate, getattr(board, "clock", time.perf_counter))
 
     asked = Experiment(
         rig,
@@ -142,40 +141,40 @@ def control(
         live,
         progress,
     )
-    return asked.recorded(loop, {"control": told})
+    return asked.record_run(loop, {"control": told})
 
 
-class Loop:
-    """A controller as the source of a run's commands, one sample at a time.
+class ControllerSource:
+    """Command source that calls a controller once per sample.
 
     Parameters
     ----------
     controller
-        What is asked.
+        The controller function.
     reference
-        Of both hubs, shape (rows, 2) [rad].
+        Reference of both joints, shape (rows, 2) [rad].
     rate
-        Samples per second.
+        Sampling rate [Hz].
     clock
-        Seconds, to say how long an answer took.
+        Clock [s] that measures the computing time of the controller.
     """
 
     def __init__(self, controller: Controller, reference: Floats, rate: float, clock: Callable[[], float]) -> None:
         self.controller, self.reference = controller, reference
         self.rows, self.rate, self.clock = len(reference), rate, clock
-        self.told = {name: reference[:, j] for j, name in enumerate(REFERENCES)}
+        self.extra_signals = {name: reference[:, j] for j, name in enumerate(REFERENCE_SIGNALS)}
         self._rig: Rig | None = None
         self._at = -1
         self._since: float | None = None
         self._took = 0.0
 
-    def first(self, rig: Rig, block: int) -> Floats:
-        """Nothing was measured yet: 0 A."""
+    def first_commands(self, rig: Rig, block: int) -> Floats:
+        """Return 0 A, because no measurement exists yet."""
         self._rig, self._at = rig, -1
         return np.zeros((1, 2))
 
-    def after(self, rows: Floats) -> Floats:
-        """The answer to what was measured last; 0 A at the run's end."""
+    def next_commands(self, rows: Floats) -> Floats:
+        """Return the controller output for the last measurement; 0 A at the end of the run."""
         if self._rig is None or not len(rows):
             raise ModelError("the board ran a sample and handed over no row of it; correct its take()")
         self._at += 1
@@ -186,7 +185,7 @@ class Loop:
         try:
             answer = self.controller(t, rows[-1, 2:6].copy(), self.reference[self._at].copy())
         except Exception as error:
-            self._rig.fail(f"at {t:.6g} s the controller failed ({type(error).__name__}: {words_of(error)})", error)
+            self._rig.fail(f"at {t:.6g} s the controller failed ({type(error).__name__}: {error_text(error)})", error)
         except BaseException:
             with contextlib.suppress(Exception):
                 self._rig.board.write((0.0, 0.0))
@@ -196,15 +195,15 @@ class Loop:
         try:
             currents, wrong = _currents(answer, self._rig.limits.current)
         except Exception as error:
-            # Lists and numbers of its own may do anything when they are read.
+            # User-defined sequences and numbers may raise on access.
             words = f"at {t:.6g} s what the controller returned cannot be read ({type(error).__name__}: "
-            self._rig.fail(f"{words}{words_of(error)})", error)
+            self._rig.fail(f"{words}{error_text(error)})", error)
         if wrong:
             self._rig.fail(f"at {t:.6g} s the controller {wrong}")
         return currents
 
-    def blamed(self, fault: str) -> str:
-        """A fault with how long the controller took, where that was longer than a sample."""
+    def explain_fault(self, fault: str) -> str:
+        """Return a fault message, with the computing time of the controller if it exceeded one sample."""
         where = f"the sample at {max(self._at, 0) / self.rate:.6g} s"
         if self._since is not None and fault.startswith("stopped by"):
             return f"{fault}: the controller had not answered to {where} for {self.clock() - self._since:.3g} s"
@@ -214,7 +213,7 @@ class Loop:
 
 
 def _currents(answer: object, limits: tuple[float, float]) -> tuple[Floats, str]:
-    """The two currents of an answer, shape (1, 2), or what is wrong with it."""
+    """Validate a controller output: currents, shape (1, 2), and an error text or ""."""
     nothing = np.zeros((1, 2))
     if answer is None:
         return nothing, "returned nothing; return both currents [A], such as (0.1, 0.0)"
@@ -246,7 +245,7 @@ def _currents(answer: object, limits: tuple[float, float]) -> tuple[Floats, str]
 
 
 def _numbers(reference: ArrayLike) -> Floats:
-    """A reference as numbers, shape (rows, 2) or (2,)."""
+    """Validate a reference array of shape (rows, 2) or (2,)."""
     try:
         raw = np.asarray(reference)
         good = raw.dtype.kind in "fiu" and raw.ndim in (1, 2) and raw.shape[-1] == 2
@@ -261,7 +260,7 @@ def _numbers(reference: ArrayLike) -> Floats:
 
 
 def _rows(given: Floats, rows: int, rate: float, travel: tuple[float, float]) -> Floats:
-    """One row a sample, all of them within the arm's travel."""
+    """Expand the reference to one row per sample; raise if it exceeds the arm's travel."""
     reference = np.tile(given, (rows, 1)) if given.ndim == 1 else given
     if len(reference) != rows:
         raise DataError(
@@ -286,8 +285,8 @@ def _rows(given: Floats, rows: int, rate: float, travel: tuple[float, float]) ->
     return reference
 
 
-def _told(controller: Controller) -> dict[str, Any]:
-    """What a run says of its controller."""
+def _describe_controller(controller: Controller) -> dict[str, Any]:
+    """Return the description of a controller for the metadata of a run."""
     name = getattr(controller, "__name__", type(controller).__name__)
     told: dict[str, Any] = {"name": str(name)[:100]}
     describe = getattr(controller, "to_dict", None)
@@ -297,11 +296,12 @@ def _told(controller: Controller) -> dict[str, Any]:
         size = len(json.dumps(told, allow_nan=False))
     except (TypeError, ValueError, RecursionError) as error:
         raise ModelError(
-            f"what to_dict() of the controller returns is no JSON ({words_of(error, 200)}); correct it"
+            f"what to_dict() of the controller returns is no JSON ({error_text(error, 200)}); correct it"
         ) from None
-    if size > SAID:
+    if size > MAX_CONTROLLER_JSON_CHARACTERS:
         raise ModelError(
-            f"what to_dict() of the controller returns is {size} characters long, more than the {SAID} that a run says "
+            f"what to_dict() of the controller returns is {size} characters long, more than the "
+            f"{MAX_CONTROLLER_JSON_CHARACTERS} that a run says "
             "of its controller; leave out what no reader needs"
         )
     return told

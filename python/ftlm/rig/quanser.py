@@ -1,6 +1,6 @@
-"""The arm on a Q8-USB board, through the vendor's Python package; timed by the board's blocking read.
+"""Q8-USB board through the vendor's Python package, timed by the board's blocking read.
 
-No board was available while this was written: it is tested against a stand-in that keeps the package's names, types,
+No board was available during development: the module is tested against a stand-in with the package's names, types,
 error codes and rules. See docs/rig.md before the first run on hardware.
 """
 
@@ -18,30 +18,30 @@ import numpy as np
 
 from ftlm import _core
 from ftlm.errors import RigFault
-from ftlm.rig.rig import COLUMNS, EXPIRED, check_rate, check_watchdog, unset
+from ftlm.rig.rig import RIG_COLUMNS, WATCHDOG_EXPIRED_MESSAGE, check_rate, check_watchdog, missing_expiration_state
 from ftlm.utils.validation import Floats
 
-#: Up to here the board's normal update rate does [Hz]; above, the fast one.
-RATE_NORMAL = 1000.0
+#: Highest rate of the board's normal update mode [Hz]; above it the fast mode is used.
+MAX_NORMAL_RATE_HZ = 1000.0
 ANALOG_IN = np.arange(4, dtype=np.uint32)
 ANALOG_OUT = np.arange(2, dtype=np.uint32)
-ENCODERS = np.arange(2, dtype=np.uint32)
-SWITCHES = np.arange(4, dtype=np.uint32)
+ENCODER_CHANNELS = np.arange(2, dtype=np.uint32)
+SWITCH_CHANNELS = np.arange(4, dtype=np.uint32)
 #: Amplifier enable of both stages (active low) and master enable (active high).
-ENABLES = np.array([0, 1, 4], dtype=np.uint32)
-ON, OFF = np.array([0, 0, 1], dtype=np.int8), np.array([1, 1, 0], dtype=np.int8)
-#: Every digital output of the board: the watchdog's rule is about all of them.
+ENABLE_CHANNELS = np.array([0, 1, 4], dtype=np.uint32)
+ENABLE_STATES_ON, ENABLE_STATES_OFF = np.array([0, 0, 1], dtype=np.int8), np.array([1, 1, 0], dtype=np.int8)
+#: All digital outputs of the board; the watchdog requires an expiration state for each of them.
 DIGITAL_OUT = np.arange(8, dtype=np.uint32)
-TRISTATE = 2
-X4 = 4
+DIGITAL_STATE_TRISTATE = 2
+QUADRATURE_MODE_X4 = 4
 OVERFLOW_IS_AN_ERROR = 0
-ENDLESS = 0x7FFFFFFF
+UNLIMITED_SAMPLES = 0x7FFFFFFF
 OPTIONS_SIZE = 256
-#: `watchdog_clear` at start-up, when there is nothing to clear.
+#: Error code of `watchdog_clear` when the watchdog has not expired.
 NOTHING_TO_CLEAR = -599
-#: The board's clock and the computer's drift apart; delays are counted from an instant that follows by this share.
-DRIFT = 1e-3
-WORDS = {
+#: Bound on the relative drift between board and computer clocks; the reference of the delays follows at this rate.
+CLOCK_DRIFT_RATIO = 1e-3
+ERROR_MESSAGES = {
     -108: "no Q8-USB board was found; plug it in, switch it on, and check --card",
     -109: "the board is in use by another program; close that program",
     -111: "the buffer overflowed and samples were lost; lower the rate or the machine's load",
@@ -79,7 +79,7 @@ def _no_library(error: OSError) -> RigFault:
 
 
 def driver_state(card: str = "0") -> str:
-    """Whether a board could be used, in words: package, library, then the board itself, opened and closed."""
+    """Describe whether a board is usable: vendor package, library, and a test that opens the board."""
     try:
         _driver()
     except RigFault as fault:
@@ -95,16 +95,16 @@ def driver_state(card: str = "0") -> str:
 
 
 class QuanserBoard:
-    """The Q8-USB behind the vendor's `HIL`.
+    """Q8-USB board, accessed by the vendor's `HIL` class.
 
     Parameters
     ----------
     card
         Identifier, such as ``"0"`` or ``"0@tcpip://host:port"``.
     clock
-        Seconds, to see delays with.
+        Clock [s] for the measurement of delays.
     sleep
-        Waits seconds, for the watchdog.
+        Function that waits a number of seconds, for the watchdog.
     """
 
     name = "Q8-USB"
@@ -125,13 +125,13 @@ class QuanserBoard:
         self._module: ModuleType | None = None
         self._task: Any = None
         self._watched = False
-        self._lapsed = False
+        self._is_expired = False
         self._seconds = 0.0
         self._analog_safe = False
         self._digital_safe = False
         self._analog = np.zeros(len(ANALOG_IN), dtype=np.float64)
-        self._counts = np.zeros(len(ENCODERS), dtype=np.int32)
-        self._digital = np.zeros(len(SWITCHES), dtype=np.int8)
+        self._counts = np.zeros(len(ENCODER_CHANNELS), dtype=np.int32)
+        self._digital = np.zeros(len(SWITCH_CHANNELS), dtype=np.int8)
         self._volts = np.zeros(len(ANALOG_OUT), dtype=np.float64)
         self._rows: list[list[float]] = []
         self._rate = 0.0
@@ -139,7 +139,7 @@ class QuanserBoard:
         self._origin = math.inf
 
     def open(self) -> None:
-        """Takes possession of the board."""
+        """Open the board."""
         module = _driver()
         self._module, self._error = module, module.HILError
         try:
@@ -152,156 +152,163 @@ class QuanserBoard:
             raise _no_library(error) from None
         if not valid:
             self._hil = None
-            raise RigFault(f"Q8-USB: {WORDS[-108]}")
+            raise RigFault(f"Q8-USB: {ERROR_MESSAGES[-108]}")
 
     def configure(self, rate: float) -> None:
-        """Ranges, directions, encoders, outputs at zero, and one reader for all channels: one sample instant."""
+        """Set ranges, directions and encoders, zero the outputs, and create one reader for simultaneous sampling."""
         check_rate(rate)
         self._rate = rate
-        speed = "normal" if rate <= RATE_NORMAL else "fast"
+        speed = "normal" if rate <= MAX_NORMAL_RATE_HZ else "fast"
         low_in, low_out = np.full(len(ANALOG_IN), -10.0), np.full(len(ANALOG_OUT), -10.0)
-        with self._spoken("configuring the board") as hil:
+        with self._translate_errors("configuring the board") as hil:
             try:
                 hil.watchdog_clear()
             except self._error as error:
                 if getattr(error, "error_code", None) != NOTHING_TO_CLEAR:
                     raise
             else:
-                # Clearing an expiry brings back what was put out before it.
+                # Clearing an expired watchdog restores the previous outputs.
                 self._write((0.0, 0.0))
-                hil.write_digital(ENABLES, len(ENABLES), OFF)
-            self._lapsed = False
+                hil.write_digital(ENABLE_CHANNELS, len(ENABLE_CHANNELS), ENABLE_STATES_OFF)
+            self._is_expired = False
             hil.set_card_specific_options(f"update_rate={speed};decimation=1", OPTIONS_SIZE)
             hil.set_analog_input_ranges(ANALOG_IN, len(ANALOG_IN), low_in, -low_in)
             hil.set_analog_output_ranges(ANALOG_OUT, len(ANALOG_OUT), low_out, -low_out)
-            hil.set_digital_directions(SWITCHES, len(SWITCHES), ENABLES, len(ENABLES))
+            hil.set_digital_directions(SWITCH_CHANNELS, len(SWITCH_CHANNELS), ENABLE_CHANNELS, len(ENABLE_CHANNELS))
             self._write((0.0, 0.0))
-            hil.write_digital(ENABLES, len(ENABLES), OFF)
-            modes = np.full(len(ENCODERS), X4, dtype=np.int32)
-            hil.set_encoder_quadrature_mode(ENCODERS, len(ENCODERS), modes)
-            hil.set_encoder_counts(ENCODERS, len(ENCODERS), np.zeros(len(ENCODERS), dtype=np.int32))
+            hil.write_digital(ENABLE_CHANNELS, len(ENABLE_CHANNELS), ENABLE_STATES_OFF)
+            modes = np.full(len(ENCODER_CHANNELS), QUADRATURE_MODE_X4, dtype=np.int32)
+            hil.set_encoder_quadrature_mode(ENCODER_CHANNELS, len(ENCODER_CHANNELS), modes)
+            hil.set_encoder_counts(
+                ENCODER_CHANNELS, len(ENCODER_CHANNELS), np.zeros(len(ENCODER_CHANNELS), dtype=np.int32)
+            )
             self._task = hil.task_create_reader(
                 max(2, round(rate / 10.0)),
                 ANALOG_IN,
                 len(ANALOG_IN),
-                ENCODERS,
-                len(ENCODERS),
-                SWITCHES,
-                len(SWITCHES),
+                ENCODER_CHANNELS,
+                len(ENCODER_CHANNELS),
+                SWITCH_CHANNELS,
+                len(SWITCH_CHANNELS),
                 None,
                 0,
             )
             hil.task_set_buffer_overflow_mode(self._task, OVERFLOW_IS_AN_ERROR)
 
     def set_expiration(self) -> None:
-        """0 V, and every digital line in tristate: without the second the analog outputs would stay."""
-        with self._spoken("setting the watchdog's expiration states") as hil:
+        """Set the expiration states to 0 V and tristate; without tristate lines the analog outputs would stay."""
+        with self._translate_errors("setting the watchdog's expiration states") as hil:
             hil.watchdog_set_analog_expiration_state(ANALOG_OUT, len(ANALOG_OUT), np.zeros(len(ANALOG_OUT)))
             self._analog_safe = True
-            states = np.full(len(DIGITAL_OUT), TRISTATE, dtype=np.int32)
+            states = np.full(len(DIGITAL_OUT), DIGITAL_STATE_TRISTATE, dtype=np.int32)
             hil.watchdog_set_digital_expiration_state(DIGITAL_OUT, len(DIGITAL_OUT), states)
             self._digital_safe = True
 
     def unsafe(self) -> str | None:
-        """What was not set."""
-        return unset(analog=self._analog_safe, digital=self._digital_safe)
+        """Message on the expiration state that is not set; None if all are set."""
+        return missing_expiration_state(analog=self._analog_safe, digital=self._digital_safe)
 
     def start_watchdog(self, seconds: float) -> None:
-        """Starts the board's watchdog."""
+        """Start the watchdog of the board."""
         missing = self.unsafe()
         if missing is not None:
             raise RigFault(f"Q8-USB: {missing}")
         check_watchdog(self._rate, seconds)
-        with self._spoken("starting the watchdog") as hil:
+        with self._translate_errors("starting the watchdog") as hil:
             self._seconds = float(seconds)
             hil.watchdog_start(self._seconds)
             self._watched = True
 
     def start(self, rate: float) -> None:
-        """Starts the task on the board's own clock."""
-        with self._spoken("starting the task") as hil:
+        """Start the sampling task on the clock of the board."""
+        with self._translate_errors("starting the task") as hil:
             clocks = getattr(self._module, "Clock", None)
-            hil.task_start(self._task, getattr(clocks, "HARDWARE_CLOCK_0", 0), float(rate), ENDLESS)
+            hil.task_start(self._task, getattr(clocks, "HARDWARE_CLOCK_0", 0), float(rate), UNLIMITED_SAMPLES)
 
     def enable(self, on: bool) -> None:
-        """Switches the amplifiers."""
+        """Enable or disable the amplifiers."""
         if self._hil is None:
             return
-        with self._spoken("switching the amplifiers") as hil:
-            self._allowed(lambda: hil.write_digital(ENABLES, len(ENABLES), ON if on else OFF), done=not on)
+        with self._translate_errors("switching the amplifiers") as hil:
+            self._run_unless_expired(
+                lambda: hil.write_digital(
+                    ENABLE_CHANNELS, len(ENABLE_CHANNELS), ENABLE_STATES_ON if on else ENABLE_STATES_OFF
+                ),
+                done=not on,
+            )
 
     def write(self, volts: tuple[float, float]) -> None:
-        """Puts volts out; where the watchdog has locked the board, 0 V is out already."""
+        """Write output voltages; 0 V is accepted even if the watchdog has locked the board."""
         if self._hil is None:
             return
-        with self._spoken("writing"):
-            self._allowed(lambda: self._write(volts), done=volts == (0.0, 0.0))
+        with self._translate_errors("writing"):
+            self._run_unless_expired(lambda: self._write(volts), done=volts == (0.0, 0.0))
 
     def rest(self, guard: _core.Guard, samples: int) -> None:
-        """Samples with 0 V out."""
+        """Sample with outputs at 0 V."""
         for _ in range(samples):
             if self._read(guard) is None:
                 return
             guard.rest(self._analog.tolist(), self._counts.tolist(), self._digital.tolist())
-            self._put(guard, (0.0, 0.0))
+            self._reload_and_write(guard, (0.0, 0.0))
             if guard.fault is not None:
                 return
 
     def run(self, guard: _core.Guard, commands: Floats) -> None:
-        """Samples under commands; each read blocks until the board has one."""
+        """Sample while applying commands; each read blocks until the board has a sample."""
         for command in commands:
             late = self._read(guard)
             if late is None:
                 return
             values = guard.read(self._analog.tolist(), self._counts.tolist(), self._digital.tolist(), late)
             volts = guard.command(command)
-            # A reading that is no number is a fault, which says so, and no measurement.
+            # A sample that is not finite is a fault and is not recorded.
             if all(map(math.isfinite, values)):
                 self._rows.append([*guard.written, *values, late])
-            self._put(guard, (volts[0], volts[1]))
+            self._reload_and_write(guard, (volts[0], volts[1]))
             if guard.fault is not None:
                 return
 
     def take(self) -> Floats:
-        """Rows since the last call."""
+        """Return the rows since the last call."""
         rows, self._rows = self._rows, []
-        return np.array(rows, dtype=np.float64).reshape(-1, len(COLUMNS) + 1)
+        return np.array(rows, dtype=np.float64).reshape(-1, len(RIG_COLUMNS) + 1)
 
     def stop(self) -> None:
-        """Stops the task and gives it back."""
+        """Stop and delete the sampling task."""
         if self._hil is not None and self._task is not None:
             task, self._task = self._task, None
-            with self._spoken("stopping the task") as hil:
+            with self._translate_errors("stopping the task") as hil:
                 try:
                     hil.task_stop(task)
                 finally:
                     hil.task_delete(task)
 
     def let_expire(self) -> bool:
-        """Waits half as long again as the watchdog does, and asks the board."""
-        if self._hil is None or self._lapsed:
+        """Wait 1.5 watchdog timeouts, and return whether the watchdog has expired."""
+        if self._hil is None or self._is_expired:
             return True
         if not self._watched:
             return False
         self._sleep(1.5 * self._seconds + 0.05)
-        return self._expired()
+        return self._has_expired()
 
     def stop_watchdog(self) -> None:
-        """Stops the watchdog; one that has expired is left as it is, since what it put out is to stay."""
-        if self._hil is not None and self._watched and not self._lapsed:
+        """Stop the watchdog; an expired one is left alone, because its safe outputs must stay."""
+        if self._hil is not None and self._watched and not self._is_expired:
             self._watched = False
-            with self._spoken("stopping the watchdog") as hil:
+            with self._translate_errors("stopping the watchdog") as hil:
                 hil.watchdog_stop()
 
     def close(self) -> None:
-        """Lets go of the board."""
+        """Close the board."""
         if self._hil is not None:
             hil, self._hil = self._hil, None
-            with self._spoken("closing the board", hil):
+            with self._translate_errors("closing the board", hil):
                 hil.close()
 
     def describe(self) -> str:
-        """What the board says of itself; empty when it says nothing."""
+        """Product name of the board in parentheses; empty if it cannot be read."""
         try:
             codes = getattr(import_module("quanser.hardware.enumerations"), "StringProperty", None)
             text = string_property(self._hil, getattr(codes, "PRODUCT_NAME", 1))
@@ -310,8 +317,8 @@ class QuanserBoard:
         return f" ({text})" if text else ""
 
     def _read(self, guard: _core.Guard) -> float | None:
-        """One sample into the buffers; how late it came [s], None where the board stopped sampling."""
-        with self._spoken("reading", guard=guard) as hil:
+        """Read one sample into the buffers; return its delay [s], None if sampling has stopped."""
+        with self._translate_errors("reading", guard=guard) as hil:
             count = hil.task_read(self._task, 1, self._analog, self._counts, self._digital, None)
             if count < 1:
                 guard.fail("Q8-USB: the board's task stopped and handed over no sample: samples were lost")
@@ -319,14 +326,14 @@ class QuanserBoard:
                 return None
         since = self.clock() - self._samples / self._rate
         self._samples += 1
-        self._origin = min(self._origin + DRIFT / self._rate, since)
+        self._origin = min(self._origin + CLOCK_DRIFT_RATIO / self._rate, since)
         return since - self._origin
 
-    def _put(self, guard: _core.Guard, volts: tuple[float, float]) -> None:
-        with self._spoken("writing", guard=guard) as hil:
+    def _reload_and_write(self, guard: _core.Guard, volts: tuple[float, float]) -> None:
+        with self._translate_errors("writing", guard=guard) as hil:
             if not hil.watchdog_reload():
-                self._lapsed = True
-                guard.fail(EXPIRED)
+                self._is_expired = True
+                guard.fail(WATCHDOG_EXPIRED_MESSAGE)
                 return
             self._write(volts)
 
@@ -334,33 +341,33 @@ class QuanserBoard:
         self._volts[:] = volts
         self._hil.write_analog(ANALOG_OUT, len(ANALOG_OUT), self._volts)
 
-    def _allowed(self, act: Callable[[], None], *, done: bool) -> None:
-        """Acts, unless the watchdog has expired and has `done` it.
+    def _run_unless_expired(self, act: Callable[[], None], *, done: bool) -> None:
+        """Perform an action; ignore its error if the watchdog has expired and has already `done` it.
 
-        The lock stays: clearing it brings back what was put out before.
+        The board stays locked, because clearing the watchdog would restore the previous outputs.
         """
         try:
             act()
         except self._error:
-            if not (done and self._expired()):
+            if not (done and self._has_expired()):
                 raise
 
-    def _expired(self) -> bool:
-        """Whether the watchdog has expired; False where the board does not say."""
+    def _has_expired(self) -> bool:
+        """Whether the watchdog has expired; False if the board cannot be asked."""
         if not self._watched:
             return False
         try:
-            self._lapsed = self._lapsed or not self._hil.watchdog_reload()
+            self._is_expired = self._is_expired or not self._hil.watchdog_reload()
         except self._error:
             return False
-        return self._lapsed
+        return self._is_expired
 
-    def _spoken(self, what: str, hil: Any = None, guard: _core.Guard | None = None) -> _Spoken:
-        return _Spoken(self, what, self._hil if hil is None else hil, guard)
+    def _translate_errors(self, what: str, hil: Any = None, guard: _core.Guard | None = None) -> _ErrorTranslator:
+        return _ErrorTranslator(self, what, self._hil if hil is None else hil, guard)
 
     def _fault(self, what: str, error: Exception) -> RigFault:
         code = getattr(error, "error_code", None)
-        words = WORDS.get(code) if isinstance(code, int) else None
+        words = ERROR_MESSAGES.get(code) if isinstance(code, int) else None
         if words is None:
             try:
                 said = str(error.get_error_message())  # type: ignore[attr-defined]
@@ -370,15 +377,15 @@ class QuanserBoard:
         return RigFault(f"Q8-USB, {what}: {words}")
 
 
-class _Spoken:
-    """The vendor's errors in words; latched where a run was under way.
+class _ErrorTranslator:
+    """Context manager that translates vendor errors to `RigFault`, and latches them during a run.
 
     Parameters
     ----------
     board, what, hil
-        Whose, doing what, with which handle.
+        Board, name of the operation, and vendor handle.
     guard
-        Of the run that is under way.
+        Guard of the current run, or None.
     """
 
     def __init__(self, board: QuanserBoard, what: str, hil: Any, guard: _core.Guard | None) -> None:
@@ -395,15 +402,15 @@ class _Spoken:
             return
         fault = board._fault(self._what, error)
         if self._guard is not None:
-            # A locked board refuses whatever is called next with an error of its own; the cause is the expiry.
-            if board._expired():
-                fault = RigFault(f"{EXPIRED} (Q8-USB, {self._what})")
+            # A locked board rejects every further call with its own error; report the expiry as the cause.
+            if board._has_expired():
+                fault = RigFault(f"{WATCHDOG_EXPIRED_MESSAGE} (Q8-USB, {self._what})")
             self._guard.fail(str(fault))
         raise fault from None
 
 
 def string_property(hil: Any, code: Any, size: int = 64) -> str:
-    """A text that the board knows; empty with the package of 2022, whose call writes past its own buffer."""
+    """Read a string property; empty for the 2022 package, whose call overflows its buffer."""
     if len(signature(hil.get_string_property).parameters) != 2:
         return ""
     return str(hil.get_string_property(code, size))

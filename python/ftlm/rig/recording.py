@@ -1,4 +1,4 @@
-"""The file that keeps what an experiment has recorded so far."""
+"""Recording of experiments: command sources, recording loop and partial files."""
 
 from __future__ import annotations
 
@@ -14,63 +14,63 @@ from typing import Any, Literal, Protocol
 
 import numpy as np
 
-from ftlm.data.construction import Asked
+from ftlm.data.construction import RunArguments
 from ftlm.data.export import Header
-from ftlm.data.run import Run, built
+from ftlm.data.run import Run, build_run
 from ftlm.errors import DataError, FtlmError, ModelError, RigFault
 from ftlm.estimation.linear import Streaming
 from ftlm.rig.arm_parameters import ArmParameters
-from ftlm.rig.excitation import INPUTS, Excitation, finite
+from ftlm.rig.excitation import CURRENT_SIGNALS, Excitation, finite_number
 from ftlm.rig.quanser import QuanserBoard
-from ftlm.rig.rig import COLUMNS, LONGEST, Board, Limits, Rig
+from ftlm.rig.rig import MAX_RUN_DURATION_S, RIG_COLUMNS, Board, Limits, Rig
 from ftlm.rig.virtual_board import VirtualBoard
-from ftlm.utils.files import RUN, check_free
-from ftlm.utils.validation import CSV_TIME, Floats, check_choice, check_seed, is_run_name, shown
+from ftlm.utils.files import RUN_MESSAGES, check_free
+from ftlm.utils.validation import CSV_TIME, Floats, check_choice, check_seed, is_run_name, short_repr
 
-UNITS = {name: "A" if name.startswith("I") else "rad" for name in COLUMNS}
+COLUMN_UNITS = {name: "A" if name.startswith("I") else "rad" for name in RIG_COLUMNS}
 
 
 def units_of(told: tuple[str, ...] = ()) -> dict[str, str]:
-    """Units of a run's columns; what a run tells besides are angles."""
-    return UNITS | dict.fromkeys(told, "rad")
+    """Return the units of the columns of a run; additional signals are angles [rad]."""
+    return COLUMN_UNITS | dict.fromkeys(told, "rad")
 
 
-def partial_of(target: Path) -> Path:
-    """Where the rows of a run are until it has ended."""
+def partial_path(target: Path) -> Path:
+    """Return the path of the partial file of a run."""
     return target.with_name(target.stem + ".csv.partial")
 
 
-class Partial:
-    """Rows on disk while they come: a csv file beside the one asked for, which loads should the program die.
+class PartialRecording:
+    """Partial csv file of a running experiment, which can be loaded if the program terminates unexpectedly.
 
     Parameters
     ----------
     target
-        The file asked for; None keeps nothing on disk.
+        Final file; None writes nothing to disk.
     name, step, about
-        Of the run.
+        Name, step [s] and metadata of the run.
     told
-        Names of its further inputs, which follow the rig's columns in every row.
+        Names of additional inputs, appended to the rig's columns in every row.
     """
 
     def __init__(
         self, target: Path | None, name: str, step: float, about: dict[str, Any], told: tuple[str, ...] = ()
     ) -> None:
-        self.path = None if target is None else partial_of(target)
+        self.path = None if target is None else partial_path(target)
         self._step, self._rows = step, 0
-        self._columns = (*COLUMNS, *told)
-        #: Rows that are on disk, whole.
+        self._columns = (*RIG_COLUMNS, *told)
+        #: Number of complete rows on disk.
         self.kept = 0
         self._descriptor: int | None = None
         if self.path is None:
             return
-        inputs = (*INPUTS, *told)
+        inputs = (*CURRENT_SIGNALS, *told)
         header = Header(
             name,
             step,
             0.0,
             inputs,
-            tuple(COLUMNS[2:]),
+            tuple(RIG_COLUMNS[2:]),
             units_of(told),
             dict.fromkeys(inputs, "zoh"),
             ("the recording did not end: the program died, or the disk was full",),
@@ -79,7 +79,7 @@ class Partial:
         lines = f"{header.line()}{','.join([CSV_TIME, *self._columns])}\n"
         flags = os.O_WRONLY | os.O_CREAT | os.O_EXCL | getattr(os, "O_BINARY", 0)
         try:
-            # Whoever overwrites a link means the link, not what it leads to.
+            # Replace a symbolic link itself, not its target.
             self.path.unlink(missing_ok=True)
             self._descriptor = os.open(self.path, flags, 0o666)
             self._append(lines.encode())
@@ -91,12 +91,12 @@ class Partial:
             ) from None
 
     def write(self, rows: Floats) -> None:
-        """Appends rows, shape (n, columns).
+        """Append rows, shape (n, columns).
 
         Raises
         ------
         RigFault
-            They cannot be written; whole rows stay.
+            The rows cannot be written; complete rows stay in the file.
         """
         if self._descriptor is None or len(rows) == 0:
             self._rows += len(rows)
@@ -124,30 +124,30 @@ class Partial:
             raise
 
     def close(self) -> None:
-        """Closes the file."""
+        """Close the file."""
         if self._descriptor is not None:
             with contextlib.suppress(OSError):
                 os.close(self._descriptor)
             self._descriptor = None
 
     def remove(self) -> None:
-        """Closes and removes it: the run is in its own file."""
+        """Close and delete the file, once the run has its final file."""
         self.close()
         if self.path is not None:
             with contextlib.suppress(OSError):
                 self.path.unlink()
 
 
-def saved(
+def save_run(
     run: Run | None,
     target: Path | None,
-    partial: Partial,
+    partial: PartialRecording,
     *,
     force: bool,
     ended: BaseException | None,
     faults: list[str],
 ) -> Run:
-    """Write the run, and raise what ended it."""
+    """Write the run to its final file, and raise the exception that ended it."""
     place = "nothing was recorded until then"
     if run is not None:
         place = f"{run.length} rows were recorded until then"
@@ -172,15 +172,15 @@ def saved(
     if ended is not None or faults or run is None:
         fault = RigFault(f"{'; '.join(faults) or 'no sample was read'}; {place}")
         fault.run = run
-        # What made a controller fail is its own to show.
+        # Keep the exception of a controller as the cause.
         raise fault from (None if ended is None else ended.__cause__)
     return run
 
 
 #: The stock low-pass of the deflections: natural frequency [rad/s] and damping.
 STOCK_FILTER = (math.sqrt(157.9137), 22.6195 / (2.0 * math.sqrt(157.9137)))
-#: Rows that are handed over at a time. In real time they are few, so that writing them takes less than a sample.
-_ROWS_PACED, _ROWS_FAST = 32, 500
+#: Rows per block on disk; in real time few, so that writing a block takes less than a sample.
+_BLOCK_ROWS_REAL_TIME, _BLOCK_ROWS_FAST = 32, 500
 
 
 def record(
@@ -209,79 +209,79 @@ def record(
     live: Streaming | None = None,
     progress: Callable[[int, int], None] | None = None,
 ) -> Run:
-    """Drive both motors of a rig and record currents and angles.
+    """Apply a current signal to both motors of a rig and record currents and angles.
 
-    Every command is clamped, slew-limited and limited by the motors' heat in the innermost write; every sample is
-    checked. However the recording ends, 0 V is written and the amplifiers are disabled, and what was recorded until
-    then is kept.
+    Every command is limited in amplitude, slew rate and thermal load, and every sample is checked. However the
+    recording ends, 0 V is written, the amplifiers are disabled, and the samples recorded so far are kept.
 
     Parameters
     ----------
     rig : {"virtual", "q8"} or Board, default "virtual"
-        The simulated arm, the arm on a Q8-USB board, or a board of your own.
+        The simulated arm, the arm on a Q8-USB board, or a user-defined board.
     input : str
         Shape of the current, see `Excitation`: square, sine, chirp, multisine, prbs, doublet or csv.
     amplitude : float or pair of float
         Largest current [A], at most 0.94 and 1.2.
     period : float, optional
-        [s]; of a prbs the time between two decisions.
+        Period [s]; for prbs the switching interval.
     band : pair of float
-        Of chirp and multisine [Hz].
+        Frequency band of chirp and multisine [Hz].
     ramp : float
-        Time over which the amplitude grows from zero [s].
+        Duration of the linear ramp of the amplitude from zero [s].
     file : path, optional
         Currents for ``input="csv"``, columns I1 and I2 [A].
     duration : float
-        [s], above 0 and at most `limit`.
+        Duration [s], above 0 and at most `limit`.
     limit : float
-        Longest run that is allowed [s], at most 600.
+        Longest permitted duration [s], at most 600.
     rate : float
-        Samples per second; the board does up to 8000.
+        Sampling rate [Hz]; at most 8000 on the board.
     seed : int
-        Of the virtual rig's noise and of random inputs. Equal seeds give equal runs.
+        Seed of the simulated noise and of random inputs. Equal seeds give equal runs.
     parameters : str, path or ArmParameters
-        Of the virtual arm: ``"effective"``, ``"measured"``, ``"linear"`` (no friction, coupling or noise), a TOML file.
+        Parameters of the simulated arm: ``"effective"``, ``"measured"``, ``"linear"`` (no friction, coupling or noise)
+        or a TOML file.
     offset : pair of float, optional
-        What drives each motor of the virtual arm besides its command while the amplifiers are enabled [A]; default that
-        of its parameters, 0. It belongs to a run: real ones have another each.
+        Current offset of each motor of the simulated arm while the amplifiers are enabled [A]; default that of its
+        parameters, 0. On hardware the offset differs from run to run.
     paced : bool
         Whether the virtual rig runs in real time.
     sensor_filter : {"stock"}, optional
         Record deflections behind the stock 2 Hz low-pass.
     watchdog : float
-        Time after which the watchdog stops the motors [s], 0.01 to 1.
+        Timeout after which the watchdog stops the motors [s], 0.01 to 1.
     arm : bool
-        Must be True for real hardware: the arm is going to move.
+        Must be True for hardware, as confirmation that the arm may move.
     card : str
-        Which Q8-USB, such as ``"0"`` or ``"0@tcpip://host:port"``.
+        Identifier of the Q8-USB, such as ``"0"`` or ``"0@tcpip://host:port"``.
     name : str, optional
-        Of the run; default the input's shape.
+        Name of the run; default the shape of the input.
     out : path, optional
         File to write, .csv or .parquet.
     force : bool
-        Whether to overwrite it.
+        Whether to overwrite an existing file.
     live : Streaming, optional
-        Identification that takes every sample while the run is recorded; the run's `about` says its last estimate.
+        Recursive identification of every recorded sample; the run's `metadata` holds the last estimate.
     progress : callable, optional
-        Called with rows recorded and rows in all, after `live` has taken them.
+        Called with the recorded and the total number of rows, after the update of `live`.
 
     Returns
     -------
     Run
-        I1, I2 [A] as written, held; theta11, theta12, theta21, theta22 [rad] and I1_measured, I2_measured [A]. Its
-        `about` says rig, seed, input, parameters, missed deadlines and faults.
+        Inputs I1, I2 [A] as commanded (zero-order hold); outputs theta11, theta12, theta21, theta22 [rad] and
+        I1_measured, I2_measured [A]. `metadata` holds rig, seed, input, parameters, missed deadlines and faults.
 
     Raises
     ------
     ModelError
-        An argument that is out of range, real hardware without ``arm=True``; nothing has moved.
+        An argument out of range, or hardware without ``arm=True``; the arm has not moved.
     DataError
-        A file that cannot be read, or that is there already; nothing has moved.
+        A file that cannot be read or exists already; the arm has not moved.
     RigFault
-        The rig stopped the run. The cause is in words; what was recorded is in `run` and in the file.
+        The rig stopped the run. The message states the cause; `run` and the file hold the recorded samples.
     BaseException
-        Ctrl-C, SIGTERM, or what `progress` raised, after the way out and when what was recorded is in the file; its
-        notes say what went wrong on the way out.
+        Ctrl-C, SIGTERM, or an exception of `progress`, raised after shutdown and after the file is written; its notes
+        list errors during shutdown.
     """
     seed = check_seed(seed)
     duration, limit, rate = check_times(duration, limit, rate)
@@ -306,29 +306,29 @@ def record(
         live,
         progress,
     )
-    return asked.recorded(lambda board: Given(commands), {"input": excitation.to_dict()})
+    return asked.record_run(lambda board: FixedCommands(commands), {"input": excitation.to_dict()})
 
 
-class Source(Protocol):
-    """What asks for commands while a run is recorded."""
+class CommandSource(Protocol):
+    """Source of the commands of a run."""
 
     rows: int
-    #: Further columns of the run by name, a row for each of its samples.
-    told: dict[str, Floats]
+    #: Additional signals of the run by name, one value per sample.
+    extra_signals: dict[str, Floats]
 
-    def first(self, rig: Rig, block: int) -> Floats:
-        """The first commands, shape (n, 2) [A]; at most `block` of them where none depends on a measurement."""
+    def first_commands(self, rig: Rig, block: int) -> Floats:
+        """Return the first commands, shape (n, 2) [A]; at most `block` rows."""
 
-    def after(self, rows: Floats) -> Floats:
-        """The next commands when these rows have been measured; none when the run is over."""
+    def next_commands(self, rows: Floats) -> Floats:
+        """Return the commands that follow these measured rows; empty at the end of the run."""
 
-    def blamed(self, fault: str) -> str:
-        """A fault of the rig in words, with what the source has to do with it."""
+    def explain_fault(self, fault: str) -> str:
+        """Return a fault message, extended by the role of this source in it."""
 
 
 @dataclass(frozen=True)
 class Experiment:
-    """What a run is asked with; see :func:`record`."""
+    """Arguments of an experiment; see :func:`record`."""
 
     rig: str | Board
     duration: float
@@ -348,18 +348,18 @@ class Experiment:
     live: Streaming | None
     progress: Callable[[int, int], None] | None
 
-    def recorded(self, source_on: Callable[[Board], Source], told: dict[str, Any]) -> Run:
-        """Drive the rig as a source on its board asks, and record it."""
-        # What moves an arm is no matter of what Python takes for true.
+    def record_run(self, source_on: Callable[[Board], CommandSource], told: dict[str, Any]) -> Run:
+        """Run the experiment with a command source and return the recorded run."""
+        # Flags that let an arm move must be bool; truthy values are rejected.
         for name, flag in (("paced", self.paced), ("arm", self.arm), ("force", self.force)):
             if not isinstance(flag, bool):
-                raise ModelError(f"{name} = {shown(flag)} is neither True nor False; use one of them")
+                raise ModelError(f"{name} = {short_repr(flag)} is neither True nor False; use one of them")
         if self.progress is not None and not callable(self.progress):
             raise ModelError(f"progress is a {type(self.progress).__name__}; pass what is called with (done, all)")
         if self.sensor_filter is not None and not (
             isinstance(self.sensor_filter, str) and self.sensor_filter == "stock"
         ):
-            raise ModelError(f"sensor_filter = {shown(self.sensor_filter)} is not known; use 'stock' or None")
+            raise ModelError(f"sensor_filter = {short_repr(self.sensor_filter)} is not known; use 'stock' or None")
         board, known = _board(
             self.rig, self.parameters, self.seed, self.offset, paced=self.paced, horizon=self.limit, card=self.card
         )
@@ -370,7 +370,7 @@ class Experiment:
                 "with arm=True (--arm)"
             )
         if not is_run_name(self.name):
-            raise DataError(f"name={shown(self.name)} cannot name a run")
+            raise DataError(f"name={short_repr(self.name)} cannot name a run")
         target = None if self.out is None else Path(self.out)
         if target is not None:
             _check_target(target, force=self.force)
@@ -396,45 +396,47 @@ class Experiment:
         )
         step, live = 1.0 / self.rate, self.live
         columns = [] if live is None else [_column_of(signal_name) for signal_name in live.signals]
-        partial = Partial(target, self.name, step, about, tuple(source.told))
-        recorder = _Recorder(partial, source, self.progress, live, columns, _ROWS_PACED if paced else _ROWS_FAST)
-        ended, faults = _drive(link, recorder)
+        partial = PartialRecording(target, self.name, step, about, tuple(source.extra_signals))
+        recorder = _Recorder(
+            partial, source, self.progress, live, columns, _BLOCK_ROWS_REAL_TIME if paced else _BLOCK_ROWS_FAST
+        )
+        ended, faults = _run_commands(link, recorder)
         about |= {"missed_deadlines": link.guard.missed, "faults": faults}
         if live is not None:
-            about["live"] = {"coefficients": live.coefficients, "pulses": live.pulses, "trouble": recorder.trouble}
+            about["live"] = {"coefficients": live.coefficients, "pulses": live.pulses, "trouble": recorder.live_error}
         try:
             run = recorder.finish(self.name, about, faults, step)
-            return saved(run, target, recorder.partial, force=self.force, ended=ended, faults=faults)
+            return save_run(run, target, recorder.partial, force=self.force, ended=ended, faults=faults)
         except BaseException:
             recorder.partial.close()
             raise
 
 
-class Given:
-    """Commands that are known before the run, shape (rows, 2) [A]."""
+class FixedCommands:
+    """Command source with precomputed commands, shape (rows, 2) [A]."""
 
     def __init__(self, commands: Floats) -> None:
         self.commands, self.rows = commands, len(commands)
-        self.told: dict[str, Floats] = {}
+        self.extra_signals: dict[str, Floats] = {}
         self._at = self._block = 0
 
-    def first(self, rig: Rig, block: int) -> Floats:
-        """The first block."""
+    def first_commands(self, rig: Rig, block: int) -> Floats:
+        """Return the first block of commands."""
         self._at, self._block = block, block
         return self.commands[:block]
 
-    def after(self, rows: Floats) -> Floats:
-        """The next block, whatever was measured."""
+    def next_commands(self, rows: Floats) -> Floats:
+        """Return the next block of commands; measurements are ignored."""
         start, self._at = self._at, self._at + self._block
         return self.commands[start : start + self._block]
 
-    def blamed(self, fault: str) -> str:
-        """The fault: commands that were known beforehand have nothing to do with it."""
+    def explain_fault(self, fault: str) -> str:
+        """Return the fault message unchanged."""
         return fault
 
 
-def _drive(link: Rig, recorder: _Recorder) -> tuple[BaseException | None, list[str]]:
-    """Runs all commands between a start and a way out; what ended the run early, and every fault in words."""
+def _run_commands(link: Rig, recorder: _Recorder) -> tuple[BaseException | None, list[str]]:
+    """Run all commands; return the exception that ended the run early, and all fault messages."""
     faults: list[str] = []
     ended: BaseException | None = None
     try:
@@ -442,22 +444,22 @@ def _drive(link: Rig, recorder: _Recorder) -> tuple[BaseException | None, list[s
             recorder.follow(link)
     except RigFault as error:
         ended = error
-        faults.append(recorder.source.blamed(str(error)))
+        faults.append(recorder.source.explain_fault(str(error)))
     except (KeyboardInterrupt, SystemExit) as error:
         ended = error
-        faults.append(recorder.source.blamed(stopped_by(error)))
+        faults.append(recorder.source.explain_fault(describe_interruption(error)))
     except BaseException as error:
-        # Of the program, such as one in `progress`: it is raised when what was recorded is in its file.
+        # Error of the program, such as in `progress`; raised again after the recorded samples are written.
         ended = error
         faults.append(f"stopped by an error of the program ({type(error).__name__}: {error})")
     if ended is not None and not isinstance(ended, RigFault):
-        for trouble in link.troubles:
+        for trouble in link.shutdown_errors:
             ended.add_note(trouble)
-    return ended, faults + [t for t in link.troubles if t not in faults]
+    return ended, faults + [t for t in link.shutdown_errors if t not in faults]
 
 
-def stopped_by(ended: KeyboardInterrupt | SystemExit) -> str:
-    """What stopped a run from outside, in words."""
+def describe_interruption(ended: KeyboardInterrupt | SystemExit) -> str:
+    """Describe the interruption of a run by a signal or an exit."""
     if isinstance(ended, KeyboardInterrupt):
         return "stopped by Ctrl-C"
     number = ended.code - 128 if isinstance(ended.code, int) else 0
@@ -466,12 +468,12 @@ def stopped_by(ended: KeyboardInterrupt | SystemExit) -> str:
 
 
 class _Recorder:
-    """Takes rows from a rig, to disk and to memory."""
+    """Recorder of the rows of a rig, in memory and on disk."""
 
     def __init__(
         self,
-        partial: Partial,
-        source: Source,
+        partial: PartialRecording,
+        source: CommandSource,
         progress: Callable[[int, int], None] | None,
         live: Streaming | None,
         columns: list[int],
@@ -479,15 +481,15 @@ class _Recorder:
     ) -> None:
         self.partial, self.source, self.progress = partial, source, progress
         self.live, self.columns, self.block = live, columns, block
-        self.trouble: str | None = None
+        self.live_error: str | None = None
         self.blocks: list[Floats] = []
         self.waiting: list[Floats] = []
         self.done = 0
 
     def follow(self, rig: Rig) -> None:
-        """Runs all that the source asks for; rows are kept a block at a time."""
+        """Run the commands of the source and store the rows in blocks."""
         try:
-            commands = self.source.first(rig, self.block)
+            commands = self.source.first_commands(rig, self.block)
             while len(commands):
                 try:
                     rig.run(commands)
@@ -496,42 +498,44 @@ class _Recorder:
                     self.waiting.append(rows)
                 if sum(map(len, self.waiting)) >= self.block:
                     self.flush()
-                commands = self.source.after(rows)
+                commands = self.source.next_commands(rows)
         finally:
             self.flush()
 
     def flush(self) -> None:
-        """Keeps the rows that wait."""
-        rows, self.waiting = np.concatenate([np.empty((0, len(COLUMNS) + 1)), *self.waiting]), []
+        """Store the pending rows."""
+        rows, self.waiting = np.concatenate([np.empty((0, len(RIG_COLUMNS) + 1)), *self.waiting]), []
         if len(rows):
             self.keep(rows)
 
     def keep(self, rows: Floats) -> None:
-        """Keeps rows in memory first, then on disk."""
-        told = [values[self.done : self.done + len(rows), None] for values in self.source.told.values()]
-        rows = np.hstack([rows[:, : len(COLUMNS)], *told])
+        """Store rows, first in memory, then on disk."""
+        told = [values[self.done : self.done + len(rows), None] for values in self.source.extra_signals.values()]
+        rows = np.hstack([rows[:, : len(RIG_COLUMNS)], *told])
         self.blocks.append(rows)
         self.done += len(rows)
         self.partial.write(rows)
-        if self.live is not None and self.trouble is None:
+        if self.live is not None and self.live_error is None:
             try:
                 self.live.push(rows[:, self.columns])
             except FtlmError as error:
-                # An estimate that fails is no reason to stop a run that can be identified afterwards.
-                self.trouble = str(error)
+                # A failed live estimate must not stop the run, which can be identified afterwards.
+                self.live_error = str(error)
         if self.progress is not None:
             self.progress(self.done, self.source.rows)
 
     def finish(self, name: str, about: dict[str, Any], faults: list[str], step: float) -> Run | None:
-        """The run; None if fewer than three rows were recorded."""
-        told = tuple(self.source.told)
-        rows = np.concatenate(self.blocks) if self.blocks else np.empty((0, len(COLUMNS) + len(told)))
+        """Return the run; None if fewer than three rows were recorded."""
+        told = tuple(self.source.extra_signals)
+        rows = np.concatenate(self.blocks) if self.blocks else np.empty((0, len(RIG_COLUMNS) + len(told)))
         if len(rows) < 3:
             return None
-        data = {column: rows[:, k] for k, column in enumerate((*COLUMNS, *told))}
+        data = {column: rows[:, k] for k, column in enumerate((*RIG_COLUMNS, *told))}
         facts = tuple(f"the rig stopped the run after {(len(rows) - 1) * step:.6g} s: {f}" for f in faults)
-        signals = {n: data[n] for n in (*INPUTS, *told)}, {n: data[n] for n in COLUMNS[2:]}
-        return built(Asked(*signals, step=step, units=units_of(told), name=name, facts=facts, about=about))
+        signals = {n: data[n] for n in (*CURRENT_SIGNALS, *told)}, {n: data[n] for n in RIG_COLUMNS[2:]}
+        return build_run(
+            RunArguments(*signals, step=step, units=units_of(told), name=name, notes=facts, metadata=about)
+        )
 
 
 def _board(
@@ -544,7 +548,7 @@ def _board(
     horizon: float,
     card: str,
 ) -> tuple[Board, dict[str, Any]]:
-    """The board that is asked for, and what a run tells of it."""
+    """Return the selected board, and its metadata for the run."""
     virtual = isinstance(rig, str) and rig == "virtual"
     if offset is not None and not virtual:
         raise ModelError("offset is of the virtual arm; a board has its own, leave it out")
@@ -556,7 +560,7 @@ def _board(
             except (TypeError, ValueError, OverflowError):
                 first = second = math.nan
             if isinstance(offset, str) or not (math.isfinite(first) and math.isfinite(second)):
-                raise ModelError(f"offset = {shown(offset)} is not a pair of currents [A], of motor 1 and motor 2")
+                raise ModelError(f"offset = {short_repr(offset)} is not a pair of currents [A], of motor 1 and motor 2")
             arm = replace(arm, current_offset=(first, second))
         return VirtualBoard(arm, seed=seed, paced=paced, horizon=horizon), {"parameters": arm.to_dict()}
     if isinstance(rig, str):
@@ -573,9 +577,9 @@ def _check_target(target: Path, *, force: bool) -> None:
         raise DataError(f"{str(target)!r} ends with neither .csv nor .parquet; runs are written as one of them")
     if target.suffix.lower() == ".parquet" and importlib.util.find_spec("pyarrow") is None:
         raise DataError(f"{str(target)!r}: parquet needs pyarrow; run: pip install 'ftlm[parquet]'")
-    check_free(target, force=force, words=RUN)
-    left = partial_of(target)
-    # A dangling link would have the rows written where it leads.
+    check_free(target, force=force, words=RUN_MESSAGES)
+    left = partial_path(target)
+    # Rows would be written to the target of a dangling link.
     if os.path.lexists(left) and not force:
         raise DataError(
             f"{str(left)!r} holds what was recorded by a program that did not end; load it, rename or remove it, or "
@@ -584,24 +588,32 @@ def _check_target(target: Path, *, force: bool) -> None:
 
 
 def check_times(duration: float, limit: float, rate: float) -> tuple[float, float, float]:
-    """Times and a rate as floats; those that no run can have are refused."""
-    longest, length, samples = finite(limit), finite(duration), finite(rate)
-    if longest is None or not 0 < longest <= LONGEST:
-        raise ModelError(f"limit = {shown(limit)} s is outside (0, {LONGEST:g}] s; give the longest time of a run")
+    """Validate duration, limit [s] and rate [Hz], and return them as floats."""
+    longest, length, samples = finite_number(limit), finite_number(duration), finite_number(rate)
+    if longest is None or not 0 < longest <= MAX_RUN_DURATION_S:
+        raise ModelError(
+            f"limit = {short_repr(limit)} s is outside (0, {MAX_RUN_DURATION_S:g}] s; give the longest time of a run"
+        )
     if length is None or length <= 0:
-        raise ModelError(f"duration = {shown(duration)} s is not a time above 0; give the length of the run")
+        raise ModelError(f"duration = {short_repr(duration)} s is not a time above 0; give the length of the run")
     if length > longest:
-        way_out = "raise limit= (--limit)" if length <= LONGEST else f"no run is longer than {LONGEST:g} s"
+        way_out = (
+            "raise limit= (--limit)"
+            if length <= MAX_RUN_DURATION_S
+            else f"no run is longer than {MAX_RUN_DURATION_S:g} s"
+        )
         raise ModelError(f"duration = {length:g} s is over the limit of {longest:g} s; {way_out}")
     if samples is None or samples <= 0:
-        raise ModelError(f"rate = {shown(rate)} Hz is not a positive number of samples per second")
+        raise ModelError(f"rate = {short_repr(rate)} Hz is not a positive number of samples per second")
     if length * samples < 2:
         raise ModelError(f"duration = {length:g} s holds fewer than three samples at {samples:g} Hz; make it longer")
     return length, longest, samples
 
 
 def _column_of(name: str) -> int:
-    """Where a row of a run holds a signal of the live structure."""
-    if name not in COLUMNS:
-        raise ModelError(f"the live structure needs {name!r}, which a rig does not record; it has {', '.join(COLUMNS)}")
-    return COLUMNS.index(name)
+    """Return the column of a signal of the live structure in a row of the rig."""
+    if name not in RIG_COLUMNS:
+        raise ModelError(
+            f"the live structure needs {name!r}, which a rig does not record; it has {', '.join(RIG_COLUMNS)}"
+        )
+    return RIG_COLUMNS.index(name)

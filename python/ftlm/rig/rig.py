@@ -1,4 +1,4 @@
-"""Signals that end a program, while motors may run: they end the run, and never the way out of it."""
+"""Rig sessions: board interface, safety limits, start-up, shutdown, fault messages and signal handlers."""
 
 from __future__ import annotations
 
@@ -14,22 +14,22 @@ from typing import Any, Literal, NoReturn, Protocol
 
 from ftlm import _core
 from ftlm.errors import FtlmError, ModelError, RigFault
-from ftlm.utils.validation import Floats, real_number, words_of
+from ftlm.utils.validation import Floats, error_text, real_number
 
-#: A closed terminal ends a program too.
-_ENDING = ("SIGINT", "SIGTERM", "SIGHUP", "SIGBREAK")
+#: Termination signals, including those of a closed terminal.
+_TERMINATION_SIGNALS = ("SIGINT", "SIGTERM", "SIGHUP", "SIGBREAK")
 
 
-class Signals:
-    """Handlers of the signals that end a program, between a start and a way out.
+class SignalHandlers:
+    """Handlers of termination signals between start-up and shutdown of a rig.
 
-    They are those of the main thread; elsewhere Python hands over no signal, and nothing is installed. The object
-    refers to no rig, so that the table of handlers does not keep one alive.
+    Handlers are installed in the main thread only, because Python delivers signals to no other. The object holds no
+    reference to a rig, so that the handler table does not keep one alive.
 
     Parameters
     ----------
     deaf
-        Code that no signal may cut short: one that comes while it is at work waits.
+        Code objects that no signal may interrupt; signals that arrive while they run are deferred.
     """
 
     def __init__(self, deaf: frozenset[CodeType]) -> None:
@@ -38,19 +38,19 @@ class Signals:
         self._waiting: int | None = None
 
     def install(self) -> None:
-        """Takes the place of the handlers that there are; a Ctrl-C that the program ignores stays ignored."""
+        """Replace the current handlers; a Ctrl-C that the program ignores stays ignored."""
         if threading.current_thread() is not threading.main_thread():
             return
-        for name in _ENDING:
+        for name in _TERMINATION_SIGNALS:
             number = getattr(signal, name, None)
             if number is None or (name == "SIGINT" and signal.getsignal(number) in (signal.SIG_IGN, None)):
                 continue
-            # Noted before it is replaced: a signal between the two finds nothing that is not put back.
+            # Store the old handler first, so that a signal between the two statements loses nothing.
             self._before[number] = signal.getsignal(number)
-            signal.signal(number, self._came)
+            signal.signal(number, self._handle)
 
     def restore(self) -> None:
-        """Puts the handlers of before back, all of them: a signal that comes meanwhile waits, where the system can."""
+        """Restore all previous handlers; signals are blocked meanwhile, if the system supports it."""
         if not self._before or threading.current_thread() is not threading.main_thread():
             return
         mask = getattr(signal, "pthread_sigmask", None)
@@ -64,14 +64,14 @@ class Signals:
                 mask(signal.SIG_SETMASK, kept)
 
     def deliver(self) -> None:
-        """Raises what a signal that waited would have raised."""
+        """Raise the exception of a deferred signal."""
         number, self._waiting = self._waiting, None
         if number == signal.SIGINT:
             signal.raise_signal(number)
         elif number is not None:
             _end(number)
 
-    def _came(self, number: int, frame: FrameType | None) -> None:
+    def _handle(self, number: int, frame: FrameType | None) -> None:
         at = frame
         while at is not None:
             if at.f_code in self._deaf:
@@ -99,51 +99,51 @@ SENSE_SCALE = 2.0
 COMMAND_SCALE = 0.5
 #: Hub angle per count [rad]: 1024 lines read fourfold, behind gears of 100:1 and 50:1.
 ENCODER_SCALE = (2.0 * math.pi / 4096.0 / 100.0, 2.0 * math.pi / 4096.0 / 50.0)
-#: Largest commands that the amplifiers are set up for [A].
+#: Largest currents for which the amplifiers are configured [A].
 CURRENT_LIMIT = (0.94, 1.2)
-#: Time at rest before every run over which the gauges' bias is averaged [s].
-REST = 0.2
-#: Longest run that may be asked for [s].
-LONGEST = 600.0
-#: Range of the watchdog's time [s]. 0 would switch it off; a second is already a long time for a motor.
-WATCHDOG_RANGE = (0.01, 1.0)
-#: Said where nothing that was tried can be known to have stopped the motors.
-LIVE = (
+#: Rest before every run, over which the bias of the gauges is averaged [s].
+REST_DURATION_S = 0.2
+#: Longest permitted run [s].
+MAX_RUN_DURATION_S = 600.0
+#: Permitted watchdog timeouts [s]; 0 would disable the watchdog, longer ones let a motor run too long.
+WATCHDOG_RANGE_S = (0.01, 1.0)
+#: Message if no shutdown step is confirmed to have stopped the motors.
+MOTORS_LIVE_MESSAGE = (
     "the motors may still be under current: neither 0 V nor switched-off amplifiers nor the watchdog's expiry could be "
     "confirmed; cut the arm's power by hand (emergency stop). The watchdog was left running and the board open"
 )
-#: What a row of a run holds.
-COLUMNS = ("I1", "I2", "theta11", "theta12", "theta21", "theta22", "I1_measured", "I2_measured")
+#: Columns of a recorded row.
+RIG_COLUMNS = ("I1", "I2", "theta11", "theta12", "theta21", "theta22", "I1_measured", "I2_measured")
 
 
 @dataclass(frozen=True)
 class Limits:
-    """What the innermost write and the checks of every sample hold a run to; pairs are stage 1 and stage 2.
+    """Safety limits of every command and sample; pairs are for joints 1 and 2.
 
     Parameters
     ----------
     current
         Largest command [A].
     slew
-        Largest change of a command [A/s]. A reversal from end to end takes two samples of 2 ms.
+        Largest rate of change of a command [A/s]; a full reversal takes two samples of 2 ms.
     continuous
-        Current that a motor bears for ever [A]: the mean square over `thermal_time` stays below its square.
+        Continuous current rating [A]: bound on the RMS current over `thermal_time`.
     thermal_time
-        [s].
+        Thermal time constant of the motors [s].
     deflection
-        Trip of the links [rad].
+        Largest link deflection [rad].
     saturation
-        Gauge volts that count as saturated.
+        Gauge voltage from which it counts as saturated [V].
     moving_current
-        Current under which a hub must move [A]; below it friction may hold it.
+        Current at which a hub must move [A]; at smaller currents it may stick.
     standstill
-        Time that it may stand still under it [s].
+        Longest standstill at that current [s].
     fastest
-        Fastest hub [rad/s]; a faster count is a fault of the encoder.
+        Largest hub speed [rad/s]; a faster count is an encoder fault.
     late
         Longest delay of a write [s].
     missed
-        Missed deadlines in a row that are borne.
+        Tolerated number of consecutive missed deadlines.
     """
 
     current: tuple[float, float] = CURRENT_LIMIT
@@ -159,7 +159,7 @@ class Limits:
     missed: int = 20
 
     def guard(self, step: float, sensor_filter: tuple[float, float] | None = None) -> _core.Guard:
-        """The guard that enforces them at a sampling step [s]."""
+        """Return the guard that enforces the limits at a sampling interval [s]."""
         return _core.Guard(
             {
                 "step": step,
@@ -184,87 +184,88 @@ class Limits:
 
 
 class Board(Protocol):
-    """What a rig must be able to do; the order is :class:`Rig`'s."""
+    """Interface of a board, in the order in which :class:`Rig` calls its methods."""
 
     name: str
     hardware: bool
 
     def open(self) -> None:
-        """Takes possession of the board."""
+        """Open the board."""
 
     def configure(self, rate: float) -> None:
-        """Sets ranges, directions and encoders, zeroes outputs, makes the one task that reads all channels."""
+        """Set ranges, directions and encoders, zero the outputs, and create the sampling task of all channels."""
 
     def set_expiration(self) -> None:
-        """Tells the watchdog to put 0 V out, and the digital lines in their safe state."""
+        """Set the expiration states of the watchdog: 0 V and safe digital lines."""
 
     def unsafe(self) -> str | None:
-        """What is missing for the watchdog to stop the motors, in words; None when nothing is."""
+        """Message on why the watchdog would not stop the motors; None if it would."""
 
     def start_watchdog(self, seconds: float) -> None:
-        """Starts the watchdog."""
+        """Start the watchdog."""
 
     def start(self, rate: float) -> None:
-        """Starts sampling."""
+        """Start sampling."""
 
     def enable(self, on: bool) -> None:
-        """Switches the amplifiers."""
+        """Enable or disable the amplifiers."""
 
     def write(self, volts: tuple[float, float]) -> None:
-        """Puts volts out."""
+        """Write output voltages [V]."""
 
     def rest(self, guard: _core.Guard, samples: int) -> None:
-        """Samples with 0 V out."""
+        """Sample with outputs at 0 V."""
 
     def run(self, guard: _core.Guard, commands: Floats) -> None:
-        """Samples under commands, shape (n, 2) [A], until they end or a fault latches."""
+        """Sample while applying commands, shape (n, 2) [A], until they end or a fault latches."""
 
     def take(self) -> Floats:
-        """Rows since the last call: COLUMNS and the delay [s]."""
+        """Return the rows since the last call: RIG_COLUMNS and the delay [s]."""
 
     def stop(self) -> None:
-        """Stops the task."""
+        """Stop sampling."""
 
     def let_expire(self) -> bool:
-        """Waits without a heartbeat until the watchdog has put 0 V out; whether it is known to have."""
+        """Wait without heartbeat for the watchdog to write 0 V; return whether this is confirmed."""
 
     def stop_watchdog(self) -> None:
-        """Stops the watchdog."""
+        """Stop the watchdog."""
 
     def close(self) -> None:
-        """Lets go of the board."""
+        """Close the board."""
 
 
 def shut_down(board: Board) -> list[str]:
-    """Every step of the way out, each tried whatever became of the one before; what went wrong, in words.
+    """Run the shutdown sequence; return the error messages of its steps.
 
-    A step that is interrupted (a second Ctrl-C) is done again. Where 0 V could not be written or the amplifiers could
-    not be disabled, the watchdog is let expire, which does both. Where none of the three is certain, the watchdog is
-    left running and the board open: stopping the one or closing the other could leave the motors under current.
+    Each step is tried even if an earlier one failed, and is repeated once if it is interrupted (a second Ctrl-C). If
+    0 V cannot be written or the amplifiers cannot be disabled, the watchdog is left to expire, which does both. If none
+    of the three is confirmed, the watchdog keeps running and the board stays open, because stopping or closing them
+    could leave the motors under current.
     """
     troubles: list[str] = []
-    zero = _tried("writing 0 V", lambda: board.write((0.0, 0.0)), troubles)
-    off = _tried("disabling the amplifiers", lambda: board.enable(False), troubles)
-    _tried("stopping the task", board.stop, troubles)
-    # A board of one's own may have no watchdog that can be waited for.
+    zero = _try_step("writing 0 V", lambda: board.write((0.0, 0.0)), troubles)
+    off = _try_step("disabling the amplifiers", lambda: board.enable(False), troubles)
+    _try_step("stopping the task", board.stop, troubles)
+    # A user-defined board may lack let_expire().
     let_expire = getattr(board, "let_expire", None)
     expired = False
     if not (zero and off) and let_expire is not None:
         seen: list[bool] = []
-        _tried("waiting for the watchdog", lambda: seen.append(let_expire()), troubles)
+        _try_step("waiting for the watchdog", lambda: seen.append(let_expire()), troubles)
         expired = any(seen)
         if expired:
             troubles.append("the watchdog was let expire instead, which puts 0 V out")
     if not (zero or off or expired):
-        troubles.append(LIVE)
+        troubles.append(MOTORS_LIVE_MESSAGE)
         return troubles
-    _tried("stopping the watchdog", board.stop_watchdog, troubles)
-    _tried("closing the board", board.close, troubles)
+    _try_step("stopping the watchdog", board.stop_watchdog, troubles)
+    _try_step("closing the board", board.close, troubles)
     return troubles
 
 
-def _tried(name: str, step: Callable[[], None], troubles: list[str]) -> bool:
-    """Whether a step was done; one that is interrupted is done again, and what fails is told."""
+def _try_step(name: str, step: Callable[[], None], troubles: list[str]) -> bool:
+    """Try a shutdown step, again if it is interrupted; record a failure and return whether it succeeded."""
     for _ in (1, 2):
         try:
             step()
@@ -279,8 +280,8 @@ def _tried(name: str, step: Callable[[], None], troubles: list[str]) -> bool:
     return False
 
 
-def _way_out(board: Board, signals: Signals) -> list[str]:
-    """The way out, and then the handlers of before; nothing that it refers to keeps the rig alive."""
+def _shut_down_and_restore(board: Board, signals: SignalHandlers) -> list[str]:
+    """Shut down the board and restore the signal handlers; holds no reference to the rig."""
     try:
         return shut_down(board)
     finally:
@@ -288,24 +289,24 @@ def _way_out(board: Board, signals: Signals) -> list[str]:
 
 
 class Rig:
-    """A rig between its start and its way out; use it in a ``with`` statement.
+    """Session on a rig, from start-up to shutdown; use it in a ``with`` statement.
 
-    However the block is left (its end, an exception, Ctrl-C, SIGTERM, SIGHUP, garbage collection), 0 V is written, the
-    amplifiers are disabled, task and watchdog stopped and the board closed, each step tried even if one before it
-    fails. If the program dies or freezes, the watchdog puts 0 V out.
+    However the block is left (end, exception, Ctrl-C, SIGTERM, SIGHUP, garbage collection), 0 V is written, the
+    amplifiers are disabled, task and watchdog are stopped and the board is closed. Each step is tried even if an
+    earlier one fails. If the program terminates or freezes, the watchdog writes 0 V.
 
     Parameters
     ----------
     board
         The virtual board or the Q8-USB.
     rate
-        Samples per second.
+        Sampling rate [Hz].
     watchdog
-        Time after which the watchdog puts 0 V out [s], 0.01 to 1.
+        Watchdog timeout [s], 0.01 to 1.
     limit
         Longest run [s]; no command is written after it.
     limits
-        What every write is held to.
+        Safety limits of every command and sample.
     sensor_filter
         Natural frequency [rad/s] and damping of a low-pass on both recorded deflections.
     """
@@ -320,30 +321,32 @@ class Rig:
         limits: Limits | None = None,
         sensor_filter: tuple[float, float] | None = None,
     ) -> None:
-        low, high = WATCHDOG_RANGE
+        low, high = WATCHDOG_RANGE_S
         watchdog = real_number("watchdog", watchdog)
         if not low <= watchdog <= high:
             raise ModelError(
                 f"watchdog = {watchdog!r} s is outside [{low:g}, {high:g}] s; 0 would leave the motors running when "
                 "the program dies"
             )
-        if not 0 < limit <= LONGEST:
-            raise ModelError(f"limit = {limit!r} s is outside (0, {LONGEST:g}] s; give the longest time of a run")
+        if not 0 < limit <= MAX_RUN_DURATION_S:
+            raise ModelError(
+                f"limit = {limit!r} s is outside (0, {MAX_RUN_DURATION_S:g}] s; give the longest time of a run"
+            )
         self.board = board
         self.rate = rate
         self.watchdog = watchdog
         self.limit = limit
         self.limits = limits or Limits()
         self.guard = self.limits.guard(1.0 / rate, sensor_filter)
-        self.troubles: list[str] = []
+        self.shutdown_errors: list[str] = []
         self._samples = 0
-        self._signals = Signals(WAY_OUT)
+        self._signals = SignalHandlers(UNINTERRUPTIBLE_CODE)
         self._finalizer: weakref.finalize[Any, Any] | None = None
 
     def __enter__(self) -> Rig:
         board = self.board
         try:
-            self._finalizer = weakref.finalize(self, _way_out, board, self._signals)
+            self._finalizer = weakref.finalize(self, _shut_down_and_restore, board, self._signals)
             self._signals.install()
             board.open()
             board.configure(self.rate)
@@ -355,7 +358,7 @@ class Rig:
                 )
             board.start_watchdog(self.watchdog)
             board.start(self.rate)
-            board.rest(self.guard, max(2, round(REST * self.rate)))
+            board.rest(self.guard, max(2, round(REST_DURATION_S * self.rate)))
             self._check()
             board.enable(True)
             return self
@@ -366,13 +369,13 @@ class Rig:
     def __exit__(self, kind: type[BaseException] | None, *_: object) -> Literal[False]:
         self._leave()
         if kind is None:
-            # Who asked to stop while the motors were being stopped gets what they asked for.
+            # A signal that arrived during shutdown takes effect now.
             self._signals.deliver()
         return False
 
     def _leave(self) -> None:
         if self._finalizer is not None:
-            self.troubles += self._finalizer() or []
+            self.shutdown_errors += self._finalizer() or []
 
     def _check(self) -> None:
         fault = self.guard.fault
@@ -380,12 +383,12 @@ class Rig:
             raise RigFault(fault if fault.startswith(self.board.name) else f"{self.board.name}: {fault}")
 
     def run(self, commands: Floats) -> None:
-        """Runs commands, shape (n, 2) [A]; rows wait in :meth:`take`.
+        """Apply commands, shape (n, 2) [A]; :meth:`take` returns the recorded rows.
 
         Raises
         ------
         RigFault
-            A fault latched: the motors are at 0 V and stay there.
+            A fault has latched; the motors stay at 0 V.
         """
         self._check()
         if self._samples + len(commands) > self.limit * self.rate + 1.5:
@@ -394,21 +397,21 @@ class Rig:
         try:
             self.board.run(self.guard, commands)
         except BaseException as error:
-            # At once, and not only on the way out: the caller may stay in the with statement.
+            # Write 0 V immediately, because the caller may stay in the with statement.
             with contextlib.suppress(Exception):
                 self.board.write((0.0, 0.0))
             if not isinstance(error, FtlmError):
                 raise
-            self.guard.fail(words_of(error))
+            self.guard.fail(error_text(error))
         self._check()
 
     def fail(self, why: str, cause: BaseException | None = None) -> NoReturn:
-        """Latch a fault of the program: 0 V at once.
+        """Latch a fault of the program and write 0 V immediately.
 
         Raises
         ------
         RigFault
-            The first fault of the run, from what caused it.
+            The first fault of the run, with its cause.
         """
         self.guard.fail(why)
         with contextlib.suppress(Exception):
@@ -420,28 +423,28 @@ class Rig:
         raise RigFault(why) from cause
 
     def take(self) -> Floats:
-        """Rows since the last call, shape (n, 9): COLUMNS and how late each was [s]."""
+        """Return the rows since the last call, shape (n, 9): RIG_COLUMNS and the delay [s]."""
         return self.board.take()
 
 
-#: Nothing cuts these short: a signal that comes while one of them is at work waits for its end.
-WAY_OUT = frozenset(f.__code__ for f in (Rig.__exit__, Rig._leave, _way_out, shut_down))
+#: Code of the shutdown functions; signals that arrive while it runs are deferred.
+UNINTERRUPTIBLE_CODE = frozenset(f.__code__ for f in (Rig.__exit__, Rig._leave, _shut_down_and_restore, shut_down))
 
 
-#: The board's clock [Hz]: lowest, and highest in fast update.
-RATES = (1.0, 8000.0)
-EXPIRED = "the watchdog expired: the program did not answer in time, and the board put 0 V out"
+#: Sampling rates of the board's clock [Hz]: lowest, and highest with fast update.
+SAMPLE_RATE_RANGE_HZ = (1.0, 8000.0)
+WATCHDOG_EXPIRED_MESSAGE = "the watchdog expired: the program did not answer in time, and the board put 0 V out"
 
 
 def check_rate(rate: float) -> None:
-    """Refuse samples a second that the board's clock cannot do."""
-    low, high = RATES
+    """Raise if the board does not support a sampling rate [Hz]."""
+    low, high = SAMPLE_RATE_RANGE_HZ
     if not low <= rate <= high:
         raise ModelError(f"rate = {rate!r} Hz cannot be done by this board; use {low:g} to {high:g} Hz")
 
 
 def check_watchdog(rate: float, seconds: float) -> None:
-    """Refuse a watchdog that would expire between one sample and the next, each of which reloads it."""
+    """Raise if the watchdog timeout [s] is shorter than two samples, so that it would expire between them."""
     if seconds * rate < 2.0:
         raise ModelError(
             f"watchdog = {seconds:g} s is shorter than two samples at {rate:g} Hz and would expire between them; use "
@@ -449,8 +452,8 @@ def check_watchdog(rate: float, seconds: float) -> None:
         )
 
 
-def unset(*, analog: bool, digital: bool) -> str | None:
-    """What keeps the watchdog from stopping the motors, given which of its expiration states are set."""
+def missing_expiration_state(*, analog: bool, digital: bool) -> str | None:
+    """Message on the watchdog expiration state that is not set; None if both are set."""
     if not analog:
         return "the watchdog's expiration state of the analog outputs is not 0 V"
     if not digital:

@@ -1,4 +1,4 @@
-"""The virtual rig: the simulated arm behind a board that keeps the real one's rules of access and of its watchdog."""
+"""Virtual board: simulated arm with the access and watchdog rules of the real board."""
 
 from __future__ import annotations
 
@@ -13,12 +13,12 @@ import numpy as np
 from ftlm import _core
 from ftlm.errors import RigFault
 from ftlm.rig import watchdog
-from ftlm.rig.arm_parameters import SETS, ArmParameters
-from ftlm.rig.rig import EXPIRED, check_rate, check_watchdog, unset
+from ftlm.rig.arm_parameters import PARAMETER_SETS, ArmParameters
+from ftlm.rig.rig import WATCHDOG_EXPIRED_MESSAGE, check_rate, check_watchdog, missing_expiration_state
 from ftlm.utils.validation import Floats, check_seed
 
-#: What can be made to go wrong: name, and what its number means.
-INJECTIONS = {
+#: Faults that can be injected: name, and meaning of its number.
+FAULT_INJECTIONS = {
     "dead encoder": "",
     "saturated gauge": "",
     "limit switch": "",
@@ -26,31 +26,31 @@ INJECTIONS = {
     "late": "delay of that sample [s]",
     "lost samples": "",
 }
-#: A run that is not in real time cannot be late; its watchdog only has to see that the program lives [s].
-_FAST_WATCHDOG = 2.0
+#: Shortest watchdog timeout of runs without real time [s]; they cannot be late, only the program can terminate.
+_MIN_FAST_WATCHDOG_S = 2.0
 
 
 @dataclass
 class VirtualBoard:
-    """The simulated arm as a board: opened, configured, watched, read, written and closed like the real one.
+    """Board of the simulated arm, with the same access rules as the real board.
 
     Parameters
     ----------
     parameters
-        Of the arm.
+        Parameters of the arm.
     seed
-        Of the noise.
+        Seed of the measurement noise.
     paced
-        Real time, or as fast as possible.
+        Whether to run in real time instead of as fast as possible.
     horizon
-        Longest run [s]; sets the size of the arm's memory.
+        Longest run [s]; determines the size of the simulation history.
     page
-        File for the output stage's registers; kept when it is given.
+        File of the output registers; it is kept if given.
     inject
-        What goes wrong: (name in INJECTIONS, channel from 0, time [s], number).
+        Injected faults: (name in FAULT_INJECTIONS, channel from 0, time [s], number).
     """
 
-    parameters: ArmParameters = field(default_factory=lambda: SETS["effective"])
+    parameters: ArmParameters = field(default_factory=lambda: PARAMETER_SETS["effective"])
     seed: int = 0
     paced: bool = False
     horizon: float = 30.0
@@ -60,7 +60,7 @@ class VirtualBoard:
     hardware: bool = False
 
     def __post_init__(self) -> None:
-        self._page: watchdog.Page | None = None
+        self._page: watchdog.RegisterPage | None = None
         self._process: subprocess.Popen[bytes] | None = None
         self._arm: _core.VirtualArm | None = None
         self._seconds = 0.0
@@ -71,13 +71,13 @@ class VirtualBoard:
         self._rate = 0.0
 
     def open(self) -> None:
-        """Makes the output stage."""
+        """Create the output stage."""
         if self._page is not None:
             raise RigFault("virtual rig: the board is open already")
-        self._page = watchdog.Page(self.page or watchdog.scratch(), create=True)
+        self._page = watchdog.RegisterPage(self.page or watchdog.create_page_file(), create=True)
 
     def configure(self, rate: float) -> None:
-        """Makes the arm; its converters and encoders need no setting."""
+        """Create the simulated arm; its converters and encoders need no configuration."""
         self._access()
         check_rate(rate)
         self._rate = rate
@@ -88,20 +88,20 @@ class VirtualBoard:
         self.write((0.0, 0.0))
 
     def set_expiration(self) -> None:
-        """0 V and tristate on expiry."""
+        """Set the expiration states of the watchdog: 0 V and tristate."""
         page = self._access()
         page.set("state1", 0.0)
         page.set("state2", 0.0)
         page.set("tristate", 1)
 
     def unsafe(self) -> str | None:
-        """What the registers lack."""
+        """Message on the expiration state that is not set; None if all are set."""
         page = self._access()
         zero = all(page.get(f"state{k}") == 0.0 for k in (1, 2))
-        return unset(analog=zero, digital=bool(page.get("tristate")))
+        return missing_expiration_state(analog=zero, digital=bool(page.get("tristate")))
 
     def start_watchdog(self, seconds: float) -> None:
-        """Starts the process that watches."""
+        """Start the watchdog process."""
         page = self._access()
         if self.paced:
             check_watchdog(self._rate, seconds)
@@ -110,49 +110,49 @@ class VirtualBoard:
         except OSError as error:
             raise RigFault(f"virtual rig: {error}; check the Python installation") from None
         self._seconds = seconds
-        page.set("timeout", seconds if self.paced else max(seconds, _FAST_WATCHDOG))
+        page.set("timeout", seconds if self.paced else max(seconds, _MIN_FAST_WATCHDOG_S))
 
     def start(self, rate: float) -> None:
-        """Starts the clock."""
-        self._stepped().start(self.paced)
+        """Start the clock."""
+        self._require_arm().start(self.paced)
         self._started = True
 
     def enable(self, on: bool) -> None:
-        """Switches the amplifiers."""
+        """Enable or disable the amplifiers."""
         if not on:
-            # Off is always possible: the real lines are released by the watchdog too.
+            # Disabling is always possible, because the real watchdog releases the lines as well.
             if self._page is not None:
                 self._page.set("enabled", 0)
             return
         self._access().set("enabled", 1)
 
     def write(self, volts: tuple[float, float]) -> None:
-        """Puts volts out; 0 V always, whatever became of the watchdog."""
-        if volts == (0.0, 0.0) and self._page is not None and (self._page.expired or self._unwatched()):
-            self._page.put(self._beat, 0.0, 0.0)
+        """Write output voltages; 0 V is always possible, even after the watchdog has expired or terminated."""
+        if volts == (0.0, 0.0) and self._page is not None and (self._page.has_expired or self._has_lost_watchdog()):
+            self._page.write_heartbeat(self._beat, 0.0, 0.0)
             return
-        self._put(*volts)
+        self._output_volts(*volts)
 
     def rest(self, guard: _core.Guard, samples: int) -> None:
-        """Samples at rest."""
-        self._stepped().rest(guard, self._random.standard_normal((samples, 4)), self._put)
+        """Sample with outputs at 0 V."""
+        self._require_arm().rest(guard, self._random.standard_normal((samples, 4)), self._output_volts)
 
     def run(self, guard: _core.Guard, commands: Floats) -> None:
-        """Samples under commands."""
+        """Sample while applying commands, shape (n, 2) [A]."""
         if not self._started:
             raise RigFault("virtual rig: the task is not started")
-        self._stepped().run(guard, commands, self._random.standard_normal((len(commands), 4)), self._put)
+        self._require_arm().run(guard, commands, self._random.standard_normal((len(commands), 4)), self._output_volts)
 
     def take(self) -> Floats:
-        """Rows since the last call."""
+        """Return the rows since the last call."""
         return np.empty((0, 9)) if self._arm is None else self._arm.take()
 
     def stop(self) -> None:
-        """Stops sampling."""
+        """Stop sampling."""
         self._started = False
 
     def let_expire(self) -> bool:
-        """Waits for the watchdog, which has the time that was asked for, also where the run is as fast as possible."""
+        """Wait for the watchdog with the requested timeout; return whether it has expired with 0 V."""
         page, process = self._page, self._process
         if page is None:
             return True
@@ -160,14 +160,14 @@ class VirtualBoard:
             return False
         page.set("timeout", self._seconds)
         until = time.monotonic() + self._seconds + 5.0
-        while not page.expired or page.volts != (0.0, 0.0):
+        while not page.has_expired or page.volts != (0.0, 0.0):
             if process.poll() is not None or time.monotonic() > until:
                 return False
             time.sleep(0.001)
         return True
 
     def stop_watchdog(self) -> None:
-        """Stops the process that watches."""
+        """Stop the watchdog process."""
         if self._page is not None:
             self._page.set("timeout", 0.0)
             self._page.set("closed", 1)
@@ -180,7 +180,7 @@ class VirtualBoard:
             self._process = None
 
     def close(self) -> None:
-        """Removes the output stage."""
+        """Remove the output stage."""
         if self._page is not None:
             page, self._page = self._page, None
             page.close()
@@ -188,30 +188,30 @@ class VirtualBoard:
                 with contextlib.suppress(OSError):
                     page.path.unlink()
 
-    def _access(self) -> watchdog.Page:
+    def _access(self) -> watchdog.RegisterPage:
         if self._page is None:
             raise RigFault("virtual rig: the board is not open")
-        if self._page.expired:
-            raise RigFault(EXPIRED)
+        if self._page.has_expired:
+            raise RigFault(WATCHDOG_EXPIRED_MESSAGE)
         return self._page
 
-    def _unwatched(self) -> bool:
-        """Whether the watchdog's process was started and is gone."""
+    def _has_lost_watchdog(self) -> bool:
+        """Whether the watchdog process was started and has terminated."""
         return self._process is not None and self._process.poll() is not None
 
-    def _stepped(self) -> _core.VirtualArm:
+    def _require_arm(self) -> _core.VirtualArm:
         if self._arm is None:
             raise RigFault("virtual rig: the board is not configured")
         return self._arm
 
-    def _put(self, volts1: float, volts2: float) -> tuple[tuple[float, float], bool]:
-        """Writes, and says what reaches the motors."""
+    def _output_volts(self, volts1: float, volts2: float) -> tuple[tuple[float, float], bool]:
+        """Write output voltages; return them and whether the amplifiers are enabled."""
         page = self._access()
-        if self._unwatched():
+        if self._has_lost_watchdog():
             raise RigFault(
                 "virtual rig: the watchdog's process has died, and nothing would stop the motors should the program "
                 "die too; see what ended it, and start again"
             )
         self._beat += 1
-        page.put(self._beat, volts1, volts2)
+        page.write_heartbeat(self._beat, volts1, volts2)
         return (volts1, volts2), bool(page.get("enabled"))

@@ -1,9 +1,9 @@
-"""The virtual rig's output stage and its watchdog, which lives in a process of its own: a dead program stops the motor.
+"""Output stage and watchdog of the virtual rig, in a separate process that stops the motors if the program ends.
 
-Run as a script with the path of a page, it watches the page's heartbeat. It imports nothing of ftlm and nothing that
-is slow to load. The rules are the board's: on expiry the analog outputs go to their expiration states only if those are
-set and the digital lines are set to tristate; otherwise they stay where they were. After an expiry the outputs stay
-locked until the watchdog is cleared.
+Run as a script with the path of a register file, it watches the heartbeat. It imports nothing of ftlm and no slow
+module. The rules are the board's: on expiry the analog outputs take their expiration states only if these are set and
+the digital lines are set to tristate; otherwise they keep their values. After an expiry the outputs stay locked until
+the watchdog is cleared.
 """
 
 from __future__ import annotations
@@ -20,9 +20,9 @@ import tempfile
 import time
 from pathlib import Path
 
-MARK = b"FTLMPAG1"
-#: Name: offset and kind of every field of the page.
-FIELDS = {
+PAGE_SIGNATURE = b"FTLMPAG1"
+#: Offset [byte] and struct format of every register.
+PAGE_FIELDS = {
     "beat": (8, "Q"),
     "volts1": (16, "d"),
     "volts2": (24, "d"),
@@ -37,94 +37,94 @@ FIELDS = {
     "last_beat": (96, "d"),
     "tripped": (104, "d"),
 }
-SIZE = 4096
-_WRITE = struct.Struct("<Qdd")
-#: Longest that a watchdog process outlives its last heartbeat, or waits for its first, when nobody closes the page [s].
-_ORPHAN = 30.0
+PAGE_SIZE_BYTES = 4096
+_HEARTBEAT_FORMAT = struct.Struct("<Qdd")
+#: Longest lifetime of an orphaned watchdog process after the last heartbeat, or without a first one [s].
+_ORPHAN_TIMEOUT_S = 30.0
 
 
-class Page:
-    """The output stage's registers, in a file that two processes map.
+class RegisterPage:
+    """Registers of the output stage, in a file mapped by two processes.
 
     Parameters
     ----------
     path
-        The file; made, or mapped when it is there.
+        Path of the file.
     create
-        Whether to make it.
+        Whether to create the file instead of mapping an existing one.
     """
 
     def __init__(self, path: str | os.PathLike[str], *, create: bool = False) -> None:
         self.path = Path(path)
         if create:
-            self.path.write_bytes(MARK + bytes(SIZE - len(MARK)))
+            self.path.write_bytes(PAGE_SIGNATURE + bytes(PAGE_SIZE_BYTES - len(PAGE_SIGNATURE)))
         descriptor = os.open(self.path, os.O_RDWR | getattr(os, "O_BINARY", 0))
         try:
-            self._map = mmap.mmap(descriptor, SIZE)
+            self._map = mmap.mmap(descriptor, PAGE_SIZE_BYTES)
         finally:
             os.close(descriptor)
-        if self._map[: len(MARK)] != MARK:
+        if self._map[: len(PAGE_SIGNATURE)] != PAGE_SIGNATURE:
             raise ValueError(f"{self.path} is no page of the virtual rig")
         if create:
             self.set("state1", math.nan)
             self.set("state2", math.nan)
 
     def get(self, name: str) -> float:
-        """A register."""
-        offset, kind = FIELDS[name]
+        """Return the value of a register."""
+        offset, kind = PAGE_FIELDS[name]
         return float(struct.unpack_from("<" + kind, self._map, offset)[0])
 
     def set(self, name: str, value: float) -> None:
-        """Sets a register."""
-        offset, kind = FIELDS[name]
+        """Set the value of a register."""
+        offset, kind = PAGE_FIELDS[name]
         struct.pack_into("<" + kind, self._map, offset, int(value) if kind == "Q" else float(value))
 
     @property
-    def expired(self) -> bool:
+    def has_expired(self) -> bool:
         """Whether the watchdog has expired."""
-        return self._map[FIELDS["expired"][0]] != 0
+        return self._map[PAGE_FIELDS["expired"][0]] != 0
 
-    def put(self, beat: int, volts1: float, volts2: float) -> None:
-        """Heartbeat and output in one go."""
-        _WRITE.pack_into(self._map, FIELDS["beat"][0], beat, volts1, volts2)
+    def write_heartbeat(self, beat: int, volts1: float, volts2: float) -> None:
+        """Write heartbeat and output voltages together."""
+        _HEARTBEAT_FORMAT.pack_into(self._map, PAGE_FIELDS["beat"][0], beat, volts1, volts2)
 
     @property
     def volts(self) -> tuple[float, float]:
-        """What is put out."""
+        """Output voltages [V]."""
         return self.get("volts1"), self.get("volts2")
 
     def close(self) -> None:
-        """Unmaps."""
+        """Unmap the file."""
         self._map.close()
 
 
-def scratch() -> Path:
-    """A new file for a page, in memory where the system has such a place."""
+def create_page_file() -> Path:
+    """Create a new file for registers, in shared memory if the system has it."""
     folder = "/dev/shm" if os.access("/dev/shm", os.W_OK) else None
     descriptor, name = tempfile.mkstemp(prefix="ftlm-rig-", suffix=".page", dir=folder)
     os.close(descriptor)
     return Path(name)
 
 
-def start(page: Page, *, keep: bool, patience: float = 10.0) -> subprocess.Popen[bytes]:
-    """Starts the watchdog process and waits until it watches.
+def start(page: RegisterPage, *, keep: bool, patience: float = 10.0) -> subprocess.Popen[bytes]:
+    """Start the watchdog process and wait until it is ready.
 
     Parameters
     ----------
     page
-        Registers.
+        Registers of the output stage.
     keep
-        Whether the page's file outlives the process.
+        Whether to keep the file when the process ends.
     patience
-        [s].
+        Longest wait for the process [s].
 
     Raises
     ------
     OSError
-        It could not be started.
+        The process could not be started.
     """
     command = [sys.executable, "-I", "-S", __file__, str(page.path), "keep" if keep else "remove"]
-    # A session of its own, so that Ctrl-C reaches the program and not its watchdog.
+    # A separate session, so that Ctrl-C does not reach the watchdog.
     process = subprocess.Popen(command, stdin=subprocess.DEVNULL, stdout=subprocess.DEVNULL, start_new_session=True)
     until = time.monotonic() + patience
     while not page.get("ready"):
@@ -137,8 +137,8 @@ def start(page: Page, *, keep: bool, patience: float = 10.0) -> subprocess.Popen
 
 
 def watch(path: str, *, keep: bool) -> None:
-    """The watchdog: until the page is closed, or its program is gone and the outputs are safe."""
-    page = Page(path)
+    """Watch the heartbeat until the registers are closed, or the program has ended and the outputs are safe."""
+    page = RegisterPage(path)
     parent = os.getppid()
     began = time.monotonic()
     beat, last = page.get("beat"), began
@@ -155,9 +155,9 @@ def watch(path: str, *, keep: bool) -> None:
             armed = timeout > 0
             if armed and now - last > timeout:
                 trip(page, now)
-                if os.getppid() != parent or now - last > _ORPHAN:
+                if os.getppid() != parent or now - last > _ORPHAN_TIMEOUT_S:
                     break
-            elif not armed and (os.getppid() != parent or now - began > _ORPHAN):
+            elif not armed and (os.getppid() != parent or now - began > _ORPHAN_TIMEOUT_S):
                 break
             time.sleep(min(0.005, timeout / 20.0) if armed else 0.005)
     finally:
@@ -167,9 +167,9 @@ def watch(path: str, *, keep: bool) -> None:
                 os.unlink(path)
 
 
-def trip(page: Page, now: float) -> None:
-    """The expiry, by the board's rules; repeated, so that a write that raced with it does not last."""
-    if not page.expired:
+def trip(page: RegisterPage, now: float) -> None:
+    """Apply the expiration states by the board's rules; called repeatedly to override concurrent writes."""
+    if not page.has_expired:
         page.set("tripped", now)
         page.set("expired", 1)
     states = page.get("state1"), page.get("state2")

@@ -13,28 +13,34 @@ import numpy as np
 
 from ftlm import _core
 from ftlm.data.run import Run, Runs
-from ftlm.data.sampling import HELD, Readings, bridged, locked
+from ftlm.data.sampling import ZERO_ORDER_HOLD, NonuniformSamples, interpolate_gaps, make_read_only
 from ftlm.errors import DataError, ModelError
-from ftlm.simulation.initial_conditions import answers, decided, has_memory, together, without_held
+from ftlm.simulation.initial_conditions import (
+    common_initial_conditions,
+    filter_impulse_responses,
+    has_memory,
+    remove_filter_transient,
+    resolve_initial_conditions,
+)
 from ftlm.structure.equation import Equation, Term
-from ftlm.structure.input_nonlinearity import WORDS
+from ftlm.structure.input_nonlinearity import INPUT_EFFECT_LABELS
 from ftlm.structure.order import Order
-from ftlm.structure.structure import Initial, Offset, Structure, check_decided
+from ftlm.structure.structure import Initial, Offset, Structure, check_offset_resolved
 from ftlm.utils.validation import Floats, check_pulses, nearest
 
 #: Default number of block pulses, that of the paper, for runs with as many samples.
-PAPER_M = 2048
+DEFAULT_PULSES = 2048
 #: Maximum number of pulses of a record: 2^24 of one signal are 128 MB.
 MAX_M = 1 << 24
 #: Minimum peak of a nonzero signal. Squares of smaller signals underflow.
-SMALLEST = 1e-140
-COULOMB = "coulomb_"
+MIN_SIGNAL_PEAK = 1e-140
+COULOMB_PREFIX = "coulomb_"
 #: Number of cached series of sensor filters: long ones, and those of at most this many pulses.
-KEPT_LONG, SHORT, KEPT_SHORT = 4, 1 << 13, 32
+CACHED_LONG_SERIES, SHORT_SERIES_PULSES, CACHED_SHORT_SERIES = 4, 1 << 13, 32
 #: Initial terms as the core takes them.
 InitialTuple: TypeAlias = tuple[bool, list[float]] | tuple[bool, list[float], int] | tuple[bool, list[float], int, int]
 #: Which signals may have a filter transient, initial level of each signal, impulse responses of the filter.
-Begun: TypeAlias = tuple[tuple[bool, ...], tuple[float, ...], Floats | None]
+TransientTuple: TypeAlias = tuple[tuple[bool, ...], tuple[float, ...], Floats | None]
 
 
 @dataclass(frozen=True)
@@ -76,9 +82,9 @@ class Record:
     initial: Initial
     offset: Offset = "none"
     states: int = 0
-    held: tuple[bool, ...] = ()
-    levels: tuple[float, ...] = ()
-    answers: Floats | None = None
+    has_transient: tuple[bool, ...] = ()
+    initial_levels: tuple[float, ...] = ()
+    filter_responses: Floats | None = None
 
     @property
     def start(self) -> InitialTuple:
@@ -94,11 +100,13 @@ class Record:
         """Return the record as an argument of the core."""
         return self.step, self.means, self.sensor
 
-    def begun(self) -> tuple[float, Floats, Floats | None] | tuple[float, Floats, Floats | None, Begun]:
+    def core_with_transients(
+        self,
+    ) -> tuple[float, Floats, Floats | None] | tuple[float, Floats, Floats | None, TransientTuple]:
         """Return the record with its filter transients as an argument of the core."""
-        if not any(self.held) and not any(self.levels):
+        if not any(self.has_transient) and not any(self.initial_levels):
             return self.core()
-        return (*self.core(), (self.held, self.levels, self.answers))
+        return (*self.core(), (self.has_transient, self.initial_levels, self.filter_responses))
 
     def of(self, name: str) -> Floats:
         """Return the pulse means of a signal."""
@@ -109,7 +117,7 @@ class Record:
 def default_m(runs: Sequence[Run], *, power_of_two: bool) -> int:
     """Return the paper's 2 048 pulses, or as many as the shortest run supports (a power of two for Haar rows)."""
     carried = min(run.length for run in runs) - 1
-    m = min(PAPER_M, carried)
+    m = min(DEFAULT_PULSES, carried)
     return 1 << (m.bit_length() - 1) if power_of_two and m > 0 else m
 
 
@@ -140,31 +148,31 @@ def record(run: Run, structure: Structure, m: int, *, filtered: bool = True) -> 
     Raises for missing signals, signals whose squares underflow, delays of outputs, and missing samples of inputs. Other
     missing samples are interpolated and must not be fitted.
     """
-    _check_known(run, structure)
-    check_held(run, structure)
-    initial = decided(run, structure)
+    _check_missing(run, structure)
+    check_zero_order_hold(run, structure)
+    initial = resolve_initial_conditions(run, structure)
     sensor = None
     if filtered and structure.sensor_filter is not None:
         sensor = sensor_series(structure, m, run.duration / m)
     rows = []
     for name in structure.signals:
         means = _means(run, structure, name, m, at_rest=initial == "rest")
-        if sensor is not None and not structure.measured_through(name):
+        if sensor is not None and not structure.is_filtered(name):
             means = _core.series_multiply(sensor, means, m)
         peak = float(np.max(np.abs(means), initial=0.0))
-        if 0 < peak < SMALLEST:
+        if 0 < peak < MIN_SIGNAL_PEAK:
             raise DataError(
                 f"signal {name!r} of run {run.name!r}: no mean is larger than {peak:.3g}, and squares below "
-                f"{SMALLEST:g} lose their digits; scale the signal"
+                f"{MIN_SIGNAL_PEAK:g} lose their digits; scale the signal"
             )
         rows.append(means)
     states, step = structure.filter_states(initial), run.duration / m
-    levels = tuple(_level(run, structure, s, initial) for s in structure.signals)
-    held = tuple(states > 0 and sensor is not None and structure.measured_through(s) for s in structure.signals)
+    levels = tuple(_initial_level(run, structure, s, initial) for s in structure.signals)
+    held = tuple(states > 0 and sensor is not None and structure.is_filtered(s) for s in structure.signals)
     return Record(
         structure.signals,
         step,
-        locked(np.stack(rows)),
+        make_read_only(np.stack(rows)),
         tuple(s in run.inputs for s in structure.signals),
         sensor,
         initial,
@@ -174,44 +182,45 @@ def record(run: Run, structure: Structure, m: int, *, filtered: bool = True) -> 
         levels,
         None
         if sensor is None or structure.sensor_filter is None
-        else answers(structure.sensor_filter, states, m, step),
+        else filter_impulse_responses(structure.sensor_filter, states, m, step),
     )
 
 
-def _level(run: Run, structure: Structure, name: str, initial: Initial) -> float:
+def _initial_level(run: Run, structure: Structure, name: str, initial: Initial) -> float:
     """Initial level of a signal; 0 from rest, for filtered inputs, and for a missing first sample."""
-    if initial == "rest" or name not in run or (structure.behind_filter and structure.measured_through(name)):
+    if initial == "rest" or name not in run or (structure.all_filtered and structure.is_filtered(name)):
         return 0.0
-    first = float(acting(run, structure, name)[name][0])
+    first = float(apply_input_nonlinearity(run, structure, name)[name][0])
     return first if math.isfinite(first) else 0.0
 
 
-def acting(run: Run, structure: Structure, name: str | None = None) -> Run:
+def apply_input_nonlinearity(run: Run, structure: Structure, name: str | None = None) -> Run:
     """Return the run with known saturations and dead zones applied to its inputs, or to one of them."""
     free = next((limit for limit in structure.limits if limit.free is not None), None)
     if free is not None:
         raise ModelError(
-            f"the {WORDS[free.law]} of {free.signal} is free: only method='output-error' estimates limits; give its "
+            f"the {INPUT_EFFECT_LABELS[free.law]} of {free.signal} is free: only method='output-error' estimates "
+            "limits; give its "
             "value"
         )
     limits = [limit for limit in structure.limits if limit.signal in run and name in (None, limit.signal)]
-    return run.bent(limits) if limits else run
+    return run.with_input_nonlinearities(limits) if limits else run
 
 
-def driving(run: Run, structure: Structure, name: str | None = None) -> Run:
+def with_effective_inputs(run: Run, structure: Structure, name: str | None = None) -> Run:
     """Return the run with effective inputs: input nonlinearities applied, filter transients removed."""
-    return without_held(acting(run, structure, name), structure, name)
+    return remove_filter_transient(apply_input_nonlinearity(run, structure, name), structure, name)
 
 
-def check_held(run: Run, structure: Structure, known: Mapping[str, float] | None = None) -> None:
+def check_zero_order_hold(run: Run, structure: Structure, known: Mapping[str, float] | None = None) -> None:
     """Raise ModelError for the derivative of a jump: a zero-order-hold input above the order of its equation.
 
     ``known`` maps free orders with a single value to it.
     """
     for item in structure.equations:
-        alpha = item.order.partly(known or {})
+        alpha = item.order.substitute(known or {})
         for term in item.terms:
-            order = term.order.partly(known or {})
+            order = term.order.substitute(known or {})
             if alpha.names or order.names or order.constant <= alpha.constant + 1e-9:
                 continue
             if term.signal in run.inputs and run.intersample[term.signal] == "zoh":
@@ -228,11 +237,11 @@ def records(runs: Sequence[Run], structure: Structure, m: int, *, filtered: bool
     Records with a finer grid than the runs are large and used once, so they are not cached.
     """
 
-    def made() -> list[Record]:
+    def build() -> list[Record]:
         return [record(run, structure, m, filtered=filtered) for run in runs]
 
     if not isinstance(runs, Runs) or m >= min(run.length for run in runs):
-        return made()
+        return build()
     filtered = filtered or structure.sensor_filter is None
     inputs = (structure.delay, structure.free_delays, structure.limits)
     read = (structure.signals, inputs, structure.sensor_filter, structure.initial)
@@ -242,7 +251,7 @@ def records(runs: Sequence[Run], structure: Structure, m: int, *, filtered: bool
         has_memory(structure),
         [e.order.constant for e in structure.equations],
     )
-    return list(runs.keep(repr((read, start, m, filtered)), made))
+    return list(runs.get_or_compute(repr((read, start, m, filtered)), build))
 
 
 def sensor_series(structure: Structure, m: int, step: float) -> Floats | None:
@@ -250,29 +259,32 @@ def sensor_series(structure: Structure, m: int, step: float) -> Floats | None:
     sensor = structure.sensor_filter
     if sensor is None:
         return None
-    return (_short_series if m <= SHORT else _long_series)(sensor.numerator, sensor.denominator, m, step)
+    return (_short_series if m <= SHORT_SERIES_PULSES else _long_series)(sensor.numerator, sensor.denominator, m, step)
 
 
-def _made(
+def _filter_series(
     numerator: tuple[tuple[float, float], ...], denominator: tuple[tuple[float, float], ...], m: int, step: float
 ) -> Floats:
     """Return the series of a filter on m pulses."""
-    return locked(_core.filter_series(list(numerator), list(denominator), m, step))
+    return make_read_only(_core.filter_series(list(numerator), list(denominator), m, step))
 
 
-_long_series, _short_series = lru_cache(maxsize=KEPT_LONG)(_made), lru_cache(maxsize=KEPT_SHORT)(_made)
+_long_series, _short_series = (
+    lru_cache(maxsize=CACHED_LONG_SERIES)(_filter_series),
+    lru_cache(maxsize=CACHED_SHORT_SERIES)(_filter_series),
+)
 
 
-def _check_known(run: Run, structure: Structure) -> None:
+def _check_missing(run: Run, structure: Structure) -> None:
     """Raise DataError for missing samples of inputs, and of outputs that are filtered before comparison."""
-    missing = run.missing
+    missing = run.missing_samples
     if not missing:
         return
     outputs, coupled = structure.outputs, structure.coupling == "simulated"
     drivers = {
         name: e.output
         for e in structure.equations
-        for name in (s.removeprefix(COULOMB) if s not in run else s for s in e.signals)
+        for name in (s.removeprefix(COULOMB_PREFIX) if s not in run else s for s in e.signals)
         if name != e.output and not (coupled and name in outputs)
     }
     lacking = next((name for name in missing if name in drivers), None)
@@ -283,17 +295,17 @@ def _check_known(run: Run, structure: Structure) -> None:
             f"{int(np.flatnonzero(gone)[0])}, and drives the equation of {drivers[lacking]} as measured; fill these "
             "rows yourself, avoid them with slice=, or use coupling='simulated'"
         )
-    if structure.behind_filter and any(name in missing for name in outputs):
+    if structure.all_filtered and any(name in missing for name in outputs):
         raise DataError(
             f"run {run.name!r} has missing samples, and a sensor filter with coupling='measured', or on what "
             "drives the run, must see all of them; use coupling='simulated', or a part without gaps"
         )
 
 
-def whole(runs: Sequence[Run], what: str) -> None:
+def check_no_missing(runs: Sequence[Run], what: str) -> None:
     """Raise DataError for missing samples if an analysis cannot exclude them."""
     for run in runs:
-        for name, gone in run.missing.items():
+        for name, gone in run.missing_samples.items():
             raise DataError(
                 f"output {name!r} of run {run.name!r} holds no value in {int(gone.sum())} rows, first row "
                 f"{int(np.flatnonzero(gone)[0])}: {what} cannot leave them out; use method='output-error' "
@@ -302,17 +314,17 @@ def whole(runs: Sequence[Run], what: str) -> None:
 
 
 def _means(run: Run, structure: Structure, name: str, m: int, *, at_rest: bool) -> Floats:
-    if name not in run and name.startswith(COULOMB) and name.removeprefix(COULOMB) in run:
+    if name not in run and name.startswith(COULOMB_PREFIX) and name.removeprefix(COULOMB_PREFIX) in run:
         # The sign of the measured rate over each interval; the last row repeats so that rows match.
-        rate = np.sign(np.diff(run[name.removeprefix(COULOMB)]))
+        rate = np.sign(np.diff(run[name.removeprefix(COULOMB_PREFIX)]))
         return _core.pulse_means(np.append(rate, rate[-1]), m, True)
     if name not in run:
         raise DataError(
             f"run {run.name!r} has no signal {name!r}{nearest(name, run.signals)}, which the model needs; "
             f"it has {', '.join(run.signals)}: name the columns with inputs= and outputs= (commands: -u and -y)"
         )
-    run = driving(run, structure, name)
-    samples = bridged(run[name])
+    run = with_effective_inputs(run, structure, name)
+    samples = interpolate_gaps(run[name])
     if name in structure.free_delays:
         raise ModelError(
             f"the delay of {name} is free: only method='output-error' estimates delays; give its value in seconds"
@@ -321,13 +333,13 @@ def _means(run: Run, structure: Structure, name: str, m: int, *, at_rest: bool) 
     if name not in run.inputs:
         if delay:
             raise ModelError(f"delay of {name} = {delay:g} s, but run {run.name!r} has it as an output; delay inputs")
-        if run.readings is not None and name not in run.missing:
-            return run.readings.means(name, "foh", m, run.duration, 0.0, 0.0)
+        if run.sample_times is not None and name not in run.missing_samples:
+            return run.sample_times.means(name, "foh", m, run.duration, 0.0, 0.0)
         return _core.pulse_means(samples, m, False)
     held = run.intersample[name] == "zoh"
-    if run.readings is not None:
+    if run.sample_times is not None:
         before = 0.0 if at_rest else float(samples[0])
-        return run.readings.means(name, run.intersample[name], m, run.duration, delay, before)
+        return run.sample_times.means(name, run.intersample[name], m, run.duration, delay, before)
     if delay:
         intervals = run.length - 1
         # On a finer grid the delayed command switches within an interval, so it is held on that grid before the delay.
@@ -366,7 +378,7 @@ def linear_tuple(item: Equation, signals: Sequence[str]) -> tuple[int, float, li
     return index[item.output], item.order.constant, terms
 
 
-def lattice_tuple(
+def order_grid_tuple(
     item: Equation, signals: Sequence[str], values: Mapping[str, Sequence[float]]
 ) -> tuple[int, list[float], list[tuple[int, list[float], bool]]]:
     """Output, values of alpha, and (signal, values of the order, whether both are free) of each term."""
@@ -413,14 +425,14 @@ def prepare(
 
     Missing samples raise DataError unless ``gaps`` is True, for an estimator that excludes them.
     """
-    check_decided(structure.offset)
+    check_offset_resolved(structure.offset)
     if not gaps:
-        whole(runs, "an estimator on the equation error")
+        check_no_missing(runs, "an estimator on the equation error")
     m = check_m(default_m(runs, power_of_two=power_of_two) if m is None else m, runs, power_of_two=power_of_two)
     for run in runs:
         run.require_outputs([o for o in structure.outputs if o in run])
     prepared = records(runs, structure, m)
-    common = together([r.initial for r in prepared])
+    common = common_initial_conditions([r.initial for r in prepared])
     if common is not None:
         # One rule for all runs of a fit: initial terms that a run at rest does not need are estimated as zero.
         prepared = records(runs, replace(structure, initial=common), m)
@@ -452,16 +464,16 @@ def named_coefficients(item: Equation, raw: Sequence[float]) -> dict[str, float]
     return {t.coefficient: c / t.factor for t, c in zip(item.terms, raw, strict=True) if isinstance(t.coefficient, str)}
 
 
-def has_own_times(run: Run, structure: Structure) -> bool:
+def has_nonuniform_samples(run: Run, structure: Structure) -> bool:
     """Whether the outputs of a run are compared at nonuniform sample times.
 
     False if an input parameter is free, or if all signals are filtered.
     """
-    return run.readings is not None and not structure.free_inputs and not structure.behind_filter
+    return run.sample_times is not None and not structure.free_inputs and not structure.all_filtered
 
 
 @dataclass(frozen=True, eq=False)
-class Instants:
+class SampleTimes:
     """Sample times of a run on its grid of pulses, with the original input samples.
 
     Parameters
@@ -479,60 +491,60 @@ class Instants:
     run: Run
     record: Record
     structure: Structure
-    readings: Readings
+    readings: NonuniformSamples
     times: Floats
 
     @classmethod
-    def of(cls, run: Run, record: Record, structure: Structure, times: Floats) -> Instants:
+    def of(cls, run: Run, record: Record, structure: Structure, times: Floats) -> SampleTimes:
         """Build for given times of a run; a uniformly sampled run has the samples of its grid."""
-        run = acting(run, structure)
-        readings = run.readings or Readings(run.time, {n: run[n] for n in run.signals})
+        run = apply_input_nonlinearity(run, structure)
+        readings = run.sample_times or NonuniformSamples(run.time, {n: run[n] for n in run.signals})
         return cls(run, record, structure, readings, times)
 
     @property
-    def places(self) -> Floats:
+    def pulse_positions(self) -> Floats:
         """Sample times in units of pulses."""
         return np.asarray(np.minimum(self.times / self.record.step, float(self.record.m)))
 
     def jumps(self, name: str) -> tuple[Floats, Floats] | None:
         """Positions and sizes of the jumps of a zero-order-hold input; None for other signals."""
-        if name not in self.run.inputs or self.run.intersample[name] != HELD:
+        if name not in self.run.inputs or self.run.intersample[name] != ZERO_ORDER_HOLD:
             return None
-        times, sizes = self.readings.jumps(name, self._delay(name), self._before(name))
+        times, sizes = self.readings.jumps(name, self._delay(name), self._initial_value(name))
         return np.asarray(times / self.record.step), sizes
 
     def values(self, name: str) -> Floats | None:
         """Values of a signal just after the sample times; None for a derived signal."""
         if name in self.run.inputs:
             kind = self.run.intersample[name]
-            return self.readings.at(name, kind, self.times, self._delay(name), self._before(name))
+            return self.readings.at(name, kind, self.times, self._delay(name), self._initial_value(name))
         if name not in self.run:
             return None
         return self.readings.at(name, "foh", self.times, 0.0, 0.0)
 
-    def corners(self, name: str, order: float) -> Floats | None:
+    def jump_correction(self, name: str, order: float) -> Floats | None:
         """Correction to the pulse means of I^order of an input with jumps, at the sample times."""
         jumps = self.jumps(name)
         if jumps is None:
             return None
-        return _core.corners(self.record.m, self.places, jumps, order, self.record.step)
+        return _core.corners(self.record.m, self.pulse_positions, jumps, order, self.record.step)
 
     def _delay(self, name: str) -> float:
         return self.structure.delay.get(name, 0.0)
 
-    def _before(self, name: str) -> float:
+    def _initial_value(self, name: str) -> float:
         return 0.0 if self.record.initial == "rest" else float(self.readings.data[name][0])
 
 
 def compared_times(run: Run, structure: Structure) -> Floats:
     """Return the times of the compared samples of a run [s since its first sample]."""
-    if run.readings is None or not has_own_times(run, structure):
+    if run.sample_times is None or not has_nonuniform_samples(run, structure):
         return run.time
-    return run.readings.times[run.readings.compared(run.duration)]
+    return run.sample_times.times[run.sample_times.indices_within(run.duration)]
 
 
 def compared_values(run: Run, structure: Structure, name: str) -> Floats:
     """Return the recorded values of a signal at these times; NaN for missing samples of an output."""
-    if run.readings is None or not has_own_times(run, structure):
+    if run.sample_times is None or not has_nonuniform_samples(run, structure):
         return run[name]
-    return run.readings.data[name][run.readings.compared(run.duration)]
+    return run.sample_times.data[name][run.sample_times.indices_within(run.duration)]

@@ -9,33 +9,33 @@ from functools import lru_cache
 import numpy as np
 
 from ftlm.data.run import Run
-from ftlm.data.sampling import HELD, locked, read
+from ftlm.data.sampling import ZERO_ORDER_HOLD, drop_missing, make_read_only
 from ftlm.structure.sensor_filter import SensorFilter
 from ftlm.structure.structure import History, Initial, Structure
-from ftlm.utils.linalg import length
-from ftlm.utils.statistics import ROUNDING, chi_squared, huber_excess, is_rest, noise_of
+from ftlm.utils.linalg import vector_norm
+from ftlm.utils.statistics import NEGLIGIBLE_RESIDUAL_SHARE, chi_squared, estimate_noise, huber_excess, is_rest
 from ftlm.utils.validation import Floats
 
 #: Increment of the powers of time.
-QUARTER = 0.25
+POWER_INCREMENT = 0.25
 #: Ratio of a signal's norm to its noise standard deviation, and the highest power, in quarters, that it needs for
 #: biases below a tenth of a standard error (benches/RESULTS.md).
-REFERENCE, QUARTERS = 2500.0, 6
+REFERENCE_SIGNAL_RATIO, REFERENCE_QUARTERS = 2500.0, 6
 #: Factor by which one more quarter reduces the unmodeled past.
-FACTOR = 2.5
+SIGNAL_RATIO_PER_QUARTER = 2.5
 #: Minimum and maximum number of quarters.
-LEAST, MOST = 2, 12
+MIN_QUARTERS, MAX_QUARTERS = 2, 12
 #: Minimum number of samples of a run per quarter.
-SPARSEST = 16
+MIN_SAMPLES_PER_QUARTER = 16
 #: Integer powers below this are always included, so that the list is the same for any order up to 3.
-WHOLE = 3
+MIN_INTEGER_POWERS = 3
 #: Significance level of the test of Caputo's terms against a full history. The usual 1 or 5 % would miss a weak past,
 #: with intervals too short for its bias. With an offset the level is lower: it explains a nonzero first value by
 #: itself, and a history would make it unidentifiable.
-DOUBT, DOUBT_BESIDE_OFFSET = 0.25, 0.02
+HISTORY_TEST_LEVEL, HISTORY_TEST_LEVEL_WITH_OFFSET = 0.25, 0.02
 #: Weight of the excess in the residual sum of squares, as an alternative to the robust excess. Few outliers must not
 #: require a history, but a least-squares fit must not be worse than one with a history and fewer parameters.
-OF_SQUARES = 0.25
+SQUARES_WEIGHT = 0.25
 
 
 def starts_at_rest(run: Run, structure: Structure) -> bool:
@@ -54,19 +54,21 @@ def history(run: Run, structure: Structure) -> History:
     visible = 1.0
     for name in structure.outputs:
         if name in run:
-            samples = read(run[name])
+            samples = drop_missing(run[name])
             # A level that is no offset is a part of the past; one that is takes no power of its own.
-            size = length(samples - (0.0 if structure.offset == "none" else np.mean(samples)))
+            size = vector_norm(samples - (0.0 if structure.offset == "none" else np.mean(samples)))
             if size:
-                visible = max(visible, size / max(noise_of(run[name]), np.finfo(np.float64).eps * size))
-    quarters = QUARTERS + math.ceil(math.log(visible / REFERENCE) / math.log(FACTOR))
-    quarters = max(LEAST, min(quarters, MOST, run.length // SPARSEST))
+                visible = max(visible, size / max(estimate_noise(run[name]), np.finfo(np.float64).eps * size))
+    quarters = REFERENCE_QUARTERS + math.ceil(
+        math.log(visible / REFERENCE_SIGNAL_RATIO) / math.log(SIGNAL_RATIO_PER_QUARTER)
+    )
+    quarters = max(MIN_QUARTERS, min(quarters, MAX_QUARTERS, run.length // MIN_SAMPLES_PER_QUARTER))
     highest = max((e.order.constant for e in structure.equations if not e.order.names), default=0.0)
-    whole = range(max(WHOLE, math.ceil(highest)))
-    return History(sorted({*(QUARTER * k for k in range(quarters + 1)), *map(float, whole)}))
+    whole = range(max(MIN_INTEGER_POWERS, math.ceil(highest)))
+    return History(sorted({*(POWER_INCREMENT * k for k in range(quarters + 1)), *map(float, whole)}))
 
 
-def decided(run: Run, structure: Structure) -> Initial:
+def resolve_initial_conditions(run: Run, structure: Structure) -> Initial:
     """Return the initial conditions of a structure on a run, resolving ``"auto"``."""
     initial = structure.initial
     if initial == "auto":
@@ -77,17 +79,17 @@ def decided(run: Run, structure: Structure) -> Initial:
     return history(run, structure) if initial == "history" else initial
 
 
-def together(decisions: list[Initial]) -> Initial | None:
+def common_initial_conditions(decisions: list[Initial]) -> Initial | None:
     """Return common initial conditions for runs of one fit, the longest ones, or None if they are equal."""
     if len(set(decisions)) < 2:
         return None
     return max(decisions, key=lambda d: (isinstance(d, tuple), d == "caputo", len(d)))
 
 
-def decided_together(runs: Sequence[Run], structure: Structure) -> Initial:
+def resolve_common_initial_conditions(runs: Sequence[Run], structure: Structure) -> Initial:
     """Return common initial conditions of a fit of all runs."""
-    starts = [decided(run, structure) for run in runs]
-    return together(starts) or starts[0]
+    starts = [resolve_initial_conditions(run, structure) for run in runs]
+    return common_initial_conditions(starts) or starts[0]
 
 
 def misfit(few: Sequence[Floats], many: Sequence[Floats], sizes: Sequence[float]) -> float:
@@ -106,7 +108,7 @@ def misfit(few: Sequence[Floats], many: Sequence[Floats], sizes: Sequence[float]
     excess = 0.0
     for one, other, size in zip(few, many, sizes, strict=True):
         there = ~np.isnan(one)
-        if float(np.sqrt(np.mean(one[there] ** 2))) > ROUNDING * size:
+        if float(np.sqrt(np.mean(one[there] ** 2))) > NEGLIGIBLE_RESIDUAL_SHARE * size:
             excess += huber_excess(one[there], other[there])
     return excess
 
@@ -117,12 +119,12 @@ def misfit_of_fits(few: Sequence[Floats], many: Sequence[Floats], sizes: Sequenc
     for one, other, size in zip(few, many, sizes, strict=True):
         there = ~np.isnan(one)
         floor, above = float(np.mean(other[there] ** 2)), float(np.sum(one[there] ** 2 - other[there] ** 2))
-        if math.sqrt(float(np.mean(one[there] ** 2))) > ROUNDING * size:
+        if math.sqrt(float(np.mean(one[there] ** 2))) > NEGLIGIBLE_RESIDUAL_SHARE * size:
             squares += above / floor if floor > 0.0 else math.inf
-    return max(misfit(few, many, sizes), OF_SQUARES * squares)
+    return max(misfit(few, many, sizes), SQUARES_WEIGHT * squares)
 
 
-def missed(measured: Floats, simulated: Floats) -> Floats:
+def output_residuals(measured: Floats, simulated: Floats) -> Floats:
     """Difference of measured and simulated samples; infinite if the simulation is, NaN at missing samples."""
     with np.errstate(invalid="ignore"):
         rows: Floats = measured - simulated
@@ -130,23 +132,23 @@ def missed(measured: Floats, simulated: Floats) -> Floats:
     return rows
 
 
-def needed(structure: Structure, excess: float, terms: int) -> bool:
+def needs_history(structure: Structure, excess: float, terms: int) -> bool:
     """Whether an excess over residuals with additional terms requires a history instead of Caputo's terms."""
-    doubt = DOUBT if structure.offset == "none" else DOUBT_BESIDE_OFFSET
+    doubt = HISTORY_TEST_LEVEL if structure.offset == "none" else HISTORY_TEST_LEVEL_WITH_OFFSET
     return terms > 0 and excess > chi_squared(terms, doubt)
 
 
 #: Length of the fit of the transient, in time constants of the fastest pole, over which the filter's input is nearly a
 #: level and a slope; and minimum number of samples per parameter of the fit.
-SHOWN = 1.0
-SAMPLES = 2
+TRANSIENT_FIT_TIME_CONSTANTS = 1.0
+SAMPLES_PER_PARAMETER = 2
 #: Product of fastest pole and sampling interval above which the transient has decayed before the second sample.
-FORGOTTEN = 1e3
+MAX_POLE_STEP_PRODUCT = 1e3
 #: Number of cached filter responses.
-KEPT = 4
+CACHED_RESPONSES = 4
 
 
-def without_held(run: Run, structure: Structure, name: str | None = None) -> Run:
+def remove_filter_transient(run: Run, structure: Structure, name: str | None = None) -> Run:
     """Return the run without the filter's transient in its signals, or in one signal, that enter as filtered inputs.
 
     From rest there is no transient. Unchanged are outputs that enter no other equation, zero-order-hold or delayed
@@ -154,45 +156,47 @@ def without_held(run: Run, structure: Structure, name: str | None = None) -> Run
     sample.
     """
     sensor = structure.sensor_filter
-    if sensor is None or not structure.behind_filter:
+    if sensor is None or not structure.all_filtered:
         return run
-    names = [n for n in ([name] if name else structure.signals) if n in run and _drives(run, structure, n)]
-    if not names or not sensor.holds_answers or _fastest(sensor) * run.step > FORGOTTEN:
+    names = [n for n in ([name] if name else structure.signals) if n in run and _enters_as_input(run, structure, n)]
+    if not names or not sensor.holds_answers or _fastest_pole(sensor) * run.step > MAX_POLE_STEP_PRODUCT:
         return run
-    states = structure.filter_states(decided(run, structure))
+    states = structure.filter_states(resolve_initial_conditions(run, structure))
     if not states:
         return run
-    changed = {n: run[n] - _held(run[n], run.step, sensor, states) for n in names}
-    if run.readings is None:
+    changed = {n: run[n] - _filter_transient(run[n], run.step, sensor, states) for n in names}
+    if run.sample_times is None:
         return run.with_samples(changed)
-    times = run.readings.times
-    own = {n: run.readings.data[n] - np.interp(times, run.time, run[n] - v) for n, v in changed.items()}
+    times = run.sample_times.times
+    own = {n: run.sample_times.data[n] - np.interp(times, run.time, run[n] - v) for n, v in changed.items()}
     return run.with_samples(changed, own)
 
 
-def _drives(run: Run, structure: Structure, name: str) -> bool:
+def _enters_as_input(run: Run, structure: Structure, name: str) -> bool:
     """Whether a filtered signal is an input of an equation other than its own."""
-    if not structure.measured_through(name) or (structure.coupling == "simulated" and name in structure.outputs):
+    if not structure.is_filtered(name) or (structure.coupling == "simulated" and name in structure.outputs):
         return False
-    if name in run.inputs and (run.intersample[name] == HELD or name in (*structure.delay, *structure.free_delays)):
+    if name in run.inputs and (
+        run.intersample[name] == ZERO_ORDER_HOLD or name in (*structure.delay, *structure.free_delays)
+    ):
         return False
     return any(t.signal == name for e in structure.equations if e.output != name for t in e.terms)
 
 
-def _held(samples: Floats, step: float, sensor: SensorFilter, states: int) -> Floats:
+def _filter_transient(samples: Floats, step: float, sensor: SensorFilter, states: int) -> Floats:
     """Transient of the filter at the samples of a signal; the first sample is all transient."""
-    system, gain = _states(sensor)
+    system, gain = _state_space(sensor)
     size = system.shape[0]
-    fastest = _fastest(sensor)
-    shown = round(SHOWN / (fastest * step)) if fastest > 0 else 0
-    count = min(max(shown, SAMPLES * (states + 2)), samples.size)
+    fastest = _fastest_pole(sensor)
+    shown = round(TRANSIENT_FIT_TIME_CONSTANTS / (fastest * step)) if fastest > 0 else 0
+    count = min(max(shown, SAMPLES_PER_PARAMETER * (states + 2)), samples.size)
     # A level and a slope that come in are two states more, which nothing moves but the slope the level.
     whole = np.zeros((size + 2, size + 2))
     whole[:size, :size], whole[size - 1, size], whole[size, size + 1] = system, gain, 1.0
     begun = np.zeros((size + 2, states + 2))
-    begun[:size, :states] = _caught(system, gain, states)
+    begun[:size, :states] = _impulse_states(system, gain, states)
     begun[size, states], begun[size + 1, states + 1] = 1.0, 1.0
-    columns = _motions(whole * step, begun, count, 0)
+    columns = _free_responses(whole * step, begun, count, 0)
     jump = columns[0, states - 1]
     rest = np.delete(columns, states - 1, axis=1)
     level = samples[0] / jump
@@ -200,35 +204,37 @@ def _held(samples: Floats, step: float, sensor: SensorFilter, states: int) -> Fl
     sizes[sizes == 0] = 1.0
     found = np.linalg.lstsq(rest / sizes, samples[:count] - level * columns[:, states - 1], rcond=None)[0] / sizes
     first = begun[:size, :states] @ np.append(found[: states - 1], level)
-    return _motions(system * step, first[:, None], samples.size, 0)[:, 0]
+    return _free_responses(system * step, first[:, None], samples.size, 0)[:, 0]
 
 
-@lru_cache(maxsize=KEPT)
-def answers(sensor: SensorFilter, states: int, m: int, step: float) -> Floats | None:
+@lru_cache(maxsize=CACHED_RESPONSES)
+def filter_impulse_responses(sensor: SensorFilter, states: int, m: int, step: float) -> Floats | None:
     """Return pulse means of a filter's responses to an impulse and its derivatives, shape (states, m).
 
     On the pulse grid an impulse would last for one pulse and its derivative for two. None for a filter with zeros, or
     with a transient that decays within a pulse.
     """
-    if not sensor.holds_answers or not states or _fastest(sensor) * step > FORGOTTEN:
+    if not sensor.holds_answers or not states or _fastest_pole(sensor) * step > MAX_POLE_STEP_PRODUCT:
         return None
-    system, gain = _states(sensor)
+    system, gain = _state_space(sensor)
     size = system.shape[0]
     # What the answer has come to is one state more.
     whole = np.zeros((size + 1, size + 1))
     whole[:size, :size], whole[size, 0] = system, 1.0
     begun = np.zeros((size + 1, states))
-    begun[:size] = _caught(system, gain, states)
-    return locked(np.ascontiguousarray(np.diff(_motions(whole * step, begun, m + 1, size), axis=0).T / step))
+    begun[:size] = _impulse_states(system, gain, states)
+    return make_read_only(
+        np.ascontiguousarray(np.diff(_free_responses(whole * step, begun, m + 1, size), axis=0).T / step)
+    )
 
 
-def _caught(system: Floats, gain: float, states: int) -> Floats:
+def _impulse_states(system: Floats, gain: float, states: int) -> Floats:
     """Return the states after an impulse and after its derivatives, one column each."""
     # An impulse is caught by the last state; each derivative of one goes through the system once more.
     return np.stack([np.linalg.matrix_power(system, k)[:, -1] * gain for k in range(states)], axis=1)
 
 
-def _states(sensor: SensorFilter) -> tuple[Floats, float]:
+def _state_space(sensor: SensorFilter) -> tuple[Floats, float]:
     """Return a filter without zeros as a chain of states with the output first, and its input gain."""
     powers = {int(order): 0.0 for _, order in sensor.denominator}
     for coefficient, order in sensor.denominator:
@@ -239,14 +245,14 @@ def _states(sensor: SensorFilter) -> tuple[Floats, float]:
     return system, sum(c for c, _ in sensor.numerator) / powers[size]
 
 
-def _fastest(sensor: SensorFilter) -> float:
+def _fastest_pole(sensor: SensorFilter) -> float:
     """Magnitude of the fastest pole of a filter without zeros [rad/s]."""
-    return float(np.max(np.abs(np.linalg.eigvals(_states(sensor)[0])), initial=0.0))
+    return float(np.max(np.abs(np.linalg.eigvals(_state_space(sensor)[0])), initial=0.0))
 
 
-def _motions(system: Floats, begun: Floats, count: int, state: int) -> Floats:
+def _free_responses(system: Floats, begun: Floats, count: int, state: int) -> Floats:
     """Return one state at unit time steps for several initial states, shape (count, initial states)."""
-    power = exponential(system)
+    power = matrix_exponential(system)
     states = begun[None]
     while states.shape[0] < count:
         states = np.concatenate([states, power @ states])
@@ -254,7 +260,7 @@ def _motions(system: Floats, begun: Floats, count: int, state: int) -> Floats:
     return np.asarray(states[:count, state])
 
 
-def exponential(matrix: Floats) -> Floats:
+def matrix_exponential(matrix: Floats) -> Floats:
     """Exponential of a small matrix by scaling and squaring of a Taylor series."""
     halvings = max(0, math.ceil(math.log2(max(float(np.linalg.norm(matrix, 1)), 1e-300))) + 1)
     part = matrix / 2.0**halvings

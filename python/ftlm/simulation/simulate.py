@@ -10,23 +10,30 @@ import numpy as np
 from ftlm import _core
 from ftlm.data.run import Run
 from ftlm.errors import ConvergenceError, DataError, ModelError
-from ftlm.model.model import Solved, check_solved
-from ftlm.simulation.discretization import MAX_M, Record, acting, equation_tuple, records, sensor_series
-from ftlm.simulation.step_refinement import refined
+from ftlm.model.model import ModelData, check_model
+from ftlm.simulation.discretization import (
+    MAX_M,
+    Record,
+    apply_input_nonlinearity,
+    equation_tuple,
+    records,
+    sensor_series,
+)
+from ftlm.simulation.step_refinement import simulate_refined
 from ftlm.structure.structure import check_initial
 from ftlm.utils.validation import Floats, real_number
 
 
-def compared(runs: Sequence[Run], model: Solved, m: int) -> list[Record]:
+def comparison_records(runs: Sequence[Run], model: ModelData, m: int) -> list[Record]:
     """Return the records with which simulations are compared: measured outputs, filtered like the simulated ones.
 
     Simulated outputs pass the sensor filter if they were measured through it. If a filtered signal is an input of a
     simulation, all signals are filtered.
     """
-    return records(runs, model.structure, m, filtered=model.structure.behind_filter)
+    return records(runs, model.structure, m, filtered=model.structure.all_filtered)
 
 
-def respond(model: Solved, rec: Record) -> tuple[dict[str, Floats], dict[str, dict[float, float]]]:
+def respond(model: ModelData, rec: Record) -> tuple[dict[str, Floats], dict[str, dict[float, float]]]:
     """Return pulse means of the outputs on one of the :func:`comparison_records`, and initial terms by exponent.
 
     The initial terms minimize the distance to the measured outputs.
@@ -46,19 +53,22 @@ def respond(model: Solved, rec: Record) -> tuple[dict[str, Floats], dict[str, di
             responses[name] = outputs[i]
             initial[name] = dict(zip(exponents[i], values[i], strict=True))
 
-    def behind(names: tuple[str, ...]) -> tuple[Floats, list[bool]] | None:
-        return None if series is None else (series, [structure.measured_through(n) for n in names])
+    def output_filter(names: tuple[str, ...]) -> tuple[Floats, list[bool]] | None:
+        return None if series is None else (series, [structure.is_filtered(n) for n in names])
 
     if coupled:
-        keep(model.outputs, _core.respond_with_initial(rec.core(), equations, inputs, terms, behind(model.outputs)))
+        keep(
+            model.outputs,
+            _core.respond_with_initial(rec.core(), equations, inputs, terms, output_filter(model.outputs)),
+        )
     else:
         for name, item in zip(model.outputs, equations, strict=True):
-            keep((name,), _core.respond_with_initial(rec.core(), [item], inputs, terms, behind((name,))))
+            keep((name,), _core.respond_with_initial(rec.core(), [item], inputs, terms, output_filter((name,))))
     return responses, initial
 
 
 def simulate(
-    model: Solved,
+    model: ModelData,
     run: Run,
     *,
     tolerance: float = 1e-6,
@@ -102,7 +112,7 @@ def simulate(
     ConvergenceError
         Overflow of an unstable model (with the time), or a response that has not converged at ``largest_m`` pulses.
     """
-    check_solved(model)
+    check_model(model)
     if not isinstance(run, Run):
         raise DataError(f"run is {type(run).__name__}, not a Run; use ftlm.load or Run.from_arrays")
     sensor = model.structure.sensor_filter
@@ -110,14 +120,16 @@ def simulate(
     for name, terms in (initial or {}).items():
         if name not in model.outputs:
             raise ModelError(f"initial terms of {name!r}, which is no output of the model: {', '.join(model.outputs)}")
-        check_initial([e for e in terms if not (model.structure.held_back(name) and e in impulses)])
+        check_initial([e for e in terms if not (model.structure.has_filter_transient(name) and e in impulses)])
     if not real_number("tolerance", tolerance) > 0:
         raise ModelError(f"tolerance = {tolerance} is not positive; the default is 1e-6")
     own = run.length - 1
     largest_m = min(largest_m, MAX_M)
     if own > largest_m:
         raise ModelError(f"run {run.name!r} has {own} intervals, more than {largest_m}; slice it")
-    free = refined(model, _completed(run, model), initial or {}, tolerance=tolerance, largest_m=largest_m, on_grid=True)
+    free = simulate_refined(
+        model, _with_missing_outputs(run, model), initial or {}, tolerance=tolerance, largest_m=largest_m, on_grid=True
+    )
     for name, samples in zip(model.outputs, free.outputs, strict=True):
         if not np.all(np.isfinite(samples)):
             at = int(np.argmax(~np.isfinite(samples))) * run.step
@@ -140,13 +152,13 @@ def simulate(
     )
 
 
-def _units(model: Solved, run: Run) -> dict[str, str]:
+def _units(model: ModelData, run: Run) -> dict[str, str]:
     """Units of inputs and simulated outputs, from the run or the model."""
     inputs = {n: run.units[n] or model.units.get(n, "") for n in run.inputs}
     return inputs | {n: model.units.get(n, "") or run.units.get(n, "") for n in model.outputs}
 
 
-def _completed(run: Run, model: Solved) -> Run:
+def _with_missing_outputs(run: Run, model: ModelData) -> Run:
     """Return the run with zeros for missing outputs; simulated outputs are never read."""
     missing = [o for o in model.outputs if o not in run]
     if not missing:
@@ -161,7 +173,7 @@ def _completed(run: Run, model: Solved) -> Run:
     return run.with_outputs({n: np.zeros(run.length) for n in missing})
 
 
-def explicit_euler(model: Solved, run: Run, *, step: Literal["record"] = "record") -> dict[str, Floats]:
+def explicit_euler(model: ModelData, run: Run, *, step: Literal["record"] = "record") -> dict[str, Floats]:
     """Simulate an integer-order model by explicit Euler at the step of the run, as in the paper's baseline.
 
     Parameters
@@ -187,7 +199,7 @@ def explicit_euler(model: Solved, run: Run, *, step: Literal["record"] = "record
     if step != "record":
         raise ModelError(f"step = {step!r} is not known; Euler steps at the record's own step: resample the run")
     signals = model.structure.signals
-    run = acting(run, model.structure)
+    run = apply_input_nonlinearity(run, model.structure)
     rows = [run[s] if s not in model.outputs else np.zeros(run.length) for s in signals]
     equations = [equation_tuple(e, signals) for e in model.equations]
     inputs = [s not in model.outputs for s in signals]

@@ -11,49 +11,49 @@ from numpy.typing import NDArray
 
 from ftlm import _core
 from ftlm.data.run import Run
-from ftlm.data.sampling import HELD, bridged
+from ftlm.data.sampling import ZERO_ORDER_HOLD, interpolate_gaps
 from ftlm.errors import ModelError
-from ftlm.model.model import Solved
-from ftlm.simulation.discretization import MAX_M, acting, has_own_times, record
-from ftlm.simulation.initial_conditions import decided
+from ftlm.model.model import ModelData
+from ftlm.simulation.discretization import MAX_M, apply_input_nonlinearity, has_nonuniform_samples, record
+from ftlm.simulation.initial_conditions import resolve_initial_conditions
 from ftlm.simulation.output_samples import (
     FIRST_REFINEMENT,
     FRICTION_REFINEMENT,
-    GRAIN,
-    Sampled,
+    ORDER_TOLERANCE,
+    OutputSamples,
     Terms,
-    begun,
-    begun_terms,
-    fitted,
+    fit_initial_terms,
+    fit_initial_terms_with_friction,
+    friction_initial_terms,
     initial_names,
     measured_samples,
-    own_times,
-    sampled,
-    started,
+    nonuniform_sample_times,
+    simulate_samples,
     unit_samples,
+    with_initial_conditions,
 )
 from ftlm.utils.validation import Floats
 
 #: Powers of the step in the error of a sample: 2 from the block-pulse scheme, 3 from extrapolation to a sample time,
 #: and 4 from the next term of both. A slope discontinuity t^eta adds powers in between, which these columns do not
 #: eliminate, but none of them increases the error by more than a small factor.
-POWERS = (2, 3, 4)
+ERROR_POWERS = (2, 3, 4)
 #: A column has the error of its power if halving the step reduced its change by at least this fraction of 2^power.
-SEEN = 0.5
+MIN_POWER_RATIO = 0.5
 #: For an unknown power: minimum reduction of the change on halving the step (slightly below the square root of two),
 #: and minimum effective number of samples from which the reduction is estimated.
-LEAST_RATIO, FEW = 1.4, 8.0
+MIN_REDUCTION_FACTOR, MIN_EFFECTIVE_SAMPLES = 1.4, 8.0
 #: Number of grids needed to estimate such a reduction factor and to test it.
-GRIDS = 4
+RATIO_TEST_GRIDS = 4
 
 
-def _moved(new: Floats, old: Floats) -> Floats:
+def _relative_change(new: Floats, old: Floats) -> Floats:
     moved, size = np.max(np.abs(new - old), axis=1), np.max(np.abs(new), axis=1)
     return np.asarray(np.where(moved == 0.0, 0.0, moved / size))
 
 
 @dataclass(frozen=True)
-class Told:
+class LimitEstimate:
     """Estimate of the limit for zero step.
 
     Parameters
@@ -68,11 +68,11 @@ class Told:
 
     samples: Floats
     change: Floats
-    beside: Floats
+    initial_terms: Floats
 
 
 @dataclass
-class Limit:
+class RichardsonTable:
     """Richardson table of grids of 1, 1/2, 1/4, … of a step; samples have the shape (outputs, N).
 
     Parameters
@@ -89,84 +89,88 @@ class Limit:
     """
 
     rows: list[list[Floats]] = field(default_factory=list)
-    beside: list[list[Floats]] = field(default_factory=list)
-    moved: list[list[Floats]] = field(default_factory=list)
-    measure: Callable[[Floats, Floats], Floats] = _moved
+    initial_terms: list[list[Floats]] = field(default_factory=list)
+    changes: list[list[Floats]] = field(default_factory=list)
+    measure: Callable[[Floats, Floats], Floats] = _relative_change
 
     def add(self, samples: Floats, beside: Floats | None = None) -> None:
         """Add samples on the next grid; samples that are not finite restart the table."""
         before = self.rows[-1] if self.rows else []
         both = bool(before) and bool(np.all(np.isfinite(before[0])) and np.all(np.isfinite(samples)))
-        row = extrapolated(samples, before if both else [])
+        row = extrapolate_row(samples, before if both else [])
         with np.errstate(invalid="ignore", over="ignore", divide="ignore"):
             # Nobody asks for the samples themselves: what was taken away moves less.
-            moved = [unknown(samples.shape[0])] * min(len(row), len(before))
+            moved = [unknown_change(samples.shape[0])] * min(len(row), len(before))
             moved[1:] = [self.measure(new, old) for new, old in zip(row[1:], before[1:], strict=False)]
         numbers = np.zeros(0) if beside is None else beside
-        self.beside = [*self.beside, extrapolated(numbers, self.beside[-1] if both else [])][-GRIDS:]
-        self.rows = [*self.rows, row][-GRIDS:]
-        self.moved = [*self.moved, moved][-2:]
+        self.initial_terms = [*self.initial_terms, extrapolate_row(numbers, self.initial_terms[-1] if both else [])][
+            -RATIO_TEST_GRIDS:
+        ]
+        self.rows = [*self.rows, row][-RATIO_TEST_GRIDS:]
+        self.changes = [*self.changes, moved][-2:]
 
-    def told(self, owners: Sequence[int] = (), *, enough: float = 0.0) -> Told:
+    def estimate(self, owners: Sequence[int] = (), *, enough: float = 0.0) -> LimitEstimate:
         """Return the estimate that another halving changes least; ``owners`` are the outputs of the initial terms.
 
         If the change of a column is at most ``enough``, no other estimate is tried.
         """
-        column, change = self.best
-        found = Told(self.rows[-1][column], change, self.beside[-1][column])
-        if len(self.rows) < GRIDS or np.all(change <= enough):
+        column, change = self.best_column
+        found = LimitEstimate(self.rows[-1][column], change, self.initial_terms[-1][column])
+        if len(self.rows) < RATIO_TEST_GRIDS or np.all(change <= enough):
             return found
         known = min(map(len, self.rows))
         every = [found, *(self._by_ratio(k, np.array(owners, dtype=int)) for k in range(known))]
-        return min((one for one in every if one is not None), key=lambda one: float(np.max(_known(one.change))))
+        return min(
+            (one for one in every if one is not None), key=lambda one: float(np.max(_nan_to_infinity(one.change)))
+        )
 
-    def _by_ratio(self, column: int, owners: NDArray[np.intp]) -> Told | None:
+    def _by_ratio(self, column: int, owners: NDArray[np.intp]) -> LimitEstimate | None:
         """Extrapolate a column with an error of unknown power, if the previous grid gave a reduction factor as well.
 
         Slope discontinuities t^eta add intermediate powers, and coinciding orders add logarithms, which the table does
         not eliminate.
         """
         oldest, older, old, new = (row[column] for row in self.rows)
-        second, third = (row[column] for row in self.beside[-2:])
-        before, now = still_to_go(oldest, older, old), still_to_go(older, old, new)
+        second, third = (row[column] for row in self.initial_terms[-2:])
+        before, now = remaining_change_ratio(oldest, older, old), remaining_change_ratio(older, old, new)
         if before is None or now is None:
             return None
         with np.errstate(invalid="ignore", over="ignore"):
             samples = new + now[:, None] * (new - old)
             change = self.measure(samples, old + before[:, None] * (old - older))
-        return Told(samples, change, third + now[owners] * (third - second))
+        return LimitEstimate(samples, change, third + now[owners] * (third - second))
 
     @property
-    def best(self) -> tuple[int, Floats]:
+    def best_column(self) -> tuple[int, Floats]:
         """Column that another halving changes least, and its change relative to the largest value of each output.
 
         Infinite before there are three grids.
         """
-        row, last = self.rows[-1], self.moved[-1]
-        found: tuple[int, Floats] = (len(row) - 1 if len(row) <= 2 else 1, unknown(row[0].shape[0]))
+        row, last = self.rows[-1], self.changes[-1]
+        found: tuple[int, Floats] = (len(row) - 1 if len(row) <= 2 else 1, unknown_change(row[0].shape[0]))
         for column in range(1, len(last)):
             told = [(column, last[column])]
-            before = self.moved[0][column] if len(self.moved) > 1 and column < len(self.moved[0]) else None
+            before = self.changes[0][column] if len(self.changes) > 1 and column < len(self.changes[0]) else None
             if before is not None and column + 1 < len(row):
-                factor = 2.0 ** POWERS[column]
+                factor = 2.0 ** ERROR_POWERS[column]
                 # What is left of a column whose power shows is what the next column takes away.
-                if np.all(last[column] * (SEEN * factor) <= before):
+                if np.all(last[column] * (MIN_POWER_RATIO * factor) <= before):
                     told.append((column + 1, last[column] / (factor - 1.0)))
-            found = min([found, *told], key=lambda pair: float(np.max(_known(pair[1]))))
+            found = min([found, *told], key=lambda pair: float(np.max(_nan_to_infinity(pair[1]))))
         return found
 
 
-def extrapolated(fine: Floats, coarse: Sequence[Floats]) -> list[Floats]:
+def extrapolate_row(fine: Floats, coarse: Sequence[Floats]) -> list[Floats]:
     """Return a row of the table from values on a grid and the row of twice its step."""
     row = [fine]
     with np.errstate(invalid="ignore", over="ignore"):
-        for power, before in zip(POWERS, coarse, strict=False):
+        for power, before in zip(ERROR_POWERS, coarse, strict=False):
             factor = 2.0**power
             row.append((factor * row[-1] - before) / (factor - 1.0))
     return row
 
 
-def still_to_go(older: Floats, old: Floats, new: Floats) -> Floats | None:
+def remaining_change_ratio(older: Floats, old: Floats, new: Floats) -> Floats | None:
     """Ratio of the remaining change to the last change of each output, for changes that shrink by a constant factor.
 
     This is Aitken's method with one factor for all samples of an output. None if few samples change, or do not
@@ -179,45 +183,47 @@ def still_to_go(older: Floats, old: Floats, new: Floats) -> Floats | None:
         squares = np.sum(unit**2, axis=1)
         still = squares == 0.0
         ratio = np.where(still, np.inf, np.sum(unit * before, axis=1) / np.where(still, 1.0, squares * size[:, 0]))
-        if not np.all(ratio >= LEAST_RATIO) or np.any(squares**2 < FEW * np.sum(unit**4, axis=1)):
+        if not np.all(ratio >= MIN_REDUCTION_FACTOR) or np.any(
+            squares**2 < MIN_EFFECTIVE_SAMPLES * np.sum(unit**4, axis=1)
+        ):
             return None
         return np.asarray(1.0 / (ratio - 1.0))
 
 
-def unknown(outputs: int) -> Floats:
+def unknown_change(outputs: int) -> Floats:
     """Return an infinite change of each output."""
     return np.full(outputs, np.inf)
 
 
-def _known(change: Floats) -> Floats:
+def _nan_to_infinity(change: Floats) -> Floats:
     """Replace NaN by infinity."""
     return np.where(np.isnan(change), np.inf, change)
 
 
 #: Minimum number of intervals of a long record. Below it, refinement of the whole grid costs no more.
-LONG = 1 << 14
+LONG_RECORD_INTERVALS = 1 << 14
 #: Pieces of a response start at its end divided by powers of this ratio, down to this minimum number of intervals.
 #: Halving the step on a piece costs as much as the whole response did.
-RATIO, SHORTEST = 8, 128
+PIECE_RATIO, MIN_PIECE_INTERVALS = 8, 128
 #: Pulses per interval of the grids that cover the whole response. The coarsest grid is not used for the first piece,
 #: where responses jump with the inputs.
-WHOLE = (1, 2, 4)
+FULL_GRID_REFINEMENTS = (1, 2, 4)
 #: Ratio of the second to the first half of a response above which the model is unstable and the sum loses its digits.
-GROWTH = 1e3
+MAX_GROWTH_RATIO = 1e3
 
 
 @dataclass
-class Piece:
+class ResponsePiece:
     """Piece of all responses, from one interval to before another, on its finest grid, and its limit for zero step."""
 
     first: int
     end: int
-    every: int
-    limit: Limit
+    refinement: int
+    limit: RichardsonTable
 
 
 @dataclass(frozen=True)
-class Answers:
+class SampleResponses:
     """Simulation as a sum of responses: to every sample of the inputs, to first samples, and to initial terms.
 
     Parameters
@@ -234,10 +240,10 @@ class Answers:
         Output and power of the initial terms.
     """
 
-    model: Solved
+    model: ModelData
     run: Run
-    drivers: Mapping[str, Floats]
-    begun: Mapping[str, float]
+    inputs: Mapping[str, Floats]
+    first_samples: Mapping[str, float]
     names: Sequence[tuple[str, float]]
 
     @property
@@ -246,7 +252,7 @@ class Answers:
         return len(self.model.outputs)
 
     @classmethod
-    def of(cls, model: Solved, run: Run, names: Sequence[tuple[str, float]]) -> Answers | None:
+    def of(cls, model: ModelData, run: Run, names: Sequence[tuple[str, float]]) -> SampleResponses | None:
         """Build for a run; None if superposition does not apply."""
         structure = model.structure
         outputs, coupled = model.outputs, structure.coupling == "simulated"
@@ -254,41 +260,41 @@ class Answers:
         drivers = dict.fromkeys(
             t.signal for e, t in read if t.signal != e.output and not (coupled and t.signal in outputs)
         )
-        if structure.has_friction or run.readings is not None or structure.behind_filter:
+        if structure.has_friction or run.sample_times is not None or structure.all_filtered:
             return None
         if any(name not in run for name in drivers) or any(
-            t.order.constant > e.order.constant + GRAIN for e, t in read
+            t.order.constant > e.order.constant + ORDER_TOLERANCE for e, t in read
         ):
             return None
         late = {name for name in drivers if structure.delay.get(name, 0.0)}
-        direct = {t.signal for e, t in read if abs(t.order.constant - e.order.constant) <= GRAIN}
-        if late and (late & direct or decided(run, structure) != "rest"):
+        direct = {t.signal for e, t in read if abs(t.order.constant - e.order.constant) <= ORDER_TOLERANCE}
+        if late and (late & direct or resolve_initial_conditions(run, structure) != "rest"):
             # What acted before the run, and at its last sample, is no answer to one of its samples.
             return None
-        every = {n: bridged(acting(run, structure, n)[n]) for n in drivers}
+        every = {n: interpolate_gaps(apply_input_nonlinearity(run, structure, n)[n]) for n in drivers}
         moving = {n: v for n, v in every.items() if v.any()}
-        ramps = [n for n in moving if n not in run.inputs or run.intersample[n] != HELD]
-        still = replace(model, structure=replace(structure, initial="rest", limited=UNSET))
+        ramps = [n for n in moving if n not in run.inputs or run.intersample[n] != ZERO_ORDER_HOLD]
+        still = replace(model, structure=replace(structure, initial="rest", input_nonlinearities=UNSET))
         return cls(still, run, moving, {n: float(moving[n][0]) for n in ramps if moving[n][0]}, names)
 
-    def on(self, every: int, intervals: int) -> Floats:
+    def compute(self, every: int, intervals: int) -> Floats:
         """Compute all responses on a grid, one block of rows per response; NaN if the equations are singular there."""
         try:
-            return self._on(every, intervals)
+            return self._compute(every, intervals)
         except ModelError:
             # The grid happens to make the equations unsolvable.
-            rows = len(self.drivers) + len(self.begun) + len(self.names)
+            rows = len(self.inputs) + len(self.first_samples) + len(self.names)
             return np.full((rows * self.count, intervals + 1), np.nan)
 
-    def _on(self, every: int, intervals: int) -> Floats:
+    def _compute(self, every: int, intervals: int) -> Floats:
         blocks, first = [], []
-        for name in self.drivers:
-            ramp = name not in self.run.inputs or self.run.intersample[name] != HELD
+        for name in self.inputs:
+            ramp = name not in self.run.inputs or self.run.intersample[name] != ZERO_ORDER_HOLD
             # What is linear in between rises to a sample before it falls.
-            rows = sampled(self.model, self._unit(name, intervals + ramp, int(ramp)), every, {})[0]
+            rows = simulate_samples(self.model, self._unit(name, intervals + ramp, int(ramp)), every, {})[0]
             blocks.append(rows[:, 1:] if ramp else rows)
-            if name in self.begun:
-                first.append(sampled(self.model, self._unit(name, intervals, 0), every, {})[0] - blocks[-1])
+            if name in self.first_samples:
+                first.append(simulate_samples(self.model, self._unit(name, intervals, 0), every, {})[0] - blocks[-1])
         more = unit_samples(self.model, self._unit("", intervals, 0), every, self.names) if self.names else []
         return np.concatenate([*blocks, *first, *more]) if blocks or more else np.zeros((0, intervals + 1))
 
@@ -309,7 +315,7 @@ class Answers:
             intersample=run.intersample,
         )
 
-    def summed(self, answers: Floats, first: int, weights: Sequence[float]) -> Floats:
+    def superpose(self, answers: Floats, first: int, weights: Sequence[float]) -> Floats:
         """Superpose responses from one interval on, shape (outputs, N - first).
 
         The weights are those of the initial terms.
@@ -317,113 +323,125 @@ class Answers:
         n = self.count
         blocks = answers.reshape(-1, n, answers.shape[1])
         out = np.zeros((n, self.run.length - first))
-        for block, samples in zip(blocks, self.drivers.values(), strict=False):
+        for block, samples in zip(blocks, self.inputs.values(), strict=False):
             for i, row in enumerate(block):
                 if row.any():
                     out[i] += _core.series_multiply(row, samples[: out.shape[1]], out.shape[1])
-        once = blocks[len(self.drivers) :]
-        for block, weight in zip(once, [*self.begun.values(), *weights], strict=True):
+        once = blocks[len(self.inputs) :]
+        for block, weight in zip(once, [*self.first_samples.values(), *weights], strict=True):
             out[:, : answers.shape[1]] += weight * block
         return out
 
-    def parts(self, answers: Floats) -> tuple[Floats, list[Floats]]:
+    def split(self, answers: Floats) -> tuple[Floats, list[Floats]]:
         """Return the simulation without initial terms, and the responses to unit initial terms."""
-        units = answers.reshape(-1, self.count, answers.shape[1])[len(self.drivers) + len(self.begun) :]
-        return self.summed(answers, 0, [0.0] * len(self.names)), list(units)
+        units = answers.reshape(-1, self.count, answers.shape[1])[len(self.inputs) + len(self.first_samples) :]
+        return self.superpose(answers, 0, [0.0] * len(self.names)), list(units)
 
 
-def long_run(model: Solved, run: Run, initial: Terms | None, *, tolerance: float, largest_m: int) -> Sampled | None:
+def simulate_long(
+    model: ModelData, run: Run, initial: Terms | None, *, tolerance: float, largest_m: int
+) -> OutputSamples | None:
     """Simulate a long run as :func:`refined` does; None if superposition does not apply.
 
     The initial conditions of the model are resolved. The refinement is that of the whole record.
     """
     own = run.length - 1
-    if own < LONG or WHOLE[-1] * own > largest_m or model.structure.has_friction:
+    if own < LONG_RECORD_INTERVALS or FULL_GRID_REFINEMENTS[-1] * own > largest_m or model.structure.has_friction:
         return None
     given = None if initial is None else [(o, p) for o in model.outputs for p in initial.get(o, {})]
-    names = initial_names(model, decided(run, model.structure)) if given is None else given
-    answers = Answers.of(model, run, names)
+    names = initial_names(model, resolve_initial_conditions(run, model.structure)) if given is None else given
+    answers = SampleResponses.of(model, run, names)
     if answers is None:
         return None
-    grids = {every: answers.on(every, own) for every in WHOLE}
-    if not all(_dies_away(rows) for rows in list(grids.values())[1:]):
+    grids = {every: answers.compute(every, own) for every in FULL_GRID_REFINEMENTS}
+    if not all(_decays(rows) for rows in list(grids.values())[1:]):
         return None
 
-    def weighed(rows: Floats) -> tuple[Floats, dict[str, dict[float, float]]]:
-        driven, units = answers.parts(rows)
+    def superpose_with_terms(rows: Floats) -> tuple[Floats, dict[str, dict[float, float]]]:
+        driven, units = answers.split(rows)
         if initial is None and names:
-            return fitted(model, measured_samples(model, run, WHOLE[-1]), driven, names, units)
+            return fit_initial_terms(
+                model, measured_samples(model, run, FULL_GRID_REFINEMENTS[-1]), driven, names, units
+            )
         kept = {o: dict((initial or {}).get(o, {})) for o in model.outputs}
         return driven + sum((kept[o][p] * u for (o, p), u in zip(names, units, strict=True)), np.zeros(1)), kept
 
-    rough, terms = weighed(grids[WHOLE[-1]])
+    rough, terms = superpose_with_terms(grids[FULL_GRID_REFINEMENTS[-1]])
     size = np.max(np.abs(rough), axis=1)
     weights = [terms[o][p] for o, p in names]
 
-    def moved_from(first: int) -> Callable[[Floats, Floats], Floats]:
-        def moved(new: Floats, old: Floats) -> Floats:
+    def change_from(first: int) -> Callable[[Floats, Floats], Floats]:
+        def relative_output_change(new: Floats, old: Floats) -> Floats:
             by = new - old
             if not np.all(np.isfinite(by)):
                 return np.full(answers.count, np.inf)
-            most = np.max(np.abs(answers.summed(by, first, weights)), axis=1)
+            most = np.max(np.abs(answers.superpose(by, first, weights)), axis=1)
             return np.asarray(np.where(most == 0.0, 0.0, most / np.where(size > 0.0, size, 1e-300)))
 
-        return moved
+        return relative_output_change
 
     pieces = []
-    for first, end in _edges(own):
-        limit = Limit(measure=moved_from(first))
-        for every in WHOLE[0 if first else 1 :]:
+    for first, end in _piece_ranges(own):
+        limit = RichardsonTable(measure=change_from(first))
+        for every in FULL_GRID_REFINEMENTS[0 if first else 1 :]:
             limit.add(grids[every][:, first:end])
-        pieces.append(Piece(first, end, WHOLE[-1], limit))
+        pieces.append(ResponsePiece(first, end, FULL_GRID_REFINEMENTS[-1], limit))
     del grids
-    change = _refined(pieces, answers, tolerance, largest_m)
-    best = np.concatenate([p.limit.told().samples for p in pieces], axis=1)
-    outputs, terms = weighed(best)
-    return Sampled(outputs, terms, pieces[-1].every, change)
+    change = _refine_pieces(pieces, answers, tolerance, largest_m)
+    best = np.concatenate([p.limit.estimate().samples for p in pieces], axis=1)
+    outputs, terms = superpose_with_terms(best)
+    return OutputSamples(outputs, terms, pieces[-1].refinement, change)
 
 
-def _refined(pieces: Sequence[Piece], answers: Answers, tolerance: float, largest_m: int) -> Floats:
+def _refine_pieces(
+    pieces: Sequence[ResponsePiece], answers: SampleResponses, tolerance: float, largest_m: int
+) -> Floats:
     """Halve the step on pieces that have not converged; return the remaining change."""
     while True:
-        changes = [p.limit.told().change for p in pieces]
+        changes = [p.limit.estimate().change for p in pieces]
         left = np.asarray(sum(c[: answers.count] for c in changes))
         restless = [
             p
             for p, c in zip(pieces, changes, strict=True)
-            if np.any(c > tolerance / len(pieces)) and 2 * p.every * p.end <= largest_m
+            if np.any(c > tolerance / len(pieces)) and 2 * p.refinement * p.end <= largest_m
         ]
         if np.all(left <= tolerance) or not restless:
             return left
         widest = restless[-1]
-        every = 2 * widest.every
-        finer = answers.on(every, widest.end - 1)
+        every = 2 * widest.refinement
+        finer = answers.compute(every, widest.end - 1)
         for piece in pieces:
-            if piece.end <= widest.end and 2 * piece.every == every:
+            if piece.end <= widest.end and 2 * piece.refinement == every:
                 piece.limit.add(finer[:, piece.first : piece.end])
-                piece.every = every
+                piece.refinement = every
 
 
-def _edges(own: int) -> list[tuple[int, int]]:
+def _piece_ranges(own: int) -> list[tuple[int, int]]:
     """Return the ranges of the pieces of responses over a number of intervals."""
     ends = [own + 1]
-    while ends[0] // RATIO >= SHORTEST:
-        ends.insert(0, ends[0] // RATIO)
+    while ends[0] // PIECE_RATIO >= MIN_PIECE_INTERVALS:
+        ends.insert(0, ends[0] // PIECE_RATIO)
     return list(zip([0, *ends[:-1]], ends, strict=True))
 
 
-def _dies_away(rows: Floats) -> bool:
+def _decays(rows: Floats) -> bool:
     """Whether responses do not grow so much that their sum loses its digits."""
     if not np.all(np.isfinite(rows)):
         return False
     half = rows.shape[1] // 2
     first, second = (np.max(np.abs(part), axis=1, initial=0.0) for part in (rows[:, :half], rows[:, half:]))
-    return bool(np.all(second <= GROWTH * first))
+    return bool(np.all(second <= MAX_GROWTH_RATIO * first))
 
 
-def refined(
-    model: Solved, run: Run, initial: Terms | None, *, tolerance: float, largest_m: int = MAX_M, on_grid: bool = False
-) -> Sampled:
+def simulate_refined(
+    model: ModelData,
+    run: Run,
+    initial: Terms | None,
+    *,
+    tolerance: float,
+    largest_m: int = MAX_M,
+    on_grid: bool = False,
+) -> OutputSamples:
     """Simulate samples on refined grids, with Richardson extrapolation, until converged or out of pulses.
 
     A long record is refined only as far as that moves it (:func:`ftlm.simulation.step_refinement.long_run`).
@@ -443,41 +461,43 @@ def refined(
     if initial is None and model.structure.has_friction:
         # Level and velocity at the start are found by descent, whose ends scatter by more than steps move them.
         rec = record(run, model.structure, FRICTION_REFINEMENT * own, filtered=False)
-        initial = begun_terms(model, begun(model, run, rec, FRICTION_REFINEMENT))
+        initial = friction_initial_terms(model, fit_initial_terms_with_friction(model, run, rec, FRICTION_REFINEMENT))
     elif initial is None:
-        model = started(model, run)
-    long = long_run(model, run, initial, tolerance=tolerance, largest_m=largest_m)
+        model = with_initial_conditions(model, run)
+    long = simulate_long(model, run, initial, tolerance=tolerance, largest_m=largest_m)
     if long is not None:
         return long
-    times = run.time if on_grid and has_own_times(run, model.structure) else own_times(model, run)
-    limit, lost = Limit(), 0
+    times = (
+        run.time if on_grid and has_nonuniform_samples(run, model.structure) else nonuniform_sample_times(model, run)
+    )
+    limit, lost = RichardsonTable(), 0
     while True:
         last = 2 * every * own > largest_m
-        samples, terms = _tried(model, run, every, initial, times, last=lost == 1)
+        samples, terms = _simulate_grid(model, run, every, initial, times, last=lost == 1)
         finite = bool(np.all(np.isfinite(samples)))
         owners = [i for i, o in enumerate(model.outputs) for _ in terms[o]]
         limit.add(samples, np.array([v for o in model.outputs for v in terms[o].values()]))
-        told = limit.told(owners, enough=tolerance)
+        told = limit.estimate(owners, enough=tolerance)
         # A stiff equation may have no stable scheme on a coarse grid; one that has none on two in a row has none.
         lost = 0 if finite or every == FIRST_REFINEMENT else lost + 1
         if last or lost == 2 or np.all(told.change <= tolerance):
             break
         every *= 2
-    return Sampled(told.samples, _like(terms, told.beside), every, told.change)
+    return OutputSamples(told.samples, _with_values(terms, told.initial_terms), every, told.change)
 
 
-def _like(terms: Terms, values: Floats) -> dict[str, dict[float, float]]:
+def _with_values(terms: Terms, values: Floats) -> dict[str, dict[float, float]]:
     """Return initial terms with the same outputs and exponents and other values."""
     left = iter(values.tolist())
     return {o: {e: next(left) for e in powers} for o, powers in terms.items()}
 
 
-def _tried(
-    model: Solved, run: Run, every: int, initial: Terms | None, times: Floats | None, *, last: bool = False
+def _simulate_grid(
+    model: ModelData, run: Run, every: int, initial: Terms | None, times: Floats | None, *, last: bool = False
 ) -> tuple[Floats, dict[str, dict[float, float]]]:
     """Simulate on one grid; NaN if the equations are singular there, unless it is the last grid."""
     try:
-        return sampled(model, run, every, initial, times)
+        return simulate_samples(model, run, every, initial, times)
     except ModelError:
         # An own coefficient c meets 1 = c h^alpha / gamma(alpha + 2) on one step, not on two.
         if last:

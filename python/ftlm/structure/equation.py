@@ -1,4 +1,4 @@
-"""Equations of fractional order: terms, equations, and how they are written."""
+"""Fractional-order equations: terms, friction, validation and formatting."""
 
 from __future__ import annotations
 
@@ -10,20 +10,20 @@ from dataclasses import dataclass, replace
 from msgspec import UNSET, UnsetType
 
 from ftlm.errors import ModelError
-from ftlm.structure.order import MAX_EXCESS, MAX_ORDER, MIN_INPUT_ORDER, Order
+from ftlm.structure.order import MAX_IMPROPER_ORDER, MAX_ORDER, MIN_INPUT_ORDER, Order
 from ftlm.utils.validation import real_number
 
 
 @dataclass(frozen=True)
 class Term:
-    """One term ``factor * coefficient * D^order signal`` of a right-hand side.
+    """Term ``factor * coefficient * D^order signal`` on the right-hand side of an equation.
 
     Parameters
     ----------
     signal
         Name of the signal.
     order
-        Its order.
+        Order of the derivative.
     coefficient
         Name of a free coefficient, or its value.
     factor
@@ -40,11 +40,11 @@ class Term:
 
     @property
     def fixed(self) -> float | None:
-        """Value of factor * coefficient, if it is known."""
+        """Value of factor * coefficient; None if the coefficient is free."""
         return None if isinstance(self.coefficient, str) else self.factor * self.coefficient
 
-    def written(self, signal: str) -> str:
-        """Write the term with another name for its signal."""
+    def as_text(self, signal: str) -> str:
+        """Format the term with a given text for its signal."""
         if isinstance(self.coefficient, str):
             factor = "" if self.factor == 1 else "-" if self.factor == -1 else f"{self.factor!r} "
             text = f"{factor}{self.coefficient} "
@@ -53,11 +53,11 @@ class Term:
         return text + derivative(self.order, signal)
 
     def __str__(self) -> str:
-        return self.written(self.signal)
+        return self.as_text(self.signal)
 
 
 def derivative(order: Order, signal: str) -> str:
-    """Write a signal with its order."""
+    """Format the derivative of a signal, such as ``D^0.5 y``."""
     if not order.names and order.constant == 0:
         return signal
     text = str(order)
@@ -67,18 +67,18 @@ def derivative(order: Order, signal: str) -> str:
 
 @dataclass(frozen=True)
 class Stribeck:
-    """What friction has more near rest: ``factor * coefficient * exp(-(D output / speed)^2) * sign(D output)``.
+    """Stribeck friction near rest: ``factor * coefficient * exp(-(D output / speed)^2) * sign(D output)``.
 
     Parameters
     ----------
     coefficient
         Name of the free coefficient fs, or its value [unit of D^alpha y]; not negative times a factor that is negative.
     speed
-        Name of the free speed vs at which the term has fallen to 1/e, or its value [unit of y per s], positive.
+        Stribeck speed vs at which the term has decayed to 1/e: name if free, else value [unit of y per s], positive.
     factor
-        Known factor of the coefficient, negative: friction takes energy.
+        Known factor of the coefficient, negative, because friction dissipates energy.
     name, speed_name
-        Names that coefficient and speed had before they got their values.
+        Names of coefficient and speed before they were fixed.
     """
 
     coefficient: str | float
@@ -89,68 +89,68 @@ class Stribeck:
 
     @property
     def strength(self) -> float | None:
-        """What friction holds at rest beyond what it takes at speed, [unit of D^alpha y], if it is known."""
+        """Stiction in excess of Coulomb friction [unit of D^alpha y]; None if the coefficient is free."""
         return None if isinstance(self.coefficient, str) else -self.factor * self.coefficient
 
-    def written(self, output: str) -> str:
-        """Write the term in words."""
+    def as_text(self, output: str) -> str:
+        """Format the Stribeck term for an output."""
         speed = self.speed if isinstance(self.speed, str) else f"{self.speed!r}"
-        return f"- {_sized(self.coefficient, self.factor)} exp(-(D {output}/{speed})^2) sign(D {output})"
+        return f"- {_format_coefficient(self.coefficient, self.factor)} exp(-(D {output}/{speed})^2) sign(D {output})"
 
 
 @dataclass(frozen=True)
 class Friction:
     """Coulomb friction ``factor * coefficient * sign(D output)`` of an equation's own output, set-valued at rest.
 
-    The sign is that of the velocity that the equation itself gives, not of a measured one. At rest it is whatever
-    within [-1, 1] keeps the body there; where nothing within does, the body slides.
+    The sign is that of the simulated velocity, not of a measured one. At rest it takes the value in [-1, 1] that keeps
+    the output at rest; if there is none, the output slides.
 
     Parameters
     ----------
     coefficient
         Name of the free coefficient, or its value [unit of D^alpha y]; not negative times a factor that is negative.
     factor
-        Known factor, negative: friction takes energy.
+        Known factor, negative, because friction dissipates energy.
     name
         Name that the coefficient had before it got its value.
     more
-        What it has more near rest, if there is such a term: a body then breaks away where the force exceeds both.
+        Optional Stribeck term. The breakaway force is then the sum of both coefficients.
     """
 
     coefficient: str | float
     factor: float = -1.0
     name: str | None = None
-    # Absent where there is none, so that what is written of an equation without it is as it was.
+    # Omitted when unset, so that digests and files of older equations do not change.
     more: Stribeck | UnsetType = UNSET
 
     @property
     def stribeck(self) -> Stribeck | None:
-        """What it has more near rest; None without."""
+        """Stribeck term of the friction; None if there is none."""
         return self.more if isinstance(self.more, Stribeck) else None
 
     @property
     def strength(self) -> float | None:
-        """What friction takes at speed, and at rest holds at most by itself, [unit of D^alpha y], if it is known."""
+        """Coulomb friction force [unit of D^alpha y]; None if the coefficient is free."""
         return None if isinstance(self.coefficient, str) else -self.factor * self.coefficient
 
     @property
     def law(self) -> tuple[float, float, float]:
-        """Numbers fc, fs and vs of friction whose coefficients are known; without a Stribeck term fs is 0, vs 1."""
+        """Parameters (fc, fs, vs) of fixed friction; fs = 0 and vs = 1 without a Stribeck term."""
         more = self.stribeck
         near = (0.0, 1.0) if more is None else (more.strength or 0.0, float(more.speed))
         return (self.strength or 0.0, *near)
 
     @property
     def names(self) -> tuple[str, ...]:
-        """Free coefficients."""
+        """Names of the free coefficients."""
         numbers = [self.coefficient] + (
             [] if self.stribeck is None else [self.stribeck.coefficient, self.stribeck.speed]
         )
         return tuple(n for n in numbers if isinstance(n, str))
 
     @property
-    def found(self) -> dict[str, float]:
-        """Coefficients that have their values, by the names that they had."""
+    def identified_coefficients(self) -> dict[str, float]:
+        """Values of the fixed coefficients by their former names."""
         more = self.stribeck
         pairs = [(self.name, self.coefficient)]
         if more is not None:
@@ -158,7 +158,7 @@ class Friction:
         return {name: float(value) for name, value in pairs if name is not None}
 
     def with_coefficients(self, values: Mapping[str, float]) -> Friction:
-        """Return it with these free coefficients replaced by values; others stay free."""
+        """Return the friction with some free coefficients fixed; the others stay free."""
         out, more = self, self.stribeck
         if isinstance(self.coefficient, str) and self.coefficient in values:
             out = replace(
@@ -174,14 +174,14 @@ class Friction:
             more = replace(more, speed=real_number(name, values[name]), speed_name=name)
         return replace(out, more=more)
 
-    def written(self, output: str) -> str:
-        """Write the terms in words."""
-        near = "" if self.stribeck is None else f" {self.stribeck.written(output)}"
-        return f"- {_sized(self.coefficient, self.factor)} sign(D {output}){near}"
+    def as_text(self, output: str) -> str:
+        """Format the friction terms for an output."""
+        near = "" if self.stribeck is None else f" {self.stribeck.as_text(output)}"
+        return f"- {_format_coefficient(self.coefficient, self.factor)} sign(D {output}){near}"
 
 
-def _sized(coefficient: str | float, factor: float) -> str:
-    """A coefficient of friction with its factor, the sign left out."""
+def _format_coefficient(coefficient: str | float, factor: float) -> str:
+    """Format a friction coefficient with the magnitude of its factor."""
     if isinstance(coefficient, str):
         return coefficient if factor == -1 else f"{-factor!r} {coefficient}"
     return f"{-factor * coefficient!r}"
@@ -189,32 +189,32 @@ def _sized(coefficient: str | float, factor: float) -> str:
 
 @dataclass(frozen=True)
 class Equation:
-    """D^order output = sum of terms.
+    """Fractional-order equation ``D^order output = sum of terms``.
 
     Parameters
     ----------
     output
         Name of the output.
     order
-        Its highest order, alpha, in (0, 10].
+        Highest order alpha, in (0, 10].
     terms
-        Right-hand side. Orders of the output itself lie in [0, alpha), those of other signals in [-3, alpha + 1): the
-        link of an arm hangs on a hub that is differentiated more often than its own deflection. A command that holds
-        between samples stays at alpha or below, its jumps have no derivative.
+        Right-hand side. Orders of the output itself lie in [0, alpha), orders of other signals in [-3, alpha + 1).
+        Orders above alpha occur, for example, when the hub of an arm drives its link. Held commands need orders of at
+        most alpha, because their jumps have no derivative.
     coulomb
-        Friction of the output's own velocity, of Coulomb and near rest of Stribeck, if there is some; alpha then lies
-        in (1, 2], and every order below alpha.
+        Optional Coulomb and Stribeck friction of the output's velocity. Alpha then lies in (1, 2], and all orders are
+        below alpha.
 
     Raises
     ------
     ModelError
-        No term, a coefficient that stands twice, an order or a number out of its range.
+        No term, a repeated coefficient, or an order or number out of range.
     """
 
     output: str
     order: Order
     terms: tuple[Term, ...]
-    # Absent where there is none, so that what is written of an equation without it is as it was.
+    # Omitted when unset, so that digests and files of older equations do not change.
     coulomb: Friction | UnsetType = UNSET
 
     def __post_init__(self) -> None:
@@ -251,7 +251,7 @@ class Equation:
                 raise ModelError(f"own-output order {order:g} of {self.output} is outside [0, {alpha:g}); lower it")
             if not own and order < MIN_INPUT_ORDER:
                 raise ModelError(f"order {order:g} of {term.signal} is below {MIN_INPUT_ORDER:g}; raise it")
-            if not own and order >= alpha + MAX_EXCESS - 1e-9:
+            if not own and order >= alpha + MAX_IMPROPER_ORDER - 1e-9:
                 raise ModelError(
                     f"order {order:g} of {term.signal} is {order - alpha:g} above alpha = {alpha:g} of {self.output}; "
                     "an equation carries another signal less than one order above its own output: lower it"
@@ -261,7 +261,7 @@ class Equation:
             self._check_friction(self.friction)
 
     def _check_friction(self, friction: Friction) -> None:
-        """Refuse friction that drives, and orders beside which a velocity has no meaning."""
+        """Raise for friction that adds energy, or for an order alpha without a velocity."""
         words = f"friction in the equation of {self.output}"
         terms: list[Friction | Stribeck] = [friction] if friction.stribeck is None else [friction, friction.stribeck]
         for term in terms:
@@ -290,13 +290,13 @@ class Equation:
                 "another order"
             )
 
-    def check_drives(self, outputs: Sequence[str]) -> None:
-        """Refuse inputs that jump in the velocity of a body; outputs that are followed have inertia of their own.
+    def check_input_orders(self, outputs: Sequence[str]) -> None:
+        """Raise if an input makes the velocity of an equation with friction jump; simulated outputs are exempt.
 
         Raises
         ------
         ModelError
-            An input of alpha or above, as far as both are numbers.
+            A fixed input order that is not below a fixed alpha.
         """
         for item in self.terms:
             known = not (self.order.names or item.order.names or item.signal in outputs)
@@ -308,43 +308,43 @@ class Equation:
 
     @property
     def friction(self) -> Friction | None:
-        """Friction of the output's own velocity; None without."""
+        """Friction of the output; None if there is none."""
         return self.coulomb if isinstance(self.coulomb, Friction) else None
 
     @property
     def signals(self) -> tuple[str, ...]:
-        """Output first, then the other signals in order of appearance."""
+        """Signal names: the output, then the others in order of appearance."""
         return tuple(dict.fromkeys([self.output, *(t.signal for t in self.terms)]))
 
     @property
     def order_names(self) -> tuple[str, ...]:
-        """Free orders in order of appearance."""
+        """Names of the free orders, in order of appearance."""
         return tuple(dict.fromkeys(n for o in (self.order, *(t.order for t in self.terms)) for n in o.names))
 
     @property
     def coefficient_names(self) -> tuple[str, ...]:
-        """Free coefficients in order of appearance."""
+        """Names of the free coefficients, in order of appearance."""
         friction = () if self.friction is None else self.friction.names
         return (*(t.coefficient for t in self.terms if isinstance(t.coefficient, str)), *friction)
 
     def with_orders(self, values: Mapping[str, float]) -> Equation:
-        """Return the equation with these free orders replaced by values; others stay free.
+        """Return the equation with some free orders fixed; the others stay free.
 
         Raises
         ------
         ModelError
-            Orders out of range once they are numbers.
+            Orders that are out of range.
         """
-        terms = tuple(replace(t, order=t.order.partly(values)) for t in self.terms)
-        return Equation(self.output, self.order.partly(values), terms, self.coulomb)
+        terms = tuple(replace(t, order=t.order.substitute(values)) for t in self.terms)
+        return Equation(self.output, self.order.substitute(values), terms, self.coulomb)
 
     def with_coefficients(self, values: Mapping[str, float]) -> Equation:
-        """Return the equation with these free coefficients replaced by values; others stay free.
+        """Return the equation with some free coefficients fixed; the others stay free.
 
         Raises
         ------
         ModelError
-            A value that is no finite number.
+            A value that is not a finite number.
         """
         terms = tuple(
             replace(t, coefficient=real_number(t.coefficient, values[t.coefficient]), name=t.coefficient)
@@ -357,21 +357,21 @@ class Equation:
 
     @property
     def is_identified(self) -> bool:
-        """Whether every order and every coefficient is a number."""
+        """Whether all orders and coefficients are fixed."""
         return not self.order_names and not self.coefficient_names
 
-    def written(self, inputs: Mapping[str, str]) -> str:
-        """Write the equation, inputs as they act."""
-        right = " + ".join(t.written(inputs.get(t.signal, t.signal)) for t in self.terms).replace("+ -", "- ")
-        friction = "" if self.friction is None else f" {self.friction.written(self.output)}"
+    def as_text(self, inputs: Mapping[str, str]) -> str:
+        """Format the equation; ``inputs`` maps an input to its text after delay and nonlinearity."""
+        right = " + ".join(t.as_text(inputs.get(t.signal, t.signal)) for t in self.terms).replace("+ -", "- ")
+        friction = "" if self.friction is None else f" {self.friction.as_text(self.output)}"
         return f"{derivative(self.order, self.output)} = {right}{friction}"
 
     def __str__(self) -> str:
-        return self.written({})
+        return self.as_text({})
 
 
-def numeric(item: Equation, inputs: Mapping[str, str] | None = None) -> str:
-    """Write an identified equation with six significant digits, inputs as they act: ``u(t - 0.035 s)``."""
+def format_equation(item: Equation, inputs: Mapping[str, str] | None = None) -> str:
+    """Format an identified equation with six significant digits; ``inputs`` holds texts such as ``u(t - 0.035 s)``."""
     texts = inputs or {}
     parts = [f"{t.fixed or 0.0:+.6g} {derivative(t.order, texts.get(t.signal, t.signal))}" for t in item.terms]
     right = " ".join([parts[0].removeprefix("+"), *(f"{p[0]} {p[1:]}" for p in parts[1:])])

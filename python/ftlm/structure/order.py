@@ -1,4 +1,4 @@
-"""Orders: numbers, affine functions of free orders, and the values that a person gives one."""
+"""Orders of terms: numbers or affine functions of free orders, and the grid values of an order."""
 
 from __future__ import annotations
 
@@ -12,23 +12,23 @@ from typing import TypeAlias
 from ftlm.errors import ModelError
 from ftlm.utils.validation import real_number
 
-#: Highest order of an equation, and the lowest of an input: a threefold integration.
+#: Highest order of an equation, and lowest order of an input term (threefold integration).
 MAX_ORDER = 10.0
 MIN_INPUT_ORDER = -3.0
-#: A signal's order stays below its equation's highest order and this: beyond, a measured signal would be differentiated
-#: more often than its samples carry.
-MAX_EXCESS = 1.0
-#: Highest order that a search tries of itself, where the structure holds none above it.
-SEARCHED_ORDER = 3.0
-#: Orders are kept to this; what differs by less is one order.
-RESOLUTION = 1e-9
-#: What a person writes for the values of an order, see :func:`parse_values`.
+#: Upper bound on the order of an input term above its equation's highest order: at higher orders the measured signal
+#: would be differentiated too often for its sampling.
+MAX_IMPROPER_ORDER = 1.0
+#: Highest order in the default grid of a search, unless the structure contains a higher one.
+MAX_DEFAULT_SEARCH_ORDER = 3.0
+#: Orders are rounded to this resolution; smaller differences mean the same order.
+ORDER_RESOLUTION = 1e-9
+#: Accepted specifications of the values of an order, see :func:`parse_values`.
 Values: TypeAlias = float | str | Iterable[float]
 
 
 @dataclass(frozen=True)
 class Order:
-    """An order: a number, or an affine function of named free orders.
+    """Order of a term: a number, or an affine function of named free orders.
 
     Parameters
     ----------
@@ -41,19 +41,19 @@ class Order:
     constant: float = 0.0
     weights: tuple[tuple[str, float], ...] = ()
 
-    def partly(self, values: Mapping[str, float]) -> Order:
-        """Return the order with these free orders replaced by values; others stay free."""
+    def substitute(self, values: Mapping[str, float]) -> Order:
+        """Substitute values for some free orders; the others stay free."""
         constant = self.constant + sum(w * values[n] for n, w in self.weights if n in values)
         return Order(round(constant, 9) + 0.0, tuple((n, w) for n, w in self.weights if n not in values))
 
     @classmethod
     def parse(cls, text: str | float) -> Order:
-        """Read ``0.5``, ``"alpha"`` or an affine expression such as ``"alpha1 - alpha2 + 2*mu2"``.
+        """Parse ``0.5``, ``"alpha"`` or an affine expression such as ``"alpha1 - alpha2 + 2*mu2"``.
 
         Raises
         ------
         ModelError
-            Anything that is not affine in its names.
+            An expression that is not affine in its names.
         """
         if isinstance(text, (int, float)) and not isinstance(text, bool):
             return cls(float(text))
@@ -66,7 +66,7 @@ class Order:
             raise ModelError(
                 f"order {shown} is neither a number nor a sum of named orders; write 0.5, alpha or alpha1-mu2+0.1"
             ) from error
-        # A plain number is judged where its range is known.
+        # The range of a plain number is checked by the equation.
         if weights and not all(map(math.isfinite, (constant, *weights.values()))):
             raise ModelError(
                 f"order {text!r:.60} holds a number that is not finite; write 0.5, alpha or alpha1-mu2+0.1"
@@ -75,16 +75,16 @@ class Order:
 
     @property
     def names(self) -> tuple[str, ...]:
-        """Free orders that this one depends on."""
+        """Names of the free orders in this expression."""
         return tuple(name for name, _ in self.weights)
 
     @property
     def is_single(self) -> bool:
-        """Whether this is one free order and nothing else."""
+        """Whether the expression is a single free order."""
         return self.constant == 0 and len(self.weights) == 1 and self.weights[0][1] == 1
 
     def at(self, values: Mapping[str, float]) -> float:
-        """Value at given free orders, rounded to 1e-9.
+        """Evaluate the order at given free orders, rounded to 1e-9.
 
         Raises
         ------
@@ -97,20 +97,22 @@ class Order:
             raise ModelError(f"order {error.args[0]} has no value; give it in orders=") from None
 
     def __str__(self) -> str:
-        parts = [f"{'-' if w < 0 else '+'}{'' if abs(w) == 1 else f'{shortest(abs(w))}*'}{n}" for n, w in self.weights]
+        parts = [
+            f"{'-' if w < 0 else '+'}{'' if abs(w) == 1 else f'{format_shortest(abs(w))}*'}{n}" for n, w in self.weights
+        ]
         if self.constant or not parts:
-            parts.append(f"{'-' if self.constant < 0 else '+'}{shortest(abs(self.constant))}")
+            parts.append(f"{'-' if self.constant < 0 else '+'}{format_shortest(abs(self.constant))}")
         return "".join(parts).removeprefix("+")
 
 
-def shortest(value: float) -> str:
-    """Write a number in six digits if that is what it is, else in as many as give it back."""
+def format_shortest(value: float) -> str:
+    """Format a number with six significant digits if exact, else with its shortest exact representation."""
     short = f"{value:g}"
     return short if float(short) == value else repr(value)
 
 
 def _affine(node: ast.expr) -> tuple[float, dict[str, float]]:
-    """Constant and weights of an affine expression; ValueError for anything else."""
+    """Constant and weights of an affine expression; `ValueError` if it is not affine."""
     match node:
         case ast.Constant(value=int() | float() as value) if not isinstance(value, bool):
             return float(value), {}
@@ -138,7 +140,7 @@ def _affine(node: ast.expr) -> tuple[float, dict[str, float]]:
 
 
 def parse_values(name: str, spec: Values) -> float | tuple[float, ...]:
-    """Values of one order: a number, ``"low:high:step"``, a tuple (low, high, step) or a list of numbers.
+    """Parse the values of one order: a number, ``"low:high:step"``, a tuple (low, high, step) or a list of numbers.
 
     Returns a number if the order is fixed, else its values in ascending order.
     """
@@ -151,12 +153,12 @@ def parse_values(name: str, spec: Values) -> float | tuple[float, ...]:
                 f"order {name}: {spec!r} is no interval; write LOW:HIGH:STEP such as 0.5:1.5:0.05"
             ) from None
         if len(numbers) == 1:
-            return _checked(name, numbers[0])
+            return _check_range(name, numbers[0])
         if len(numbers) != 3:
             raise ModelError(f"order {name}: {spec!r} has {len(numbers)} parts; write LOW:HIGH:STEP")
-        return grid(name, *numbers)
+        return order_axis(name, *numbers)
     if isinstance(spec, (int, float)):
-        return _checked(name, real_number(f"order {name}", spec))
+        return _check_range(name, real_number(f"order {name}", spec))
     if isinstance(spec, tuple) and len(spec) == 2:
         raise ModelError(f"order {name}: {spec!r} has no step; write (low, high, step), or a list for two values")
     try:
@@ -164,46 +166,48 @@ def parse_values(name: str, spec: Values) -> float | tuple[float, ...]:
     except TypeError:
         raise ModelError(f"order {name}: {spec!r} is no list of numbers; write LOW:HIGH:STEP or numbers") from None
     if isinstance(spec, tuple) and len(spec) == 3:
-        return grid(name, *numbers)
-    values = [_checked(name, v) for v in numbers]
+        return order_axis(name, *numbers)
+    values = [_check_range(name, v) for v in numbers]
     if not values:
         raise ModelError(f"order {name} has no value; give at least one")
     values = sorted(set(values))
     for low, high in pairwise(values):
         if round(low, 9) == round(high, 9):
             raise ModelError(
-                f"order {name}: values {shortest(low)} and {shortest(high)} are one order: orders are kept to "
-                f"{RESOLUTION:g}; leave one out"
+                f"order {name}: values {format_shortest(low)} and {format_shortest(high)} are one order: orders are "
+                "kept to "
+                f"{ORDER_RESOLUTION:g}; leave one out"
             )
     return tuple(values)
 
 
-def _checked(name: str, value: float) -> float:
+def _check_range(name: str, value: float) -> float:
     if not MIN_INPUT_ORDER <= value <= MAX_ORDER:
         raise ModelError(f"order {name} = {value:g} is outside [-3, 10]; choose another value")
     return value
 
 
-#: Most values on one axis of a lattice: a step of 1e-6 over the widest interval is a slip of the hand.
-MAX_AXIS = 1_000_000
+#: Bound on the values of one axis of an order grid; more of them are taken for a typing error.
+MAX_AXIS_VALUES = 1_000_000
 
 
-def grid(name: str, low: float, high: float, step: float) -> tuple[float, ...]:
-    """Multiples of ``step`` from ``low`` to ``high``, both included, counted from ``low``."""
+def order_axis(name: str, low: float, high: float, step: float) -> tuple[float, ...]:
+    """Values of one order from ``low`` to ``high`` in increments of ``step``, both ends included."""
     low, high, step = (real_number(f"order {name}", v) for v in (low, high, step))
     if not (math.isfinite(step) and step > 0):
         raise ModelError(f"order {name}: step {step:g} is not positive; the paper's is 0.05")
-    if step < RESOLUTION:
+    if step < ORDER_RESOLUTION:
         raise ModelError(
-            f"order {name}: step {step:g} is below {RESOLUTION:g}, to which orders are kept; raise the step"
+            f"order {name}: step {step:g} is below {ORDER_RESOLUTION:g}, to which orders are kept; raise the step"
         )
-    _checked(name, low)
-    _checked(name, high)
+    _check_range(name, low)
+    _check_range(name, high)
     if high < low:
         raise ModelError(f"order {name}: interval {low:g}:{high:g} is empty; put the lower end first")
     steps = (high - low) / step
-    if steps > MAX_AXIS:
+    if steps > MAX_AXIS_VALUES:
         raise ModelError(
-            f"order {name}: {low:g}:{high:g}:{step:g} has {steps:.3g} values, more than {MAX_AXIS}; raise the step"
+            f"order {name}: {low:g}:{high:g}:{step:g} has {steps:.3g} values, more than {MAX_AXIS_VALUES}; raise "
+            "the step"
         )
     return tuple(round(low + i * step, 9) + 0.0 for i in range(int(steps + 1e-6) + 1))

@@ -1,4 +1,4 @@
-"""Intervals and step of an order search."""
+"""Order grid of a search: interval and increment of every free order."""
 
 from __future__ import annotations
 
@@ -6,48 +6,48 @@ from collections.abc import Mapping
 from dataclasses import dataclass, field, replace
 
 from ftlm.errors import ModelError
-from ftlm.structure.order import MAX_ORDER, Order, Values, grid, parse_values
+from ftlm.structure.order import MAX_ORDER, Order, Values, order_axis, parse_values
 from ftlm.structure.structure import Structure
 from ftlm.utils.validation import real_number
 
-#: The paper's step.
-STEP = 0.05
-#: The interval of alpha: a flexible link is second order or a little less.
-ALPHA = (1.05, 2.0)
+#: Increment of the order grid in the paper.
+DEFAULT_INCREMENT = 0.05
+#: Default interval of the highest order: a flexible link has an order of 2 or slightly less.
+DEFAULT_ALPHA_RANGE = (1.05, 2.0)
 
 
 @dataclass(frozen=True)
-class Lattice:
+class OrderGrid:
     """Intervals and step of an order search.
 
     Parameters
     ----------
-    step
-        Step of every order that has no step of its own.
+    increment
+        Increment of every order that has none of its own.
     alpha
         (low, high) of every highest order.
     orders
         Other orders by name: a number, a tuple (low, high) or (low, high, step), ``"low:high:step"`` or a list of
-        values; ``alpha`` stands for every highest order and takes the place of the interval above.
+        values. The name ``alpha`` means every highest order and replaces the interval above.
     """
 
-    step: float = STEP
-    alpha: tuple[float, float] = ALPHA
+    increment: float = DEFAULT_INCREMENT
+    alpha: tuple[float, float] = DEFAULT_ALPHA_RANGE
     orders: Mapping[str, Values] = field(default_factory=dict)
 
     def values(self, structure: Structure) -> dict[str, tuple[float, ...]]:
-        """Values of each free order of a structure.
+        """Return the grid values of each free order of a structure.
 
-        What the structure or this lattice does not name runs over all multiples of the step from 0 to the largest
-        alpha; the search itself keeps an own-output order below alpha and any other at most alpha.
+        An order that neither the structure nor this grid names takes all multiples of the increment from 0 to the
+        largest alpha. The search restricts own-output orders to values below alpha and input orders to at most alpha.
 
         Raises
         ------
         ModelError
-            A name that is no free order, an interval out of range.
+            A name that is not a free order, or an interval out of range.
         """
         free = structure.order_names
-        check_lattice_names(self, structure)
+        check_order_grid_names(self, structure)
         highest = [n for e in structure.equations for n in e.order.names if e.order.is_single]
         values: dict[str, tuple[float, ...]] = {}
         for name in free:
@@ -61,17 +61,19 @@ class Lattice:
         top = max([max(values[n]) for n in highest if n in values] + fixed, default=2.0)
         for name in free:
             if name not in values:
-                values[name] = grid(name, 0.0, min(top, MAX_ORDER), self.step)
+                values[name] = order_axis(name, 0.0, min(top, MAX_ORDER), self.increment)
         return {name: values[name] for name in free}
 
     def _axis(self, name: str, spec: Values) -> tuple[float, ...]:
         if isinstance(spec, tuple) and len(spec) == 2:
-            spec = (*spec, self.step)
+            spec = (*spec, self.increment)
         values = parse_values(name, spec)
         return (values,) if isinstance(values, float) else values
 
 
-def lattice(step: float = STEP, alpha: tuple[float, float] = ALPHA, **orders: Values) -> Lattice:
+def order_grid(
+    step: float = DEFAULT_INCREMENT, alpha: tuple[float, float] = DEFAULT_ALPHA_RANGE, **orders: Values
+) -> OrderGrid:
     """Intervals and step of an order search.
 
     Every own-output order takes all values 0 <= nu < alpha on the step (distinct, unordered within a signal), every
@@ -79,53 +81,53 @@ def lattice(step: float = STEP, alpha: tuple[float, float] = ALPHA, **orders: Va
 
     Parameters
     ----------
-    step
-        Step, positive; the paper's is 0.05.
+    increment
+        Grid increment, positive; the paper uses 0.05.
     alpha
         (low, high) of the highest order, in (0, 10].
     **orders
-        Other orders by name, see :class:`Lattice`.
+        Other orders by name, see :class:`OrderGrid`.
 
     Returns
     -------
-    Lattice
-        Its values follow once it meets a structure.
+    OrderGrid
+        Grid whose values depend on the structure it is applied to.
 
     Raises
     ------
     ModelError
-        A step that is not positive, an interval that is empty or out of range.
+        An increment that is not positive, or an interval that is empty or out of range.
     """
     if not (isinstance(alpha, (tuple, list)) and len(alpha) == 2):
-        raise ModelError(f"alpha = {alpha!r} is no interval; write (low, high), such as {ALPHA}")
+        raise ModelError(f"alpha = {alpha!r} is no interval; write (low, high), such as {DEFAULT_ALPHA_RANGE}")
     low, high = (real_number("alpha", a) for a in alpha)
     if not 0 < low <= MAX_ORDER:
         raise ModelError(f"alpha interval {low:g}:{high:g} starts outside (0, 10]; choose a positive order")
-    grid("alpha", low, high, step)
-    return Lattice(step, (float(low), float(high)), dict(orders))
+    order_axis("alpha", low, high, step)
+    return OrderGrid(step, (float(low), float(high)), dict(orders))
 
 
-def check_lattice(lattice: Lattice | None) -> None:
-    """Refuse a lattice that is none."""
-    if not (lattice is None or isinstance(lattice, Lattice)):
+def check_order_grid(lattice: OrderGrid | None) -> None:
+    """Raise if an argument is not an order grid."""
+    if not (lattice is None or isinstance(lattice, OrderGrid)):
         raise ModelError(f"lattice is {type(lattice).__name__}, not a Lattice; use ftlm.lattice(…)")
 
 
 def axis_of(order: Order, values: Mapping[str, tuple[float, ...]]) -> list[float]:
-    """Values of an order that is a number or one free order."""
+    """Return the grid values of an order that is a number or a single free order."""
     return list(values[order.names[0]]) if order.names else [order.constant]
 
 
-def check_lattice_names(given: Lattice | None, structure: Structure) -> None:
-    """Refuse a lattice that names an order which is not free."""
+def check_order_grid_names(given: OrderGrid | None, structure: Structure) -> None:
+    """Raise if an order grid names an order that is not free."""
     for name in given.orders if given is not None else ():
         if name not in structure.order_names and name != "alpha":
             free = ", ".join(structure.order_names) or "none"
             raise ModelError(f"lattice order {name!r} is no free order; free are {free}")
 
 
-def lattice_of(given: Lattice | None, part: Structure) -> Lattice | None:
-    """Return what a lattice says of a part of its structure."""
+def restrict_order_grid(given: OrderGrid | None, part: Structure) -> OrderGrid | None:
+    """Restrict an order grid to the free orders of a substructure."""
     if given is None:
         return None
     names = (*part.order_names, "alpha")

@@ -1,4 +1,4 @@
-"""Equations in words: the parser, and the structure that a text makes."""
+"""Parser of equation texts: text to `Structure`."""
 
 from __future__ import annotations
 
@@ -12,17 +12,23 @@ from msgspec import UNSET
 
 from ftlm.errors import ModelError
 from ftlm.structure.equation import Equation, Friction, Stribeck, Term
-from ftlm.structure.input_nonlinearity import SHORT, Limit, LimitLaw, Value, in_order
+from ftlm.structure.input_nonlinearity import (
+    INPUT_EFFECT_ABBREVIATIONS,
+    InputNonlinearity,
+    NonlinearityKind,
+    Value,
+    sort_nonlinearities,
+)
 from ftlm.structure.order import Order, Values
 from ftlm.structure.sensor_filter import SensorFilter
 from ftlm.structure.structure import Offset, Structure, check_initial, check_offset
 from ftlm.utils.validation import check_known, real_number
 
-NAME = r"[^\W\d]\w*"
-#: What words may say of an input.
-LIMITS: tuple[LimitLaw, ...] = ("saturation", "dead_zone")
-#: A term that is such a name alone is an offset.
-_OFFSET = re.compile(r"c\d*")
+IDENTIFIER_PATTERN = r"[^\W\d]\w*"
+#: Input nonlinearities with a syntax in equation texts.
+NONLINEARITY_KINDS: tuple[NonlinearityKind, ...] = ("saturation", "dead_zone")
+#: A term that consists of such a name alone is an offset.
+_OFFSET_PATTERN = re.compile(r"c\d*")
 
 
 def equation(
@@ -38,53 +44,50 @@ def equation(
     offset: str | None = None,
     coupling: Literal["measured", "simulated"] | None = None,
 ) -> Structure:
-    """Any linear fractional equation, in words.
+    """Parse the text of one or several fractional-order equations into a structure.
 
     Parameters
     ----------
     text
-        Such as ``"D^2.2 y = a1 D^0.9 y + a0 y + b0 u"``. ``D^alpha`` names a free order, ``D^(alpha-mu)`` an order
-        law, ``D`` and ``D y`` the first derivative; a coefficient is a name, a number (fixed) or a number times a
-        name. Several equations are separated by ``;`` or by lines. A term that is ``c`` alone (or ``c0``, ``c1``, …)
-        is an offset, an unknown constant; a signal of that name is ``1 c``. ``- fc*sign(D y)`` in the equation of y is
-        Coulomb friction: the sign of the velocity that the equation itself gives, and at rest whatever within
-        [-1, 1] keeps it there. ``- fs*exp(-(D y/vs)^2)*sign(D y)`` beside it is what friction has more near rest
-        (Stribeck), fs and the speed vs > 0 each a name or a number; y then breaks away where the force exceeds fc + fs.
+        Such as ``"D^2.2 y = a1 D^0.9 y + a0 y + b0 u"``. ``D^alpha`` is a free order, ``D^(alpha-mu)`` an order law,
+        ``D y`` the first derivative. A coefficient is a name, a number (fixed) or a number times a name. Separate
+        equations by ``;`` or line breaks. A term ``c`` alone (or ``c0``, ``c1``, …) is an offset, an unknown constant;
+        write ``1 c`` for a signal of that name. ``- fc*sign(D y)`` in the equation of y is Coulomb friction of the
+        simulated velocity, set-valued at rest. ``- fs*exp(-(D y/vs)^2)*sign(D y)`` adds Stribeck friction, with fs and
+        vs > 0 each a name or a number; the breakaway force is then fc + fs.
     orders
-        Values of the free orders: a number fixes one, ``"0.5:1.5:0.05"`` or (low, high, step) gives its lattice.
+        Values of the free orders: a number fixes one, ``"0.5:1.5:0.05"`` or (low, high, step) gives its grid.
     fixed
         Known coefficients, by name.
     delay
-        Delay of inputs [s], by name, not negative: a number is known, (least, largest) is estimated by output error.
+        Delay of inputs [s], by name, not negative: a number fixes one, (lower, upper) is estimated by output error.
     saturation, dead_zone
-        How far inputs act at most, and what they must exceed before they act, on either side of 0 and in their units:
-        a number is known, (least, largest) is estimated by output error. In words ``sat(u, 0.94)``,
-        ``dead(u, 0.05)``, ``sat(u, 0.5:1.5)``.
+        Symmetric saturation level and half-width of the dead zone of inputs, in their units: a number fixes one,
+        (lower, upper) is estimated by output error. As text: ``sat(u, 0.94)``, ``dead(u, 0.05)``, ``sat(u, 0.5:1.5)``.
     initial
-        What the run did before its start, as powers of t: ``"rest"`` (nothing), ``"caputo"`` (held still, at any
-        level), ``"history"`` (anything: powers in quarters, as many as stand out of the noise), or the exponents to
-        use. ``"auto"``: rest where the outputs start at zero, else Caputo's where orders are whole or where the run
-        asks for no more, else a history.
+        Initial conditions as powers of t: ``"rest"`` (zero), ``"caputo"`` (constant before the start), ``"history"``
+        (unknown past: exponents in quarters, as many as are significant), or given exponents. ``"auto"``: rest if the
+        outputs start at zero, else Caputo for integer orders or if the data need no more, else history.
     sensor_filter
-        Known filter that some signals were measured through, inputs or outputs; see :class:`ftlm.SensorFilter`.
+        Known filter of some measured signals, inputs or outputs; see :class:`ftlm.SensorFilter`.
     offset
-        ``"constant"``: an unknown constant on the right-hand side of each equation, as ``+ c`` says in words;
-        ``"ramp"``: a constant and a constant times t; ``"none"``. One each run, estimated with the coefficients and
-        never carried to another run. Default what the text says.
+        ``"constant"``: an unknown constant on the right-hand side of each equation, the same as ``+ c`` in the text;
+        ``"ramp"``: a constant and a constant times t; ``"none"``. Offsets are estimated per run with the coefficients
+        and never transferred to another run. Default: as in the text.
     coupling
-        Of several equations: ``"measured"``, each is driven by the other outputs as they were measured, the default;
-        ``"simulated"``, all follow from the other signals alone, as they do by default where any of them has friction.
+        Coupling of several equations. ``"measured"``: the measured other outputs are inputs (default).
+        ``"simulated"``: all outputs are simulated together (default if an equation has friction).
 
     Returns
     -------
     Structure
-        To be identified, or a model's structure if nothing is free.
+        Structure to identify, or the structure of a model if all parameters are fixed.
 
     Raises
     ------
     ModelError
-        Text that is no such equation (with the place), a name that does not occur, orders out of range, an offset in
-        some of several equations only.
+        A syntax error (with its position), an unknown name, an order out of range, or an offset in only some of several
+        equations.
     """
     if not isinstance(text, str):
         raise ModelError(f"the equation is {type(text).__name__}, not text; write it as in 'D^1.5 y = a0 y + b0 u'")
@@ -109,7 +112,7 @@ def equation(
             initial=check_initial(initial),
             sensor_filter=sensor_filter,
             offset=_offset_of([(item, found) for item, found, _ in parsed], offset),
-            limited=_limits_of([words for _, _, words in parsed]) or UNSET,
+            input_nonlinearities=_merge_nonlinearities([words for _, _, words in parsed]) or UNSET,
         )
         .with_delays(delay or {})
         .with_orders(orders or {})
@@ -118,7 +121,7 @@ def equation(
 
 
 def _offset_of(parsed: Sequence[tuple[Equation, bool]], offset: str | None) -> Offset:
-    """Offset of equations in words: what the argument says, or all of the equations."""
+    """Return the offset: the argument if given, else the one that all equation texts share."""
     said = [item.output for item, found in parsed if found]
     if offset is not None:
         if said and check_offset(offset) == "none":
@@ -133,20 +136,20 @@ def _offset_of(parsed: Sequence[tuple[Equation, bool]], offset: str | None) -> O
     return "constant" if said else "none"
 
 
-_TOKEN = re.compile(
-    rf"\s*(?:(?P<number>(?:\d+\.?\d*|\.\d+)(?:[eE][+-]?\d+)?)|(?P<name>{NAME})|(?P<symbol>[-+*/^(){{}}=,:]))"
+_TOKEN_PATTERN = re.compile(
+    rf"\s*(?:(?P<number>(?:\d+\.?\d*|\.\d+)(?:[eE][+-]?\d+)?)|(?P<name>{IDENTIFIER_PATTERN})|(?P<symbol>[-+*/^(){{}}=,:]))"
 )
 
 
-class _Words:
-    """Tokens of one equation, with the place of each for messages."""
+class _TokenStream:
+    """Token stream of one equation, with positions for error messages."""
 
     def __init__(self, text: str) -> None:
         self.text = text
         self.tokens: list[tuple[str, str, int]] = []
         at = 0
         while text[at:].strip():
-            token = _TOKEN.match(text, at)
+            token = _TOKEN_PATTERN.match(text, at)
             if token is None:
                 start = at + len(text[at:]) - len(text[at:].lstrip())
                 raise ModelError(f"equation {text!r}: {text[start]!r} at character {start + 1} has no meaning there")
@@ -154,7 +157,7 @@ class _Words:
             self.tokens.append((kind, token[kind], token.start(kind)))
             at = token.end()
         self.position = 0
-        #: Limits of inputs by signal and law, and signals that stand there as they are.
+        #: Nonlinearities by (signal, kind), and signals that occur without one.
         self.limits: dict[tuple[str, str], Value] = {}
         self.plain: set[str] = set()
 
@@ -184,7 +187,7 @@ class _Words:
 
 
 def parse_equation(text: str) -> Equation:
-    """Read one equation without an offset; see :func:`equation`."""
+    """Parse one equation without offset and input nonlinearities; see :func:`equation`."""
     item, offset, words = _parse(text)
     if offset or words.limits:
         what = "an offset" if offset else "a limit of an input"
@@ -192,8 +195,8 @@ def parse_equation(text: str) -> Equation:
     return item
 
 
-def _limits_of(parsed: Sequence[_Words]) -> tuple[Limit, ...]:
-    """Limits of inputs in equations in words; an actuator limits all that it drives."""
+def _merge_nonlinearities(parsed: Sequence[_TokenStream]) -> tuple[InputNonlinearity, ...]:
+    """Merge the input nonlinearities of all equations; each input must have the same one in every term."""
     found: dict[tuple[str, str], Value] = {}
     for words in parsed:
         for key, limit in words.limits.items():
@@ -206,12 +209,16 @@ def _limits_of(parsed: Sequence[_Words]) -> tuple[Limit, ...]:
             f"{both} stands there limited and as it is, but an actuator limits all that it drives; limit it in each "
             "term, or give the run the limited input as a signal of its own"
         )
-    return tuple(in_order([Limit(s, law, v) for law in LIMITS for (s, own), v in found.items() if own == law]))
+    return tuple(
+        sort_nonlinearities(
+            [InputNonlinearity(s, law, v) for law in NONLINEARITY_KINDS for (s, own), v in found.items() if own == law]
+        )
+    )
 
 
-def _parse(text: str) -> tuple[Equation, bool, _Words]:
-    """Read one equation, whether it has an offset, and what it says of its inputs."""
-    words = _Words(text)
+def _parse(text: str) -> tuple[Equation, bool, _TokenStream]:
+    """Parse one equation: the equation, whether it has an offset, and its token stream with nonlinearities."""
+    words = _TokenStream(text)
     order, output = _parse_derivative(words)
     if words.take()[1] != "=":
         words.position -= 1
@@ -267,8 +274,8 @@ def _parse(text: str) -> tuple[Equation, bool, _Words]:
     return Equation(output, order, tuple(terms), friction or UNSET), offset, words
 
 
-def _parse_friction(words: _Words, sign: float) -> tuple[Friction | Stribeck, str] | None:
-    """``fc*sign(D y)`` or ``fs*exp(-(D y/vs)^2)*sign(D y)`` with its signal; None where the term is another one."""
+def _parse_friction(words: _TokenStream, sign: float) -> tuple[Friction | Stribeck, str] | None:
+    """Parse ``fc*sign(D y)`` or ``fs*exp(-(D y/vs)^2)*sign(D y)`` with its signal; None for any other term."""
     ahead = 0
     factor, coefficient = sign, 1.0
     named: str | None = None
@@ -283,7 +290,7 @@ def _parse_friction(words: _Words, sign: float) -> tuple[Friction | Stribeck, st
     words.position += ahead
     near: tuple[str, str | float] | None = None
     if words.peek()[1] == "exp":
-        near = _parse_fall(words)
+        near = _parse_stribeck_factor(words)
         if words.peek()[1] == "*":
             words.take()
         if words.peek()[1] != "sign":
@@ -309,8 +316,8 @@ def _parse_friction(words: _Words, sign: float) -> tuple[Friction | Stribeck, st
     return (Friction(*strength) if near is None else Stribeck(strength[0], near[1], strength[1])), signal
 
 
-def _parse_fall(words: _Words) -> tuple[str, str | float]:
-    """``exp(-(D y/vs)^2)``: the signal, and the speed's name or value."""
+def _parse_stribeck_factor(words: _TokenStream) -> tuple[str, str | float]:
+    """Parse ``exp(-(D y/vs)^2)``: the signal, and name or value of the Stribeck speed."""
     words.take()
     for symbol in "(-(":
         _expect(words, symbol, "-(D y/vs)^2, as in exp(-(D y/vs)^2)")
@@ -328,15 +335,15 @@ def _parse_fall(words: _Words) -> tuple[str, str | float]:
     return signal, float(value) if kind == "number" else value
 
 
-def _expect(words: _Words, symbol: str, wanted: str | None = None) -> None:
-    """Take what stands next, which is this."""
+def _expect(words: _TokenStream, symbol: str, wanted: str | None = None) -> None:
+    """Consume an expected symbol; raise if the next token is another one."""
     if words.peek()[1] != symbol:
         raise words.fail(wanted or f"'{symbol}'")
     words.take()
 
 
-def _is_offset(words: _Words) -> bool:
-    """Whether the term that follows is an unknown constant alone; a known one is refused."""
+def _is_offset(words: _TokenStream) -> bool:
+    """Whether the next term is an unknown constant (offset); raise for a numeric constant."""
     (kind, value, at), (after, symbol, _) = words.peek(), words.peek(1)
     if not (after == "end" or (after == "symbol" and symbol in "+-")):
         return False
@@ -345,11 +352,11 @@ def _is_offset(words: _Words) -> bool:
             f"equation {words.text!r}: {value} at character {at + 1} is a constant without a signal; an offset is "
             f"unknown: write '+ c' and it is estimated, or subtract a known one from the run"
         )
-    return kind == "name" and _OFFSET.fullmatch(value) is not None
+    return kind == "name" and _OFFSET_PATTERN.fullmatch(value) is not None
 
 
-def _parse_derivative(words: _Words) -> tuple[Order | None, str]:
-    """``D^order signal`` or ``signal``."""
+def _parse_derivative(words: _TokenStream) -> tuple[Order | None, str]:
+    """Parse ``D^order signal`` or ``signal``."""
     kind, value, _ = words.peek()
     order: Order | None = None
     if kind == "name" and value == "D":
@@ -361,12 +368,15 @@ def _parse_derivative(words: _Words) -> tuple[Order | None, str]:
     return order, _parse_signal(words)
 
 
-def _parse_signal(words: _Words) -> str:
-    """A signal, or what of an input acts: ``sat(u, 0.94)``, ``dead(u, 0.05)``, ``sat(dead(u, 0.05), 0.5:1.2)``."""
+def _parse_signal(words: _TokenStream) -> str:
+    """Parse a signal, or an input with nonlinearity such as ``sat(dead(u, 0.05), 0.5:1.2)``."""
     kind, value, _ = words.peek()
     if kind != "name" or value == "D":
         raise words.fail("the name of a signal")
-    law = next((law for law in LIMITS if SHORT[law] == value and words.peek(1)[1] == "("), None)
+    law = next(
+        (law for law in NONLINEARITY_KINDS if INPUT_EFFECT_ABBREVIATIONS[law] == value and words.peek(1)[1] == "("),
+        None,
+    )
     words.take()
     if law is None:
         words.plain.add(value)
@@ -395,7 +405,7 @@ def _parse_signal(words: _Words) -> str:
     return signal
 
 
-def _parse_number(words: _Words) -> float:
+def _parse_number(words: _TokenStream) -> float:
     kind, value, _ = words.peek()
     if kind != "number":
         raise words.fail("a limit, or LEAST:LARGEST where it is estimated")
@@ -403,7 +413,7 @@ def _parse_number(words: _Words) -> float:
     return float(value)
 
 
-def _parse_order(words: _Words) -> Order:
+def _parse_order(words: _TokenStream) -> Order:
     kind, value, start = words.peek()
     if value in "({" and kind == "symbol":
         close = ")" if value == "(" else "}"
@@ -427,7 +437,7 @@ def _parse_order(words: _Words) -> Order:
     return words.order(sign + value, start)
 
 
-def _parse_term(words: _Words, sign: float) -> Term:
+def _parse_term(words: _TokenStream, sign: float) -> Term:
     factor = sign
     if words.peek()[0] == "number":
         factor *= float(words.take()[1])
@@ -436,7 +446,7 @@ def _parse_term(words: _Words, sign: float) -> Term:
     coefficient: str | float = 1.0
     kind, value, _ = words.peek()
     following = words.peek(1)
-    # A name is a coefficient if a signal or a derivative follows it.
+    # A name followed by a signal or a derivative is a coefficient.
     if kind == "name" and value != "D" and (following[0] == "name" or following[1] == "*"):
         coefficient = value
         words.take()

@@ -1,4 +1,4 @@
-"""The sensor filter: a known rational filter that signals were measured through."""
+"""Sensor filter: known rational transfer function of measured signals."""
 
 from __future__ import annotations
 
@@ -13,25 +13,25 @@ from ftlm.utils.validation import real_number
 
 
 class SensorFilter(msgspec.Struct, frozen=True, forbid_unknown_fields=True):
-    """A known rational filter that some signals were measured through.
+    """Sensor filter: known rational transfer function that some signals have passed.
 
-    It belongs to signals, inputs and outputs alike, for it commutes with every linear equation. Where an equation is
-    driven by a filtered signal, all of its signals are taken behind the filter: a filtered one as it was measured, any
-    other one put through it, the output that the equation is compared with included. A free run in which all outputs
-    follow from unfiltered signals is the machine's own motion, and only its filtered outputs pass the filter before
-    they are compared; so it always is where a body has friction. See :attr:`Structure.behind_filter`.
+    The filter may apply to inputs and outputs, because it commutes with every linear equation. If a filtered signal is
+    an input of an equation, the equation is used for filtered signals only: signals without the filter, including the
+    output that is compared, are filtered by software. If all inputs are unfiltered, or an equation has friction, the
+    unfiltered motion is simulated and only the filtered outputs are filtered before the comparison. See
+    :attr:`Structure.all_filtered`.
 
     Parameters
     ----------
     signals
-        Names of the signals that were measured through it, at least one.
+        Names of the filtered signals, at least one.
     numerator, denominator
         (coefficient, order) pairs of sums of coefficient * D^order.
 
     Raises
     ------
     ModelError
-        No signal, one named twice, a term that is none, or a numerator of higher order than the denominator.
+        No signal, a repeated signal, an invalid term, or a numerator of higher order than the denominator.
     """
 
     signals: tuple[str, ...]
@@ -39,7 +39,7 @@ class SensorFilter(msgspec.Struct, frozen=True, forbid_unknown_fields=True):
     denominator: tuple[tuple[float, float], ...]
 
     def __post_init__(self) -> None:
-        """Refuse a filter that is none."""
+        """Validate the signals and the transfer function."""
         if not self.signals:
             raise ModelError("sensor filter: it names no signal; name those that were measured through it")
         twice = next((s for i, s in enumerate(self.signals) if s in self.signals[:i]), None)
@@ -64,7 +64,7 @@ class SensorFilter(msgspec.Struct, frozen=True, forbid_unknown_fields=True):
 
     @property
     def relative_degree(self) -> int:
-        """By how many whole orders the denominator exceeds the numerator: derivatives of an impulse that it answers."""
+        """Relative degree: integer part of the order of the denominator minus that of the numerator."""
         bottom, top = (
             max((order for coefficient, order in part if coefficient), default=0.0)
             for part in (self.denominator, self.numerator)
@@ -73,22 +73,22 @@ class SensorFilter(msgspec.Struct, frozen=True, forbid_unknown_fields=True):
 
     @property
     def holds_answers(self) -> bool:
-        """Whether all that it can hold are such answers: it has no zero and no fractional order."""
+        """Whether impulse responses span the filter's transient: no zeros and integer orders only."""
         whole = all(order == round(order) for coefficient, order in self.denominator if coefficient)
         return whole and not any(order for coefficient, order in self.numerator if coefficient)
 
     @classmethod
     def low_pass(cls, signals: Sequence[str], frequency: float = 2.0, damping: float = 0.9) -> SensorFilter:
-        """Second-order low-pass of ``frequency`` [Hz]; the default is that of the arm's stock real-time model.
+        """Second-order low-pass filter; the default is that of the arm's stock real-time model.
 
         Parameters
         ----------
         signals
-            Names of the signals that were measured through it.
+            Names of the filtered signals.
         frequency
-            Its own [Hz].
+            Natural frequency [Hz].
         damping
-            Ratio.
+            Damping ratio.
 
         Raises
         ------

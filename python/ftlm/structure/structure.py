@@ -1,4 +1,4 @@
-"""Structures: equations over shared signals, with what is known about them."""
+"""Model structures: coupled equations with order law, coefficient law, delays, offsets and initial terms."""
 
 from __future__ import annotations
 
@@ -11,35 +11,42 @@ from typing import Literal, TypeAlias
 from msgspec import UNSET, UnsetType
 
 from ftlm.errors import ModelError
-from ftlm.structure.equation import Equation, Term, numeric
-from ftlm.structure.input_nonlinearity import FreeInput, Limit, Value, check_limits, input_name, with_values
+from ftlm.structure.equation import Equation, Term, format_equation
+from ftlm.structure.input_nonlinearity import (
+    FreeInputParameter,
+    InputNonlinearity,
+    Value,
+    check_nonlinearities,
+    input_name,
+    replace_nonlinearities,
+)
 from ftlm.structure.order import Order, Values, parse_values
 from ftlm.structure.sensor_filter import SensorFilter
 from ftlm.utils.validation import check_known, real_number
 
 
 class History(tuple[float, ...]):
-    """Powers of time that stand for what a run did before its start, decided from the run."""
+    """Exponents of t of the initial terms, selected from the data for unknown initial conditions."""
 
     __slots__ = ()
 
 
 Initial: TypeAlias = Literal["auto", "rest", "caputo", "history"] | tuple[float, ...]
 Offset: TypeAlias = Literal["none", "constant", "ramp", "auto"]
-#: What initial terms are called.
-START_WORDS = ("auto", "rest", "caputo", "history")
+#: Accepted words for the initial terms.
+INITIAL_CHOICES = ("auto", "rest", "caputo", "history")
 
 
 def check_initial(initial: str | Iterable[float]) -> Initial:
-    """Refuse initial terms that are neither a known word nor exponents above -1."""
-    if isinstance(initial, str) and initial in START_WORDS:
+    """Validate initial terms: a known word, or exponents in (-1, 10]."""
+    if isinstance(initial, str) and initial in INITIAL_CHOICES:
         return initial  # type: ignore[return-value]
     try:
         if isinstance(initial, str):
             raise TypeError
         exponents = tuple(real_number("exponent of an initial term", e) for e in initial)
     except TypeError:
-        words = f"{', '.join(map(repr, START_WORDS))} or exponents of t"
+        words = f"{', '.join(map(repr, INITIAL_CHOICES))} or exponents of t"
         raise ModelError(f"initial = {initial!r} is not known; use {words}") from None
     bad = next((e for e in exponents if not (math.isfinite(e) and -1 < e <= 10)), None)
     if bad is not None:
@@ -48,14 +55,14 @@ def check_initial(initial: str | Iterable[float]) -> Initial:
 
 
 def check_offset(offset: str) -> Offset:
-    """Refuse an offset that is no known word."""
+    """Validate an offset: ``"none"``, ``"constant"``, ``"ramp"`` or ``"auto"``."""
     if offset in ("none", "constant", "ramp", "auto"):
         return offset  # type: ignore[return-value]
     raise ModelError(f"offset = {offset!r} is not known; use 'none', 'constant', 'ramp' or 'auto'")
 
 
-def check_decided(offset: str) -> None:
-    """Refuse an offset that nothing has decided yet."""
+def check_offset_resolved(offset: str) -> None:
+    """Raise if the offset is still ``"auto"``."""
     if offset == "auto":
         raise ModelError(
             "offset='auto' lets ftlm.identify decide from the runs whether an equation has one; here use offset='none' "
@@ -65,75 +72,74 @@ def check_decided(offset: str) -> None:
 
 @dataclass(frozen=True)
 class Hints:
-    """What the maker of a structure knows of where its orders lie; it tells a fit where to start, and bounds nothing.
+    """Prior knowledge for initial guesses of a fit; it imposes no bounds.
 
     Parameters
     ----------
-    highest
-        Usual interval of highest orders; None: anything.
-    natural
-        Values beside the whole orders of its physics, by order; starts are looked for there, too, if all orders have
-        some.
-    freed
-        Names of the orders that an equation taken out of an order law frees, by the coefficient of their term.
-    exceeds
-        What a ratio of the coefficient law exceeds by its physics; 1 where nothing is said, as a sum of inertias beside
-        one of them.
-    positive
-        Coefficients of one equation that the law ties to those of another and physics makes positive. Least squares may
-        take the one equation for the other; a start then has the other's coefficients by the law, with these signs.
-    known
-        Values of coefficients by a physics that is nearly right; a fit that frees one also starts with it held there.
+    highest_order_range
+        Usual interval of the highest orders; None for no preference.
+    nominal_orders
+        Typical values of the free orders, by name; used as additional initial guesses if every free order has some.
+    order_names_by_coefficient
+        Name of the free order of a term when its equation is separated from an order law, by the term's coefficient.
+    min_ratios
+        Physical lower bounds of ratios in the coefficient law, by name; default 1, as for a sum of inertias over one
+        of them.
+    positive_coefficients
+        Coefficients that the coefficient law ties to another equation and that are physically positive. Least squares
+        can confuse the two equations; an additional initial guess uses the law with these signs.
+    nominal_coefficients
+        Nominal values of coefficients from approximate physics, used as additional initial guesses.
     """
 
-    highest: tuple[float, float] | None = None
-    natural: Mapping[str, tuple[float, ...]] = field(default_factory=dict)
-    freed: Mapping[str, str] = field(default_factory=dict)
-    exceeds: Mapping[str, float] = field(default_factory=dict)
-    positive: tuple[str, ...] = ()
-    known: Mapping[str, float] = field(default_factory=dict)
+    highest_order_range: tuple[float, float] | None = None
+    nominal_orders: Mapping[str, tuple[float, ...]] = field(default_factory=dict)
+    order_names_by_coefficient: Mapping[str, str] = field(default_factory=dict)
+    min_ratios: Mapping[str, float] = field(default_factory=dict)
+    positive_coefficients: tuple[str, ...] = ()
+    nominal_coefficients: Mapping[str, float] = field(default_factory=dict)
 
 
 @dataclass(frozen=True)
 class Structure:
-    """Equations over shared signals, with what is known about them; some orders or coefficients may be free.
+    """Structure of coupled fractional-order equations; orders and coefficients may be free.
 
     Parameters
     ----------
     equations
-        One for each output that is modelled.
+        One equation per modeled output.
     order_values
-        Lattice of free orders that have one: their values, ascending.
+        Grid values of free orders, ascending, where given.
     coupling
-        ``"measured"``: each equation is driven by the measured other outputs. ``"simulated"``: all outputs follow
-        together from the inputs alone.
+        ``"measured"``: the measured other outputs are inputs of each equation. ``"simulated"``: all outputs are
+        simulated together from the inputs.
     delay
-        Known delay of inputs [s].
+        Fixed delay of inputs [s].
     free_delays
-        Least and largest delay of inputs whose delay is to be estimated [s].
-    limited
-        Saturations and dead zones of inputs, known or to be estimated.
+        Lower and upper bound of estimated input delays [s].
+    input_nonlinearities
+        Saturations and dead zones of inputs, fixed or estimated.
     initial
         Initial terms, see :func:`equation`.
     sensor_filter
-        Known filter that some signals were measured through, inputs or outputs.
+        Known filter of some measured signals, inputs or outputs.
     coefficient_law
-        Optional law that ties the coefficients: (name, sign, factors) with coefficient = sign * product of factors.
+        Optional law between coefficients: (name, sign, factors) with coefficient = sign * product of factors.
     reference
-        Coefficients by name as the maker of the machine states them, to be set beside estimates.
+        Manufacturer's values of coefficients by name, shown next to the estimates.
     name
-        What this is.
+        Name of the structure.
     hints
-        Where its orders lie, if its maker knows; no part of what it says, so never compared nor written.
+        Prior knowledge for initial guesses; neither compared nor written.
     offset
-        ``"constant"``: each equation has an unknown constant on its right-hand side, ``"ramp"``: a constant and a
-        constant times t; one each run, estimated as initial terms are and never carried to another run. ``"auto"``:
-        identification decides between none and a constant.
+        ``"constant"``: an unknown constant on the right-hand side of each equation. ``"ramp"``: a constant and a
+        constant times t. Offsets are estimated per run, like initial terms, and never transferred to another run.
+        ``"auto"``: identification decides between none and a constant.
 
     Raises
     ------
     ModelError
-        No equation, an output or a coefficient that two of them have, a delay, limit or filter of what is no signal.
+        No equation, a repeated output or coefficient, or a delay, nonlinearity or filter of an unknown signal.
     """
 
     equations: tuple[Equation, ...]
@@ -148,8 +154,8 @@ class Structure:
     name: str = "equation"
     hints: Hints | UnsetType = field(default=UNSET, repr=False, compare=False)
     offset: Offset = "none"
-    # Absent where there is none, so that what is written of a structure without it is as it was.
-    limited: tuple[Limit, ...] | UnsetType = UNSET
+    # Omitted when unset, so that digests and files of older structures do not change.
+    input_nonlinearities: tuple[InputNonlinearity, ...] | UnsetType = UNSET
 
     def __post_init__(self) -> None:
         if not self.equations:
@@ -174,7 +180,7 @@ class Structure:
             if not 0 <= numbers[0] < numbers[1] < math.inf:
                 raise ModelError(f"delay of {name} from {low} to {high} s is no interval; give two rising times from 0")
         check_known("limited input", [limit.signal for limit in self.limits], external)
-        check_limits(self.limits, self.delay, self.free_delays)
+        check_nonlinearities(self.limits, self.delay, self.free_delays)
         for item in self.free_inputs:
             if item.name in names or item.name in self.order_names:
                 raise ModelError(f"{item.name} is the {item.words}; call the coefficient otherwise")
@@ -186,28 +192,28 @@ class Structure:
 
     @property
     def has_friction(self) -> bool:
-        """Whether the output of an equation may stick."""
+        """Whether an equation has friction."""
         return any(e.friction is not None for e in self.equations)
 
     @property
-    def sticks(self) -> tuple[int, ...]:
-        """Places of the equations with friction."""
+    def friction_equations(self) -> tuple[int, ...]:
+        """Indices of the equations with friction."""
         return tuple(i for i, e in enumerate(self.equations) if e.friction is not None)
 
     def _check_friction(self) -> None:
-        """Refuse what a free run with friction does not know yet."""
-        rubbing = [self.equations[i].output for i in self.sticks]
+        """Raise for properties that the simulation with friction does not support."""
+        rubbing = [self.equations[i].output for i in self.friction_equations]
         words = f"the equation of {rubbing[0]} has friction"
-        for i in self.sticks:
-            self.equations[i].check_drives(self.outputs)
+        for i in self.friction_equations:
+            self.equations[i].check_input_orders(self.outputs)
         if len(self.equations) > 1 and self.coupling == "measured":
             raise ModelError(
                 f"{words}, and the structure {len(self.equations)} equations with measured coupling: driven by "
                 f"measured signals they share no free run, so give that of {rubbing[0]} a structure of its own, or "
                 "follow them together with coupling='simulated'"
             )
-        if self.behind_filter:
-            through = [s for s in self.signals if s not in self.outputs and self.measured_through(s)]
+        if self.all_filtered:
+            through = [s for s in self.signals if s not in self.outputs and self.is_filtered(s)]
             raise ModelError(
                 f"{words}, and {' and '.join(through)}, which drives it, passed the sensor filter: what sticks does so "
                 "before the filter, and what was filtered is not given back; let it follow from an equation of its "
@@ -226,10 +232,10 @@ class Structure:
             )
 
     def _check_offset(self) -> None:
-        """Refuse an offset that is no word, or that given initial terms hold already."""
+        """Raise for an unknown offset, or one that duplicates a given initial term."""
         check_offset(self.offset)
         if isinstance(self.initial, (str, History)):
-            # Where the powers of a history hold that of the offset, they are one term.
+            # An exponent that equals that of the offset is merged with it.
             return
         for item in self.equations:
             for power in [] if item.order.names else offset_exponents(item.order.constant, self.offset).values():
@@ -242,43 +248,42 @@ class Structure:
 
     @property
     def outputs(self) -> tuple[str, ...]:
-        """Modelled outputs, one an equation."""
+        """Names of the modeled outputs, one per equation."""
         return tuple(e.output for e in self.equations)
 
     @property
     def signals(self) -> tuple[str, ...]:
-        """Outputs first, then every other signal."""
+        """Names of all signals, outputs first."""
         return tuple(dict.fromkeys([e.output for e in self.equations] + [s for e in self.equations for s in e.signals]))
 
     @property
-    def behind_filter(self) -> bool:
-        """Whether equations and free runs are those of filtered signals, every unfiltered one put through the filter.
+    def all_filtered(self) -> bool:
+        """Whether the equations hold for filtered signals, so that all unfiltered signals must be filtered.
 
-        So it is where a filtered signal drives an equation: another output with measured coupling, or what is not
-        modelled. What such a structure compares and returns is filtered, in all of its equations. What may stick
-        follows from its own velocity, before the filter.
+        This is the case if a filtered signal is an input of an equation: an external signal, or another output with
+        measured coupling. All simulated and compared outputs are then filtered. With friction, outputs are simulated
+        before the filter.
         """
         followed = self.outputs if self.coupling == "simulated" or self.has_friction else ()
-        return any(s not in followed and self.measured_through(s) for s in self.signals)
+        return any(s not in followed and self.is_filtered(s) for s in self.signals)
 
     def filter_states(self, initial: Initial) -> int:
-        """How many free motions of the filter stand beside decided initial terms where signals pass it.
+        """Return the number of unknown initial states of the sensor filter for given initial terms.
 
-        What the filter is applied to here, signals that were not measured through it or outputs that follow from
-        others, passes it from the start of the run on, so what the filter still holds of the time before is unknown:
-        its answers to an impulse and to derivatives of one. None from rest, nor beside exponents that are given. Of
-        outputs that follow from unfiltered signals a filter is refused that may hold more.
+        Signals that are filtered by software pass the filter from the start of the run, so its initial transient is
+        unknown. The transient is modeled by responses to an impulse and its derivatives. There is none from rest or
+        with given exponents.
 
         Raises
         ------
         ModelError
-            Such a filter.
+            A filter with zeros or fractional orders on simulated outputs, whose transient these responses do not span.
         """
         sensor = self.sensor_filter
         if sensor is None or not (initial == "caputo" or isinstance(initial, History)):
             return 0
-        if not (self.behind_filter or sensor.holds_answers):
-            through = [o for o in self.outputs if self.measured_through(o)]
+        if not (self.all_filtered or sensor.holds_answers):
+            through = [o for o in self.outputs if self.is_filtered(o)]
             raise ModelError(
                 f"{' and '.join(through)} passed a sensor filter with a zero or a fractional order, and a run starts "
                 "in motion: what such a filter still held is more than answers to impulses; use initial='rest' and "
@@ -286,39 +291,39 @@ class Structure:
             )
         return sensor.relative_degree
 
-    def held_back(self, output: str) -> bool:
-        """Whether the filter may still hold something of the time before a run that an output lacks then."""
-        return self.behind_filter or self.measured_through(output)
+    def has_filter_transient(self, output: str) -> bool:
+        """Whether an output may contain the initial transient of the sensor filter."""
+        return self.all_filtered or self.is_filtered(output)
 
-    def measured_through(self, signal: str) -> bool:
-        """Whether a signal was measured through the sensor filter."""
+    def is_filtered(self, signal: str) -> bool:
+        """Whether a signal passed the sensor filter."""
         return self.sensor_filter is not None and signal in self.sensor_filter.signals
 
     @property
     def order_names(self) -> tuple[str, ...]:
-        """Free orders: those that stand alone in order of appearance, then those seen only through a law."""
+        """Names of the free orders: single ones in order of appearance, then those that occur only in a law."""
         orders = [o for e in self.equations for o in (e.order, *(t.order for t in e.terms))]
         alone = [o.names[0] for o in orders if o.is_single]
         return tuple(dict.fromkeys([*alone, *(n for o in orders for n in o.names)]))
 
     @property
     def coefficient_names(self) -> tuple[str, ...]:
-        """Free coefficients."""
+        """Names of the free coefficients."""
         return tuple(n for e in self.equations for n in e.coefficient_names)
 
     @property
     def has_order_law(self) -> bool:
-        """Whether orders depend on one another: one is no plain name, or two are the same."""
+        """Whether an order law relates the orders: an order is an expression, or two orders share a name."""
         orders = [o for e in self.equations for o in (e.order, *(t.order for t in e.terms)) if o.names]
         names = [o.names[0] for o in orders]
         return any(not o.is_single for o in orders) or len(set(names)) < len(names)
 
-    def parts(self) -> dict[str, Structure]:
-        """What an order search takes one by one: equations that share no free order do not wait for one another.
+    def independent_groups(self) -> dict[str, Structure]:
+        """Return the independent substructures of an order search: groups of equations that share free orders.
 
-        Equations that an order law ties stay together, as ``"stage"`` where that is all of the structure, else under
-        the names of their outputs; any other equation is by itself, with measured coupling. Equations without free
-        orders are left out.
+        Equations related by an order law form one group, named ``"stage"`` if it is the whole structure, else by its
+        outputs. Any other equation is a group of its own, with measured coupling. Equations without free orders are
+        omitted.
         """
         groups: list[tuple[set[str], list[Equation]]] = []
         for item in self.equations:
@@ -342,7 +347,7 @@ class Structure:
         return out
 
     def _of(self, equations: tuple[Equation, ...], coupling: Literal["measured", "simulated"]) -> Structure:
-        """What is known of some of the equations, free of laws between coefficients."""
+        """Return the substructure of some equations, without coefficient laws."""
         orders = {n for e in equations for n in e.order_names}
         signals = tuple(dict.fromkeys(s for e in equations for s in e.signals))
         return replace(
@@ -352,17 +357,17 @@ class Structure:
             coupling=coupling,
             delay={n: v for n, v in self.delay.items() if n in signals},
             free_delays={n: v for n, v in self.free_delays.items() if n in signals},
-            limited=_or_unset([limit for limit in self.limits if limit.signal in signals]),
-            sensor_filter=narrowed(self.sensor_filter, signals),
+            input_nonlinearities=_or_unset([limit for limit in self.limits if limit.signal in signals]),
+            sensor_filter=restrict_filter(self.sensor_filter, signals),
             coefficient_law=(),
             name=f"{self.name}, {', '.join(e.output for e in equations)}",
         )
 
     def equation(self, output: str) -> Structure:
-        """One equation of this structure alone, with measured coupling and free of order laws.
+        """Return one equation as a structure of its own, with measured coupling and without order laws.
 
-        An order that a law would give becomes a free order of its own, named after its term; the order of an input
-        becomes 0 unless it is a number already.
+        An order given by a law becomes a free order named after its term. The order of an input becomes 0 unless it is
+        fixed.
 
         Raises
         ------
@@ -373,24 +378,24 @@ class Structure:
         own = next(e for e in self.equations if e.output == output)
         modelled = [s for e in self.equations for s in e.signals if s in self.outputs]
 
-        def freed(k: int, term: Term) -> Term:
+        def free_order(k: int, term: Term) -> Term:
             if term.order.is_single or not term.order.names:
                 return term
             if term.signal not in modelled:
                 return replace(term, order=Order())
             called = str(term.name or term.coefficient)
-            name = (self.hints or Hints()).freed.get(called, f"nu_{output}_{k + 1}")
+            name = (self.hints or Hints()).order_names_by_coefficient.get(called, f"nu_{output}_{k + 1}")
             return replace(term, order=Order(0.0, ((name, 1.0),)))
 
-        single = replace(own, terms=tuple(freed(k, t) for k, t in enumerate(own.terms)))
+        single = replace(own, terms=tuple(free_order(k, t) for k, t in enumerate(own.terms)))
         return self._of((single,), "measured")
 
-    def driven(self, output: str) -> Structure:
-        """One equation of this structure driven by measured signals, its orders as they are here."""
+    def with_measured_inputs(self, output: str) -> Structure:
+        """Return one equation as a structure with measured coupling; its orders keep their expressions."""
         return self._of(tuple(e for e in self.equations if e.output == output), "measured")
 
     def with_orders(self, orders: Mapping[str, Values]) -> Structure:
-        """Fix free orders (a number) or give them a lattice (see :func:`parse_values`).
+        """Fix free orders (a number) or set their grid values (see :func:`parse_values`).
 
         Raises
         ------
@@ -421,7 +426,7 @@ class Structure:
         return replace(self, equations=tuple(e.with_coefficients(values) for e in self.equations))
 
     def with_delays(self, delays: Mapping[str, float | tuple[float, float]]) -> Structure:
-        """Set delays of inputs [s]: a number is known, (least, largest) is to be estimated.
+        """Set input delays [s]: a number fixes one, (lower, upper) bounds an estimated one.
 
         Raises
         ------
@@ -443,65 +448,67 @@ class Structure:
     def with_limits(
         self, *, saturation: Mapping[str, Value] | None = None, dead_zone: Mapping[str, Value] | None = None
     ) -> Structure:
-        """Set saturations and dead zones of inputs, in their units: a number is known, (least, largest) is estimated.
+        """Set saturations and dead zones of inputs: a number fixes one, (lower, upper) bounds an estimated one.
 
         Parameters
         ----------
         saturation, dead_zone
-            By the name of the input: the size beyond which no more acts, and that up to which nothing does.
+            Limit by input, in its unit: the saturation level, and the half-width of the dead zone.
 
         Raises
         ------
         ModelError
-            A name that is no input, a limit that is no number above 0, no interval, or not estimated beside others.
+            A name that is not an input, an invalid limit or interval, or more than one free parameter per input.
         """
-        limits = with_values(self.limits, "dead_zone", dead_zone or {})
-        return replace(self, limited=_or_unset(with_values(limits, "saturation", saturation or {})))
+        limits = replace_nonlinearities(self.limits, "dead_zone", dead_zone or {})
+        return replace(
+            self, input_nonlinearities=_or_unset(replace_nonlinearities(limits, "saturation", saturation or {}))
+        )
 
     @property
-    def limits(self) -> tuple[Limit, ...]:
-        """Saturations and dead zones of inputs, as inputs pass them."""
-        return () if isinstance(self.limited, UnsetType) else self.limited
+    def limits(self) -> tuple[InputNonlinearity, ...]:
+        """Saturations and dead zones of inputs, in the order in which they act."""
+        return () if isinstance(self.input_nonlinearities, UnsetType) else self.input_nonlinearities
 
     @property
-    def free_inputs(self) -> tuple[FreeInput, ...]:
-        """What is to be estimated of inputs: delays, then limits."""
-        late = [FreeInput(n, "delay", (ends[0], ends[1])) for n, ends in self.free_delays.items()]
+    def free_inputs(self) -> tuple[FreeInputParameter, ...]:
+        """Parameters of inputs to estimate: delays, then saturations and dead zones."""
+        late = [FreeInputParameter(n, "delay", (ends[0], ends[1])) for n, ends in self.free_delays.items()]
         return tuple([*late, *(limit.free for limit in self.limits if limit.free is not None)])
 
     def with_inputs(self, values: Mapping[str, float]) -> Structure:
-        """Set free delays and limits by the names of their estimates, such as ``delay_u`` and ``sat_u``."""
+        """Fix free input parameters by name, such as ``delay_u`` and ``sat_u``."""
         names = {n: input_name("delay", n) for n in self.free_delays}
         delays = {n: values[name] for n, name in names.items() if name in values}
         limits = tuple(
             replace(limit, value=float(values[limit.name])) if limit.free and limit.name in values else limit
             for limit in self.limits
         )
-        return replace(self.with_delays(delays), limited=_or_unset(limits))
+        return replace(self.with_delays(delays), input_nonlinearities=_or_unset(limits))
 
-    def as_given(self) -> Structure:
-        """The structure without free delays and limits: inputs as they were given."""
+    def without_input_nonlinearities(self) -> Structure:
+        """Return the structure without free delays, saturations and dead zones."""
         known = [limit for limit in self.limits if limit.free is None]
-        return replace(self, free_delays={}, limited=_or_unset(known))
+        return replace(self, free_delays={}, input_nonlinearities=_or_unset(known))
 
-    def acting(self, digits: str = "r") -> dict[str, str]:
-        """How inputs are written that do not act as they are: ``sat(u(t - 0.035 s), 0.94)``."""
+    def describe_inputs(self, digits: str = "r") -> dict[str, str]:
+        """Texts of inputs with delay or nonlinearity, such as ``sat(u(t - 0.035 s), 0.94)``."""
         out = {n: f"{n}(t - {d:.6g} s)" for n, d in self.delay.items() if d > 0 and digits != "r"}
         for limit in self.limits:
-            out[limit.signal] = limit.written(out.get(limit.signal, limit.signal), digits)
+            out[limit.signal] = limit.as_text(out.get(limit.signal, limit.signal), digits)
         return out
 
     def __str__(self) -> str:
-        inputs = self.acting()
-        return "\n".join(f"{e.written(inputs)}{self.offset_in_words}" for e in self.equations)
+        inputs = self.describe_inputs()
+        return "\n".join(f"{e.as_text(inputs)}{self.offset_in_words}" for e in self.equations)
 
-    def written(self, item: Equation) -> str:
-        """Write an identified equation of this structure with its delays, its limits and its offset."""
-        return numeric(item, self.acting(".6g")) + self.offset_in_words
+    def equation_text(self, item: Equation) -> str:
+        """Format an identified equation with its delays, nonlinearities and offset."""
+        return format_equation(item, self.describe_inputs(".6g")) + self.offset_in_words
 
     @property
     def offset_in_words(self) -> str:
-        """What an offset adds to an equation in words; nothing without one."""
+        """Text of the offset at the end of an equation; empty if there is none."""
         taken = {*self.coefficient_names, *self.order_names, *self.signals}
         name = next(n for n in ("c", *(f"c{k}" for k in range(len(taken) + 1))) if n not in taken)
         asked = f" + ({name} if the runs ask for it)"
@@ -511,19 +518,19 @@ class Structure:
         return f"<pre>{html.escape(str(self))}</pre>"
 
 
-def _or_unset(limits: Sequence[Limit]) -> tuple[Limit, ...] | UnsetType:
-    """Limits as a structure holds them."""
+def _or_unset(limits: Sequence[InputNonlinearity]) -> tuple[InputNonlinearity, ...] | UnsetType:
+    """Return the nonlinearities as a tuple, or UNSET if there are none."""
     return tuple(limits) or UNSET
 
 
 def offset_exponents(alpha: float, offset: Offset) -> dict[str, float]:
-    """Powers of t that an offset is once its equation is integrated, by what they are: c t^alpha / Gamma(alpha + 1)."""
+    """Exponents of t of the integrated offset, by name: c t^alpha / Gamma(alpha + 1)."""
     names = {"none": (), "auto": (), "constant": ("constant",), "ramp": ("constant", "ramp")}[offset]
     return {name: round(alpha + i, 9) for i, name in enumerate(names)}
 
 
-def narrowed(sensor: SensorFilter | None, signals: Sequence[str]) -> SensorFilter | None:
-    """Return the filter of those signals that are left, or None."""
+def restrict_filter(sensor: SensorFilter | None, signals: Sequence[str]) -> SensorFilter | None:
+    """Restrict a sensor filter to some signals; None if none of them is filtered."""
     if sensor is None:
         return None
     left = tuple(s for s in sensor.signals if s in signals)

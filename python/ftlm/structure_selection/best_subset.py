@@ -15,44 +15,44 @@ from ftlm import _core
 from ftlm.data.run import Run
 from ftlm.errors import FtlmError
 from ftlm.estimation.free_parameters import FreeProblem
-from ftlm.estimation.objective import Attempt, Grid, descend
+from ftlm.estimation.objective import Iterate, Objective, minimize_cost
 from ftlm.structure.equation import Term
 from ftlm.structure.order import Order
-from ftlm.structure.structure import Offset, Structure, narrowed
-from ftlm.structure_selection.candidates import Change, Inside, Variant, signature, worded
-from ftlm.structure_selection.cross_validation import LOST, Folds, decided
+from ftlm.structure.structure import Offset, Structure, restrict_filter
+from ftlm.structure_selection.candidates import Change, NestedStructures, Variant, describe_structure, signature
+from ftlm.structure_selection.cross_validation import MIN_FIT_PERCENT, Folds, fix_initial_conditions
 from ftlm.utils.validation import Floats
 
 Item = TypeVar("Item")
 Made = TypeVar("Made")
 #: Minimum number of input terms for best-subset screening. Stepwise selection is as fast for fewer.
-LEAST_DRIVES = 3
+MIN_INPUT_TERMS = 3
 #: Minimum number of samples of a subsampled run.
-SAMPLES = 1000
+MIN_SCREENING_SAMPLES = 1000
 #: Spacing of the grid in ln(frequency), damping factors, and number of times that the spacing is halved around the best
 #: points.
-SPACING = 0.15
-DAMPING = tuple(np.geomspace(0.006, 4.0, 10).tolist())
-ZOOMS = 2
+LOG_FREQUENCY_SPACING = 0.15
+DAMPING_FACTORS = tuple(np.geomspace(0.006, 4.0, 10).tolist())
+GRID_REFINEMENTS = 2
 #: Number of subsets around whose points the grid is refined.
-LEADING = 24
+REFINED_SUBSETS = 24
 #: Maximum number of subsets for an exhaustive search. Beyond it, the best subsets of each size are extended.
-ALL = 4096
+MAX_EXHAUSTIVE_SUBSETS = 4096
 #: Ridge added to the scaled normal matrix, for collinear responses.
-UNTOLD = 1e-12
+RELATIVE_RIDGE = 1e-12
 #: Number of grid points per task.
-CHUNK = 16
+POINTS_PER_TASK = 16
 
 
-class Pool(Protocol):
+class TaskPool(Protocol):
     """Pool that maps a function over items, in their order."""
 
-    def quietly(self, work: Callable[[Item], Made], items: Sequence[Item]) -> list[Made]:
+    def map_items(self, work: Callable[[Item], Made], items: Sequence[Item]) -> list[Made]:
         """Return the results for the items, in their order."""
 
 
 @dataclass(frozen=True)
-class Screened:
+class ScreenedSubset:
     """Subset with the initial guess of its fit, and its score on the grid: mean over folds of ln(1 - fit / 100)."""
 
     change: Change
@@ -66,19 +66,19 @@ class Column:
 
     coefficient: str
     signal: str
-    place: float
+    order: float
     names: tuple[str, ...]
 
     def term(self, term: Term, name: str) -> Term:
         """Return the term at this order with a coefficient of its own."""
-        return replace(term, order=Order(self.place), coefficient=name)
+        return replace(term, order=Order(self.order), coefficient=name)
 
 
 @dataclass(frozen=True)
-class Ground:
+class BaseModel:
     """Base model: own terms at integer orders with coefficients from a grid, and columns of possible input terms."""
 
-    inside: Inside
+    inside: NestedStructures
     variant: Variant
     structure: Structure
     own: tuple[tuple[str, float], ...]
@@ -86,29 +86,29 @@ class Ground:
     runs: tuple[Run, ...]
 
     @property
-    def top(self) -> float:
+    def highest_order(self) -> float:
         """Highest order."""
         return self.structure.equations[0].order.constant
 
-    def lattice(self) -> Iterator[tuple[float, ...]]:
+    def grid_points(self) -> Iterator[tuple[float, ...]]:
         """Yield logarithms of frequency and of damping, as many as there are free own coefficients."""
         if not self.own:
             yield ()
             return
         longest = max(r.length * r.step for r in self.runs)
         low, high = math.log(1.0 / longest), math.log(math.pi / (2.0 * min(r.step for r in self.runs)))
-        steps = np.linspace(low, high, max(2, math.ceil((high - low) / SPACING) + 1)).tolist()
+        steps = np.linspace(low, high, max(2, math.ceil((high - low) / LOG_FREQUENCY_SPACING) + 1)).tolist()
         for w in steps:
-            yield from [(w,)] if len(self.own) == 1 else [(w, math.log(g)) for g in DAMPING]
+            yield from [(w,)] if len(self.own) == 1 else [(w, math.log(g)) for g in DAMPING_FACTORS]
 
     def coefficients(self, point: tuple[float, ...]) -> dict[str, float]:
         """Own coefficients at a point: a power of the frequency for the lower order, damping for the higher."""
         w = math.exp(point[0]) if point else 1.0
         shares = [1.0, math.exp(point[1]) if len(point) > 1 else 1.0]
         ordered = sorted(self.own, key=lambda item: item[1])
-        return {n: -g * w ** (self.top - order) for (n, order), g in zip(ordered, shares, strict=False)}
+        return {n: -g * w ** (self.highest_order - order) for (n, order), g in zip(ordered, shares, strict=False)}
 
-    def stable(self, point: tuple[float, ...]) -> bool:
+    def is_stable(self, point: tuple[float, ...]) -> bool:
         """Whether the model is stable at a point; True if no own coefficient is free."""
         if not point:
             return True
@@ -133,43 +133,43 @@ class Products:
     values: Floats
 
 
-def screened(inside: Inside, folds: Folds, pool: Pool) -> list[Screened]:
+def screen_subsets(inside: NestedStructures, folds: Folds, pool: TaskPool) -> list[ScreenedSubset]:
     """Return every subset at integer orders, best prediction first; empty if the screening does not apply.
 
     It needs several runs, or a validation run: blocks of one run share initial terms.
     """
     # Subsets are compared as bodies that slide; friction that may be left out is added to the best.
-    inside = Inside(inside.sliding)
+    inside = NestedStructures(inside.without_optional_friction)
     structure = inside.structure
     drives = [t for t in structure.equations[0].terms if t.signal != structure.equations[0].output]
     if (
         len(structure.equations) > 1
         or structure.has_friction
         or structure.free_inputs
-        or sum(t.coefficient in inside.droppable for t in drives) < LEAST_DRIVES
+        or sum(t.coefficient in inside.droppable for t in drives) < MIN_INPUT_TERMS
         or any(f.rows is not None for f in folds.parts)
     ):
         return []
     runs = list(folds.runs)
-    runs += [f.judged for f in folds.parts if not any(f.judged is r for r in runs)]
-    found: dict[str, Screened] = {}
-    for ground in grounds(inside, tuple(runs)):
-        for one in judged_subsets(ground, folds, pool):
+    runs += [f.validation_run for f in folds.parts if not any(f.validation_run is r for r in runs)]
+    found: dict[str, ScreenedSubset] = {}
+    for ground in base_models(inside, tuple(runs)):
+        for one in score_subsets(ground, folds, pool):
             key = signature(inside.build(one.change.variant))
             if key not in found or one.score < found[key].score:
                 found[key] = one
     return sorted(found.values(), key=lambda s: (s.score, s.change.words))
 
 
-def grounds(inside: Inside, runs: tuple[Run, ...]) -> Iterator[Ground]:
+def base_models(inside: NestedStructures, runs: tuple[Run, ...]) -> Iterator[BaseModel]:
     """Yield base models: at most two own terms at integer orders, with and without an offset."""
     structure = inside.structure
     item = structure.equations[0]
     own = [t for t in item.terms if t.signal == item.output]
-    tops = inside.wholes(item.order.names[0]) if item.order.is_single else [item.order.constant]
+    tops = inside.integer_values(item.order.names[0]) if item.order.is_single else [item.order.constant]
     seen: set[str] = set()
     for top in (v for v in tops if v > 0):
-        for places in itertools.product(*(_places(inside, t, top) for t in own)):
+        for places in itertools.product(*(_candidate_orders(inside, t, top) for t in own)):
             there = [(t, p) for t, p in zip(own, places, strict=True) if p is not None]
             if len({p for _, p in there}) < len(there) or (own and not there):
                 continue
@@ -181,28 +181,28 @@ def grounds(inside: Inside, runs: tuple[Run, ...]) -> Iterator[Ground]:
             offsets = (False, True) if inside.offset_allowed else (False,)
             for offset in (True,) if structure.offset == "constant" else offsets:
                 variant = Variant(frozenset(n for n, _ in free), tuple(sorted(whole.items())), offset)
-                ground = _ground(inside, variant, [(t, p) for t, p in there], top, free, runs)
+                ground = _base_model(inside, variant, [(t, p) for t, p in there], top, free, runs)
                 key = "" if ground is None else signature(ground.structure)
                 if ground is not None and key not in seen:
                     seen.add(key)
                     yield ground
 
 
-def _places(inside: Inside, term: Term, top: float) -> list[float | None]:
+def _candidate_orders(inside: NestedStructures, term: Term, top: float) -> list[float | None]:
     """Integer orders of an own term below the highest, and None if it is optional."""
     out: list[float | None] = [None] if term.coefficient in inside.droppable else []
-    places = inside.wholes(term.order.names[0]) if term.order.is_single else [term.order.constant]
+    places = inside.integer_values(term.order.names[0]) if term.order.is_single else [term.order.constant]
     return out + [p for p in places if p < top]
 
 
-def _ground(
-    inside: Inside,
+def _base_model(
+    inside: NestedStructures,
     variant: Variant,
     own: Sequence[tuple[Term, float]],
     top: float,
     free: tuple[tuple[str, float], ...],
     runs: tuple[Run, ...],
-) -> Ground | None:
+) -> BaseModel | None:
     """Return a base model with every possible column; None if there is none, or not all are linear."""
     item = inside.structure.equations[0]
     known = [t for t in item.terms if t.signal != item.output and t.fixed is not None]
@@ -216,10 +216,10 @@ def _ground(
         if term.coefficient in taken:
             return None
         names = term.order.names
-        for place in inside.wholes(names[0]) if term.order.is_single else [term.order.constant]:
+        for place in inside.integer_values(names[0]) if term.order.is_single else [term.order.constant]:
             column = Column(str(term.coefficient), term.signal, place, tuple(names))
             made = column.term(term, f"column{len(columns)}")
-            if _drives(inside.structure, [*kept, *known, made], top, runs):
+            if _is_valid_input_set(inside.structure, [*kept, *known, made], top, runs):
                 columns.append(column)
                 terms.append(made)
     if not columns:
@@ -228,7 +228,7 @@ def _ground(
         inside.structure.offset if inside.structure.offset == "ramp" else "constant" if variant.offset else "none"
     )
     structure = _with_terms(inside.structure, [*kept, *known, *terms], top, asked)
-    return Ground(inside, variant, decided(structure, runs), free, tuple(columns), runs)
+    return BaseModel(inside, variant, fix_initial_conditions(structure, runs), free, tuple(columns), runs)
 
 
 def _with_terms(structure: Structure, terms: Sequence[Term], top: float, offset: Offset) -> Structure:
@@ -240,34 +240,34 @@ def _with_terms(structure: Structure, terms: Sequence[Term], top: float, offset:
         order_values={},
         offset=offset,
         delay={n: v for n, v in structure.delay.items() if n in signals},
-        limited=tuple(x for x in structure.limits if x.signal in signals) or UNSET,
-        sensor_filter=narrowed(structure.sensor_filter, signals),
+        input_nonlinearities=tuple(x for x in structure.limits if x.signal in signals) or UNSET,
+        sensor_filter=restrict_filter(structure.sensor_filter, signals),
     )
 
 
-def _drives(structure: Structure, terms: Sequence[Term], top: float, runs: Sequence[Run]) -> bool:
+def _is_valid_input_set(structure: Structure, terms: Sequence[Term], top: float, runs: Sequence[Run]) -> bool:
     """Whether these terms form an equation that the runs can simulate."""
     try:
-        made = decided(_with_terms(structure, terms, top, "none"), runs)
-        Grid(FreeProblem.of(made), runs[:1], [1.0], decimation=_thinning(runs)).experiments  # noqa: B018
+        made = fix_initial_conditions(_with_terms(structure, terms, top, "none"), runs)
+        Objective(FreeProblem.of(made), runs[:1], [1.0], decimation=_decimation(runs)).experiments  # noqa: B018
     except FtlmError:
         return False
     return True
 
 
-def _thinning(runs: Sequence[Run]) -> int:
-    return max(1, min(run.length - 1 for run in runs) // SAMPLES)
+def _decimation(runs: Sequence[Run]) -> int:
+    return max(1, min(run.length - 1 for run in runs) // MIN_SCREENING_SAMPLES)
 
 
-def judged_subsets(
-    ground: Ground, folds: Folds, pool: Pool, points: Sequence[tuple[float, ...]] | None = None
-) -> list[Screened]:
+def score_subsets(
+    ground: BaseModel, folds: Folds, pool: TaskPool, points: Sequence[tuple[float, ...]] | None = None
+) -> list[ScreenedSubset]:
     """Score subsets of the columns of a base model by their residuals on validation data.
 
     Own coefficients are those of given points, or of a grid refined around the best points.
     """
     problem = FreeProblem.of(ground.structure)
-    grid = Grid(problem, ground.runs, [1.0], decimation=_thinning(ground.runs))
+    grid = Objective(problem, ground.runs, [1.0], decimation=_decimation(ground.runs))
     # Made here, once, before the threads ask for them.
     experiments, ends = grid.experiments, np.cumsum([0, *(count for _, count in grid.counts)]).tolist()
     places = [problem.coefficients.index(f"column{k}") for k in range(len(ground.columns))]
@@ -276,24 +276,26 @@ def judged_subsets(
         return [_products(ground, problem, experiments, ends, places, p) for p in points]
 
     def all_of(points: Sequence[tuple[float, ...]]) -> list[tuple[tuple[float, ...], Floats]]:
-        asked = [p for p in points if ground.stable(p)]
-        chunks = [asked[k : k + CHUNK] for k in range(0, len(asked), CHUNK)]
-        made = [g for part in pool.quietly(one, chunks) for g in part]
+        asked = [p for p in points if ground.is_stable(p)]
+        chunks = [asked[k : k + POINTS_PER_TASK] for k in range(0, len(asked), POINTS_PER_TASK)]
+        made = [g for part in pool.map_items(one, chunks) for g in part]
         return [(p, g) for p, g in zip(asked, made, strict=True) if g is not None]
 
-    there = all_of(list(ground.lattice()) if points is None else points)
-    judge = Judge.of(ground, folds, [float(np.nanvar(r[ground.structure.outputs[0]])) for r in ground.runs], ends)
-    spacing = (SPACING, math.log(DAMPING[1] / DAMPING[0]))
-    for zoom in range(ZOOMS + 1):
+    there = all_of(list(ground.grid_points()) if points is None else points)
+    judge = SubsetScorer.of(
+        ground, folds, [float(np.nanvar(r[ground.structure.outputs[0]])) for r in ground.runs], ends
+    )
+    spacing = (LOG_FREQUENCY_SPACING, math.log(DAMPING_FACTORS[1] / DAMPING_FACTORS[0]))
+    for zoom in range(GRID_REFINEMENTS + 1):
         if not there:
             return []
         products = Products([p for p, _ in there], np.array([g for _, g in there]))
-        found = judge.every(products)
-        if zoom == ZOOMS or points is not None or not ground.own:
+        found = judge.score_all(products)
+        if zoom == GRID_REFINEMENTS or points is not None or not ground.own:
             break
         spacing = (spacing[0] / 2, spacing[1] / 2)
         known = {p for p, _ in there}
-        best = sorted(found, key=lambda s: found[s].score)[:LEADING]
+        best = sorted(found, key=lambda s: found[s].score)[:REFINED_SUBSETS]
         centres = dict.fromkeys(products.points[k] for s in best for k in found[s].points)
         near = (
             tuple(c + m * w for c, m, w in zip(centre, moves, spacing, strict=False))
@@ -307,12 +309,12 @@ def judged_subsets(
         if change is not None:
             values = ground.coefficients(products.points[verdict.points[-1]])
             values |= {ground.columns[k].coefficient: c for k, c in zip(subset, verdict.coefficients, strict=True)}
-            out.append(Screened(change, values, verdict.score))
+            out.append(ScreenedSubset(change, values, verdict.score))
     return out
 
 
 def _products(
-    ground: Ground,
+    ground: BaseModel,
     problem: FreeProblem,
     experiments: list[object],
     ends: Sequence[int],
@@ -323,7 +325,9 @@ def _products(
     values = ground.coefficients(point)
     coefficients = [values.get(n, 0.0) for n in problem.coefficients]
     try:
-        outcome = descend(problem, experiments, Attempt([], coefficients, "", {}), evaluations=1, plain=True).outcome
+        outcome = minimize_cost(
+            problem, experiments, Iterate([], coefficients, "", {}), evaluations=1, plain=True
+        ).outcome
     except FtlmError:
         return None
     rows = np.vstack([np.asarray(outcome["jacobian"])[places], np.asarray(outcome["residuals"])])
@@ -332,19 +336,19 @@ def _products(
     return np.stack([rows[:, a:b] @ rows[:, a:b].T for a, b in itertools.pairwise(ends)])
 
 
-def _change(ground: Ground, subset: Sequence[int]) -> Change | None:
+def _change(ground: BaseModel, subset: Sequence[int]) -> Change | None:
     """Return a subset as a change to a variant; None if it is invalid."""
     chosen = [ground.columns[k] for k in subset]
-    whole = {**ground.variant.held(), **{n: c.place for c in chosen for n in c.names}}
+    whole = {**ground.variant.integer_order_values(), **{n: c.order for c in chosen for n in c.names}}
     kept = ground.variant.kept | {c.coefficient for c in chosen}
-    variant = replace(ground.variant, kept=frozenset(kept)).with_whole(whole)
-    if not ground.inside.possible(variant):
+    variant = replace(ground.variant, kept=frozenset(kept)).with_integer_orders(whole)
+    if not ground.inside.is_valid(variant):
         return None
-    return Change(worded(ground.inside.build(variant)), variant)
+    return Change(describe_structure(ground.inside.build(variant)), variant)
 
 
 @dataclass(frozen=True)
-class Verdict:
+class SubsetScore:
     """Score of a subset, its grid points by fold (last: all runs), and its coefficients there."""
 
     score: float
@@ -353,16 +357,16 @@ class Verdict:
 
 
 @dataclass(frozen=True)
-class Judge:
+class SubsetScorer:
     """Scorer of subsets: estimation runs by fold (last: all), validation run by fold, and output powers."""
 
     columns: tuple[Column, ...]
-    fitted: tuple[tuple[int, ...], ...]
-    judged: tuple[int, ...]
+    estimation_runs: tuple[tuple[int, ...], ...]
+    validation_runs: tuple[int, ...]
     sizes: Floats
 
     @classmethod
-    def of(cls, ground: Ground, folds: Folds, spread: Sequence[float], ends: Sequence[int]) -> Judge:
+    def of(cls, ground: BaseModel, folds: Folds, spread: Sequence[float], ends: Sequence[int]) -> SubsetScorer:
         """Build from the folds on the runs of a base model."""
 
         def place(run: Run) -> int:
@@ -373,52 +377,52 @@ class Judge:
         return cls(
             ground.columns,
             (*fitted, tuple(place(r) for r in folds.runs)),
-            tuple(place(f.judged) for f in folds.parts),
+            tuple(place(f.validation_run) for f in folds.parts),
             sizes,
         )
 
-    def one(self, products: Floats, pooled: Floats, subset: Sequence[int]) -> Verdict:
+    def score_subset(self, products: Floats, pooled: Floats, subset: Sequence[int]) -> SubsetScore:
         """Fit a subset on the runs of each fold at its best point, and score it on the validation run."""
         keys = [*subset, -1]
         cut = pooled[:, :, keys][:, :, :, keys]
         matrix, right, rest = cut[..., :-1, :-1], cut[..., :-1, -1], cut[..., -1, -1]
         scale = np.sqrt(np.maximum(np.einsum("...kk->...k", matrix), np.finfo(float).tiny))
-        even = matrix / scale[..., None] / scale[..., None, :] + UNTOLD * np.eye(len(subset))
+        even = matrix / scale[..., None] / scale[..., None, :] + RELATIVE_RIDGE * np.eye(len(subset))
         found = -np.linalg.solve(even, (right / scale)[..., None])[..., 0] / scale
         left = rest + np.einsum("pfk,pfk->pf", found, right)
         points = np.argmin(left, axis=0)
         scores = []
-        for fold, run in enumerate(self.judged):
+        for fold, run in enumerate(self.validation_runs):
             at, c = points[fold], found[points[fold], fold]
             whole = products[at, run][keys][:, keys]
             with_one = np.append(c, 1.0)
             share = math.sqrt(max(float(with_one @ whole @ with_one), 0.0) / float(self.sizes[run]))
-            scores.append(math.log(min(max(share, 1e-12), 1.0 - LOST / 100.0)))
-        return Verdict(float(np.mean(scores)), tuple(points.tolist()), tuple(found[points[-1], -1].tolist()))
+            scores.append(math.log(min(max(share, 1e-12), 1.0 - MIN_FIT_PERCENT / 100.0)))
+        return SubsetScore(float(np.mean(scores)), tuple(points.tolist()), tuple(found[points[-1], -1].tolist()))
 
-    def every(self, products: Products) -> dict[tuple[int, ...], Verdict]:
+    def score_all(self, products: Products) -> dict[tuple[int, ...], SubsetScore]:
         """Score every subset; if there are too many, extend the best of each size."""
         values = products.values
-        pooled = np.stack([values[:, list(runs)].sum(axis=1) for runs in self.fitted], axis=1)
+        pooled = np.stack([values[:, list(runs)].sum(axis=1) for runs in self.estimation_runs], axis=1)
         choices: dict[str, list[int]] = {}
         for k, column in enumerate(self.columns):
             choices.setdefault(column.coefficient, []).append(k)
         count = math.prod(1 + len(c) for c in choices.values()) - 1
-        out: dict[tuple[int, ...], Verdict] = {}
+        out: dict[tuple[int, ...], SubsetScore] = {}
 
         def judge(subsets: Iterable[tuple[int, ...]]) -> None:
             for subset in subsets:
                 if subset not in out:
-                    out[subset] = self.one(values, pooled, subset)
+                    out[subset] = self.score_subset(values, pooled, subset)
 
-        if count <= ALL:
+        if count <= MAX_EXHAUSTIVE_SUBSETS:
             judge(
                 tuple(sorted(k for k in chosen if k is not None))
                 for chosen in itertools.product(*([None, *c] for c in choices.values()))
                 if any(k is not None for k in chosen)
             )
             return out
-        width = max(4, ALL // len(self.columns) ** 2)
+        width = max(4, MAX_EXHAUSTIVE_SUBSETS // len(self.columns) ** 2)
         ahead: list[tuple[int, ...]] = [()]
         for _ in choices:
             wider = {

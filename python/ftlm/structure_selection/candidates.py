@@ -11,10 +11,10 @@ from ftlm.errors import ModelError
 from ftlm.estimation.free_parameters import FreeProblem
 from ftlm.structure.equation import Equation, Term
 from ftlm.structure.input_nonlinearity import input_name
-from ftlm.structure.structure import Structure, narrowed
+from ftlm.structure.structure import Structure, restrict_filter
 
 #: Integer values that replace a free order.
-WHOLE = (0.0, 1.0, 2.0, 3.0)
+INTEGER_ORDER_VALUES = (0.0, 1.0, 2.0, 3.0)
 
 
 @dataclass(frozen=True)
@@ -36,19 +36,19 @@ class Variant:
     """
 
     kept: frozenset[str]
-    whole: tuple[tuple[str, float], ...]
+    integer_orders: tuple[tuple[str, float], ...]
     offset: bool
     inputs: frozenset[str] = frozenset()
-    rubs: frozenset[str] = frozenset()
+    frictions: frozenset[str] = frozenset()
 
-    def held(self) -> dict[str, float]:
+    def integer_order_values(self) -> dict[str, float]:
         """Integer orders by name."""
-        return dict(self.whole)
+        return dict(self.integer_orders)
 
-    def with_whole(self, values: Mapping[str, float | None]) -> Variant:
+    def with_integer_orders(self, values: Mapping[str, float | None]) -> Variant:
         """Return the variant with some orders integer, or free where the value is None."""
-        known = {**self.held(), **values}
-        return replace(self, whole=tuple(sorted((n, v) for n, v in known.items() if v is not None)))
+        known = {**self.integer_order_values(), **values}
+        return replace(self, integer_orders=tuple(sorted((n, v) for n, v in known.items() if v is not None)))
 
 
 @dataclass(frozen=True)
@@ -60,7 +60,7 @@ class Change:
 
 
 @dataclass(frozen=True)
-class Inside:
+class NestedStructures:
     """A structure and all structures nested in it.
 
     Optional are terms with a free coefficient of their own (for one equation without laws), an allowed offset, free
@@ -97,7 +97,7 @@ class Inside:
                 out[f"{own} near rest"] = own if own in out else None
         return out
 
-    def _rubbing(self, item: Equation, rubs: frozenset[str]) -> Equation:
+    def _with_frictions(self, item: Equation, rubs: frozenset[str]) -> Equation:
         """Return an equation with the given optional frictions and all mandatory ones."""
         found, own, choices = item.friction, f"friction of {item.output}", self.frictions
         if found is None:
@@ -108,9 +108,9 @@ class Inside:
         return replace(item, coulomb=replace(found, more=UNSET)) if near in choices and near not in rubs else item
 
     @property
-    def sliding(self) -> Structure:
+    def without_optional_friction(self) -> Structure:
         """Structure without its optional frictions."""
-        equations = tuple(self._rubbing(e, frozenset()) for e in self.structure.equations)
+        equations = tuple(self._with_frictions(e, frozenset()) for e in self.structure.equations)
         return replace(self.structure, equations=equations)
 
     def build(self, variant: Variant) -> Structure:
@@ -119,7 +119,7 @@ class Inside:
         equations = []
         for item in structure.equations:
             terms = tuple(t for t in item.terms if t.coefficient not in droppable or t.coefficient in variant.kept)
-            equations.append(self._rubbing(replace(item, terms=terms), variant.rubs))
+            equations.append(self._with_frictions(replace(item, terms=terms), variant.frictions))
         names = {n for e in equations for n in e.order_names}
         signals = tuple(dict.fromkeys(n for e in equations for n in (e.output, *e.signals)))
         left = {i.name for i in structure.free_inputs} - variant.inputs
@@ -130,13 +130,14 @@ class Inside:
             order_values={n: v for n, v in structure.order_values.items() if n in names},
             delay={n: v for n, v in structure.delay.items() if n in signals},
             free_delays=free,
-            limited=tuple(x for x in structure.limits if x.signal in signals and x.name not in left) or UNSET,
-            sensor_filter=narrowed(structure.sensor_filter, signals),
-        ).with_orders({n: v for n, v in variant.whole if n in names})
+            input_nonlinearities=tuple(x for x in structure.limits if x.signal in signals and x.name not in left)
+            or UNSET,
+            sensor_filter=restrict_filter(structure.sensor_filter, signals),
+        ).with_orders({n: v for n, v in variant.integer_orders if n in names})
         asked = structure.offset if structure.offset == "ramp" else "constant" if variant.offset else "none"
         return replace(made, offset=asked)
 
-    def possible(self, variant: Variant) -> bool:
+    def is_valid(self, variant: Variant) -> bool:
         """Whether a variant is valid: its own orders differ and are below the highest."""
         try:
             made = self.build(variant)
@@ -151,11 +152,11 @@ class Inside:
                 return False
         return True
 
-    def wholes(self, name: str) -> list[float]:
+    def integer_values(self, name: str) -> list[float]:
         """Integer values that a free order may take."""
         problem = FreeProblem.of(self.structure)
         low, high = problem.bounds[problem.orders.index(name)]
-        return [v for v in WHOLE if low <= v <= high and (v > 0 or name not in self._highest)] or [
+        return [v for v in INTEGER_ORDER_VALUES if low <= v <= high and (v > 0 or name not in self._highest)] or [
             round(0.5 * (low + high), 6)
         ]
 
@@ -163,12 +164,12 @@ class Inside:
     def _highest(self) -> set[str]:
         return {n for e in self.structure.equations for n in e.order.names}
 
-    def skeletons(self) -> Iterator[Change]:
+    def simplest(self) -> Iterator[Change]:
         """Yield the simplest structures: integer orders, the output's own terms, and one input term."""
         free = [n for n in self.structure.order_names if n in self._highest]
         tops: list[dict[str, float]] = [{}]
         for name in free:
-            tops = [{**top, name: v} for top in tops for v in self.wholes(name) if v > 0]
+            tops = [{**top, name: v} for top in tops for v in self.integer_values(name) if v > 0]
         for top in tops:
             base = self._with_own_terms(top)
             if base is None:
@@ -178,18 +179,18 @@ class Inside:
             ]
             known = any(not self._owns(t) and t.fixed is not None for t in self.structure.equations[0].terms)
             if not drives or known:
-                yield Change(self._named(base), base)
+                yield Change(self._describe(base), base)
                 continue
             for term in drives:
-                yield from self._adding(base, term)
+                yield from self._with_term(base, term)
 
-    def top(self, variant: Variant) -> tuple[float | None, ...]:
+    def highest_orders(self, variant: Variant) -> tuple[float | None, ...]:
         """Integer values of the highest orders of a variant; None for a free one."""
-        held = variant.held()
+        held = variant.integer_order_values()
         return tuple(held.get(n) for n in sorted(self._highest))
 
-    def _named(self, variant: Variant) -> str:
-        return worded(self.build(variant))
+    def _describe(self, variant: Variant) -> str:
+        return describe_structure(self.build(variant))
 
     def _owns(self, term: Term) -> bool:
         return any(term in e.terms and term.signal == e.output for e in self.structure.equations)
@@ -210,7 +211,9 @@ class Inside:
                     continue
                 if term.order.is_single:
                     name = term.order.names[0]
-                    places = [v for v in self.wholes(name) if not own or (v < (highest or 0.0) and v not in taken)]
+                    places = [
+                        v for v in self.integer_values(name) if not own or (v < (highest or 0.0) and v not in taken)
+                    ]
                     if not places:
                         if term.coefficient in droppable:
                             continue
@@ -232,24 +235,24 @@ class Inside:
         variant = Variant(frozenset(kept), tuple(sorted(whole.items())), self.structure.offset == "constant")
         # Without own terms there is no equation before something drives it.
         alone = any(self._owns(t) for item in self.structure.equations for t in item.terms)
-        return variant if self.possible(variant) or not alone else None
+        return variant if self.is_valid(variant) or not alone else None
 
-    def _adding(self, variant: Variant, term: Term) -> Iterator[Change]:
+    def _with_term(self, variant: Variant, term: Term) -> Iterator[Change]:
         """Yield variants with one more term, its order at each of its integer values."""
         assert isinstance(term.coefficient, str)
         kept = variant.kept | {term.coefficient}
         if not term.order.names:
             grown = [replace(variant, kept=kept)]
-        elif term.order.is_single and term.order.names[0] not in variant.held():
+        elif term.order.is_single and term.order.names[0] not in variant.integer_order_values():
             name = term.order.names[0]
-            grown = [replace(variant, kept=kept).with_whole({name: v}) for v in self.wholes(name)]
+            grown = [replace(variant, kept=kept).with_integer_orders({name: v}) for v in self.integer_values(name)]
             if self._owns(term):
                 # Where every whole order is taken, it starts free.
-                grown = [v for v in grown if self.possible(v)] or [replace(variant, kept=kept)]
+                grown = [v for v in grown if self.is_valid(v)] or [replace(variant, kept=kept)]
         else:
             grown = [replace(variant, kept=kept)]
         for one in grown:
-            if self.possible(one):
+            if self.is_valid(one):
                 yield Change(f"+ {self._term_in(one, term)}", one)
 
     def _term_in(self, variant: Variant, term: Term) -> str:
@@ -263,7 +266,7 @@ class Inside:
         for item in self.structure.equations:
             for term in item.terms:
                 if term.coefficient in self.droppable and term.coefficient not in variant.kept:
-                    grown = [c.variant for c in self._adding(variant, term)]
+                    grown = [c.variant for c in self._with_term(variant, term)]
                     free = set(self.build(variant).order_names)
                     variant = next((v for v in grown if set(self.build(v).order_names) <= free), variant)
         return variant
@@ -273,19 +276,22 @@ class Inside:
         for item in self.structure.equations:
             for term in item.terms:
                 if term.coefficient in self.droppable and term.coefficient not in variant.kept:
-                    yield from self._adding(variant, term)
-        present = {n for n in self.build(variant.with_whole(dict.fromkeys(variant.held()))).order_names}
-        for name in variant.held():
+                    yield from self._with_term(variant, term)
+        present = {
+            n
+            for n in self.build(variant.with_integer_orders(dict.fromkeys(variant.integer_order_values()))).order_names
+        }
+        for name in variant.integer_order_values():
             if name in present:
-                yield Change(f"{name} free", variant.with_whole({name: None}))
+                yield Change(f"{name} free", variant.with_integer_orders({name: None}))
         if self.offset_allowed and not variant.offset:
             yield Change("an offset of each run", replace(variant, offset=True))
         for number in self.structure.free_inputs:
             if number.name not in variant.inputs:
                 yield Change(f"{number.name} free", replace(variant, inputs=variant.inputs | {number.name}))
         for name, below in self.frictions.items():
-            if name not in variant.rubs and (below is None or below in variant.rubs):
-                yield Change(name, replace(variant, rubs=variant.rubs | {name}))
+            if name not in variant.frictions and (below is None or below in variant.frictions):
+                yield Change(name, replace(variant, frictions=variant.frictions | {name}))
 
     def smaller(self, variant: Variant) -> Iterator[Change]:
         """Yield every variant with one term, free order or offset fewer."""
@@ -296,23 +302,23 @@ class Inside:
                 others = [t for t in item.terms if t is not term and (t.signal == item.output) == own]
                 if term.coefficient in self.droppable and others:
                     less = replace(variant, kept=variant.kept - {str(term.coefficient)})
-                    if self.possible(less):
+                    if self.is_valid(less):
                         yield Change(f"without {term}", less)
         for name in made.order_names:
-            for value in self.wholes(name):
-                less = variant.with_whole({name: value})
-                if self.possible(less):
+            for value in self.integer_values(name):
+                less = variant.with_integer_orders({name: value})
+                if self.is_valid(less):
                     yield Change(f"{name} = {value:g}", less)
         if self.offset_allowed and variant.offset:
             yield Change("without an offset", replace(variant, offset=False))
         for name in sorted(variant.inputs):
             yield Change(f"without {name}", replace(variant, inputs=variant.inputs - {name}))
-        for name in sorted(variant.rubs):
+        for name in sorted(variant.frictions):
             above = {n for n, below in self.frictions.items() if below == name}
-            yield Change(f"without {name}", replace(variant, rubs=variant.rubs - {name} - above))
+            yield Change(f"without {name}", replace(variant, frictions=variant.frictions - {name} - above))
 
 
-def worded(structure: Structure) -> str:
+def describe_structure(structure: Structure) -> str:
     """Return a structure as one line, with the free parameters of its inputs."""
     free = "".join(f", {item.words} free" for item in structure.free_inputs)
     return str(structure).replace("\n", "; ") + free
@@ -332,7 +338,7 @@ def signature(structure: Structure) -> str:
     return f"{parts} {rest} {[i.name for i in structure.free_inputs]}"
 
 
-def named(structures: Sequence[Structure] | Mapping[str, Structure]) -> dict[str, Structure]:
+def name_candidates(structures: Sequence[Structure] | Mapping[str, Structure]) -> dict[str, Structure]:
     """Return candidates by name, the default name being the equation; one with ``offset="auto"`` gives two candidates.
 
     Raises
@@ -343,7 +349,7 @@ def named(structures: Sequence[Structure] | Mapping[str, Structure]) -> dict[str
     items = (
         list(structures.items())
         if isinstance(structures, Mapping)
-        else [(worded(s) if isinstance(s, Structure) else "", s) for s in structures]
+        else [(describe_structure(s) if isinstance(s, Structure) else "", s) for s in structures]
     )
     if not items:
         raise ModelError("there are no candidates; give structures, or one structure whose inside is searched")

@@ -15,30 +15,30 @@ import numpy as np
 from ftlm._core import __version__
 from ftlm.data.run import Run
 from ftlm.errors import ConvergenceError, DataError, FtlmError, ModelError
-from ftlm.estimation.output_error import Growth, JointFit
+from ftlm.estimation.output_error import JointFit, UnstableOptimum
 from ftlm.order_search import checkpoint as frames
-from ftlm.order_search.checkpoint import SELECTION, Log
+from ftlm.order_search.checkpoint import SELECTION_FILE, FrameFile
 from ftlm.structure.structure import History, Initial, Structure
-from ftlm.structure_selection.best_subset import Screened
+from ftlm.structure_selection.best_subset import ScreenedSubset
 from ftlm.structure_selection.candidates import Change, Variant
 from ftlm.structure_selection.cross_validation import Trial
 from ftlm.utils.validation import Floats
 
 Made = TypeVar("Made")
 #: Version of fit and validation. Results of different versions must not be combined.
-ALGORITHM = 3
+ALGORITHM_VERSION = 3
 #: Errors of a candidate's fit. Any other error is a defect.
-End: TypeAlias = Literal["ConvergenceError", "DataError", "ModelError"]
-ENDS: dict[End, type[FtlmError]] = {
+ErrorName: TypeAlias = Literal["ConvergenceError", "DataError", "ModelError"]
+CANDIDATE_ERRORS: dict[ErrorName, type[FtlmError]] = {
     "ConvergenceError": ConvergenceError,
     "DataError": DataError,
     "ModelError": ModelError,
 }
 #: Size of a double [bytes].
-DOUBLE = 8
+DOUBLE_BYTES = 8
 
 
-def _plain(value: object) -> object:
+def _encode_numpy(value: object) -> object:
     """Convert NumPy numbers to Python numbers, and a history to its powers."""
     if isinstance(value, (np.floating, np.integer, np.bool_)):
         return value.item()
@@ -48,11 +48,11 @@ def _plain(value: object) -> object:
     raise NotImplementedError(type(value))
 
 
-ENCODER = msgspec.msgpack.Encoder(enc_hook=_plain)
+ANSWER_ENCODER = msgspec.msgpack.Encoder(enc_hook=_encode_numpy)
 
 
 def _digest(value: object) -> bytes:
-    return hashlib.blake2b(ENCODER.encode(value), digest_size=frames.DIGEST).digest()
+    return hashlib.blake2b(ANSWER_ENCODER.encode(value), digest_size=frames.DIGEST_BYTES).digest()
 
 
 class Request(msgspec.Struct, frozen=True, forbid_unknown_fields=True, tag="selection"):
@@ -68,11 +68,11 @@ class Request(msgspec.Struct, frozen=True, forbid_unknown_fields=True, tag="sele
     def of(cls, runs: Sequence[Run], candidates: object, judges: Sequence[Run], words: str) -> Request:
         """Build from runs, candidates, validation runs and the description of the validation."""
         return cls(
-            ALGORITHM,
+            ALGORITHM_VERSION,
             __version__,
-            _digest([_told(r) for r in runs]),
+            _digest([_run_content(r) for r in runs]),
             _digest(candidates),
-            _digest([words, [_told(r) for r in judges]]),
+            _digest([words, [_run_content(r) for r in judges]]),
         )
 
     def difference(self, other: Request) -> str | None:
@@ -81,28 +81,28 @@ class Request(msgspec.Struct, frozen=True, forbid_unknown_fields=True, tag="sele
         return next((said for n, said in words.items() if getattr(self, n) != getattr(other, n)), None)
 
 
-def _told(run: Run) -> list[object]:
+def _run_content(run: Run) -> list[object]:
     """Return all data of a run that affect a fit."""
-    own = run.readings
+    own = run.sample_times
     times = [] if own is None else [own.times.tobytes(), {n: v.tobytes() for n, v in own.data.items()}]
     samples = {n: np.ascontiguousarray(run[n], "<f8").tobytes() for n in run.signals}
     return [run.name, run.step, run.inputs, run.outputs, samples, run.units, run.intersample, times]
 
 
-class Refused(msgspec.Struct, frozen=True, forbid_unknown_fields=True, tag="refused"):
+class FitError(msgspec.Struct, frozen=True, forbid_unknown_fields=True, tag="refused"):
     """Error of a candidate's fit."""
 
-    kind: End
+    kind: ErrorName
     words: str
 
     @classmethod
-    def of(cls, error: FtlmError) -> Refused | None:
+    def of(cls, error: FtlmError) -> FitError | None:
         """Serialize an error; None for an internal error, which is no result of a candidate."""
-        return next((cls(n, str(error)) for n, kind in ENDS.items() if type(error) is kind), None)
+        return next((cls(n, str(error)) for n, kind in CANDIDATE_ERRORS.items() if type(error) is kind), None)
 
     def error(self) -> FtlmError:
         """Deserialize the error."""
-        return ENDS[self.kind](self.words)
+        return CANDIDATE_ERRORS[self.kind](self.words)
 
 
 class FitFile(msgspec.Struct, frozen=True, forbid_unknown_fields=True, tag="fit"):
@@ -131,18 +131,18 @@ class FitFile(msgspec.Struct, frozen=True, forbid_unknown_fields=True, tag="fit"
     @classmethod
     def of(cls, joint: JointFit) -> FitFile:
         """Serialize a least-squares fit with Wald intervals."""
-        growth = joint.growth
+        growth = joint.unstable_optimum
         return cls(
             joint.orders,
             joint.coefficients,
             joint.inputs,
             _bytes(joint.covariance),
-            _bytes(joint.on_grid),
+            _bytes(joint.finest_grid_values),
             joint.noise,
             joint.cost,
             joint.samples,
             joint.refinement,
-            joint.settled,
+            joint.step_converged,
             joint.converged,
             tuple(joint.starts),
             tuple({n: _bytes(e) for n, e in part.items()} for part in joint.residuals),
@@ -151,18 +151,18 @@ class FitFile(msgspec.Struct, frozen=True, forbid_unknown_fields=True, tag="fit"
             isinstance(joint.initial, History),
             joint.initial_terms,
             joint.origin,
-            None if growth is None else (growth.kept, growth.excess, growth.at_limit),
+            None if growth is None else (growth.is_accepted, growth.residual_excess, growth.at_stability_limit),
         )
 
     @property
     def _count(self) -> int:
         return len(self.orders) + len(self.coefficients) + len(self.inputs)
 
-    def problem(self) -> str | None:
+    def inconsistency(self) -> str | None:
         """Describe inconsistent data, or return None."""
-        if len(self.covariance) != DOUBLE * self._count**2 or len(self.on_grid) != DOUBLE * self._count:
+        if len(self.covariance) != DOUBLE_BYTES * self._count**2 or len(self.on_grid) != DOUBLE_BYTES * self._count:
             return f"a covariance or values of other than its {self._count} numbers"
-        if any(len(e) % DOUBLE for part in self.residuals for e in part.values()):
+        if any(len(e) % DOUBLE_BYTES for part in self.residuals for e in part.values()):
             return "residuals that are no doubles"
         if self.history and isinstance(self.initial, str):
             return f"a history that is no powers of t but {self.initial!r}"
@@ -188,9 +188,9 @@ class FitFile(msgspec.Struct, frozen=True, forbid_unknown_fields=True, tag="fit"
             dict(self.inputs),
             told,
             self.initial_terms,
-            on_grid=_array(self.on_grid),
+            finest_grid_values=_array(self.on_grid),
             origin=self.origin,
-            growth=None if self.growth is None else Growth(*self.growth),
+            unstable_optimum=None if self.growth is None else UnstableOptimum(*self.growth),
         )
 
 
@@ -213,16 +213,16 @@ class JudgementFile(msgspec.Struct, frozen=True, forbid_unknown_fields=True, tag
         """Serialize a trial."""
         validation = {n: dict(part) for n, part in trial.validation.items()}
         return cls(
-            trial.numbers,
+            trial.parameters,
             dict(trial.estimation),
             validation,
             trial.scores,
             dict(trial.values),
             dict(trial.errors),
-            trial.idle,
-            trial.grows,
+            trial.insignificant,
+            trial.unstable,
             trial.failed,
-            trial.fine,
+            trial.refined,
         )
 
     def trial(self, name: str, structure: Structure, joint: JointFit) -> Trial:
@@ -236,10 +236,10 @@ class JudgementFile(msgspec.Struct, frozen=True, forbid_unknown_fields=True, tag
             self.scores,
             values=self.values,
             errors=self.errors,
-            idle=self.idle,
-            grows=self.grows,
+            insignificant=self.idle,
+            unstable=self.grows,
             failed=self.failed,
-            fine=self.fine,
+            refined=self.fine,
             joint=None if self.failed is not None else joint,
         )
 
@@ -257,16 +257,16 @@ class SubsetFile(msgspec.Struct, frozen=True, forbid_unknown_fields=True):
     score: float
 
     @classmethod
-    def of(cls, one: Screened) -> SubsetFile:
+    def of(cls, one: ScreenedSubset) -> SubsetFile:
         """Serialize a subset."""
         v = one.change.variant
-        kept, inputs, rubs = (tuple(sorted(names)) for names in (v.kept, v.inputs, v.rubs))
-        return cls(one.change.words, kept, v.whole, v.offset, inputs, rubs, dict(one.start), one.score)
+        kept, inputs, rubs = (tuple(sorted(names)) for names in (v.kept, v.inputs, v.frictions))
+        return cls(one.change.words, kept, v.integer_orders, v.offset, inputs, rubs, dict(one.start), one.score)
 
-    def screened(self) -> Screened:
+    def to_subset(self) -> ScreenedSubset:
         """Deserialize the subset."""
         variant = Variant(frozenset(self.kept), self.whole, self.offset, frozenset(self.inputs), frozenset(self.rubs))
-        return Screened(Change(self.words, variant), self.start, self.score)
+        return ScreenedSubset(Change(self.words, variant), self.start, self.score)
 
 
 class SubsetsFile(msgspec.Struct, frozen=True, forbid_unknown_fields=True, tag="subsets"):
@@ -275,26 +275,26 @@ class SubsetsFile(msgspec.Struct, frozen=True, forbid_unknown_fields=True, tag="
     each: tuple[SubsetFile, ...]
 
     @classmethod
-    def of(cls, subsets: Sequence[Screened]) -> SubsetsFile:
+    def of(cls, subsets: Sequence[ScreenedSubset]) -> SubsetsFile:
         """Serialize all subsets."""
         return cls(tuple(SubsetFile.of(s) for s in subsets))
 
-    def subsets(self) -> list[Screened]:
+    def subsets(self) -> list[ScreenedSubset]:
         """Deserialize all subsets."""
-        return [s.screened() for s in self.each]
+        return [s.to_subset() for s in self.each]
 
 
-Answer = Refused | FitFile | JudgementFile | SubsetsFile
+Answer = FitError | FitFile | JudgementFile | SubsetsFile
 
 
-class Kept(msgspec.Struct, frozen=True, forbid_unknown_fields=True, tag="kept"):
+class StoredAnswer(msgspec.Struct, frozen=True, forbid_unknown_fields=True, tag="kept"):
     """Result of a step, with the digest of its arguments."""
 
     asked: bytes
     answer: Answer
 
 
-DECODER = msgspec.msgpack.Decoder(Request | Kept)
+ANSWER_DECODER = msgspec.msgpack.Decoder(Request | StoredAnswer)
 
 
 def _bytes(values: Floats) -> bytes:
@@ -311,18 +311,18 @@ class Store:
     def __init__(self, path: str | os.PathLike[str], request: Request) -> None:
         self._known: dict[bytes, Answer] = {}
         self._lock = threading.Lock()
-        self._log = Log(path, SELECTION, create=True)
+        self._log = FrameFile(path, SELECTION_FILE, create=True)
         try:
             data = self._log.read()
-            if self._log.unbegun(data):
-                data = self._log.begin(ENCODER.encode(request))
+            if self._log.has_no_frame(data):
+                data = self._log.begin(ANSWER_ENCODER.encode(request))
             self._take(data, request)
         except BaseException:
             self._log.close()
             raise
 
     def _take(self, data: bytes, request: Request) -> None:
-        path, offset, digest = self._log.path, len(SELECTION.magic), bytes(frames.DIGEST)
+        path, offset, digest = self._log.path, len(SELECTION_FILE.magic), bytes(frames.DIGEST_BYTES)
         view = memoryview(data)
         while offset < len(data):
             got = frames.next_frame(view, offset, digest)
@@ -332,15 +332,19 @@ class Store:
                 raise DataError(f"store {path} is damaged: {got}; choose another file, and leave this one")
             payload, digest, end = got
             try:
-                frame = DECODER.decode(payload)
+                frame = ANSWER_DECODER.decode(payload)
             except (msgspec.MsgspecError, ValueError, RecursionError, OverflowError) as error:
                 raise DataError(
                     f"store {path} holds something else at byte {offset}: {error}; choose another file"
                 ) from error
-            if isinstance(frame, Request) != (offset == len(SELECTION.magic)):
+            if isinstance(frame, Request) != (offset == len(SELECTION_FILE.magic)):
                 raise DataError(f"store {path} holds something else at byte {offset}; choose another file")
             # Digests tell what was damaged, not what was written wrong.
-            wrong = frame.answer.problem() if isinstance(frame, Kept) and isinstance(frame.answer, FitFile) else None
+            wrong = (
+                frame.answer.inconsistency()
+                if isinstance(frame, StoredAnswer) and isinstance(frame.answer, FitFile)
+                else None
+            )
             if wrong is not None:
                 raise DataError(f"store {path} holds a fit with {wrong} at byte {offset}; choose another file")
             if isinstance(frame, Request):
@@ -351,7 +355,7 @@ class Store:
             self._log.end, self._log.digest = end, digest
         if self._log.end < len(data):
             # What a kill left of the last frame.
-            self._log.cut()
+            self._log.truncate()
 
     def _check_same(self, asked: Request, held: Request) -> None:
         path = self._log.path
@@ -366,7 +370,7 @@ class Store:
             raise DataError(f"store {path} holds a selection {difference}; choose another file")
 
     def _other(self, asked: str, answer: Answer) -> DataError:
-        held = {FitFile: "a fit", Refused: "an error", JudgementFile: "a judgement", SubsetsFile: "subsets"}
+        held = {FitFile: "a fit", FitError: "an error", JudgementFile: "a judgement", SubsetsFile: "subsets"}
         return DataError(
             f"store {self._log.path} holds {held[type(answer)]} where {asked} was asked for; choose another file"
         )
@@ -374,7 +378,7 @@ class Store:
     def __len__(self) -> int:
         return len(self._known)
 
-    def recalled(
+    def recall_or_compute(
         self,
         asked: object,
         compute: Callable[[], Made],
@@ -391,7 +395,7 @@ class Store:
             if answer is None:
                 return made
             with self._lock:
-                self._log.append([ENCODER.encode(Kept(key, answer))])
+                self._log.append([ANSWER_ENCODER.encode(StoredAnswer(key, answer))])
                 self._known[key] = answer
         # What is given is always what the store gives back, so that one that goes on has the same bits.
         return read(answer)
@@ -408,18 +412,18 @@ class Store:
         def write(made: JointFit | FtlmError) -> Answer | None:
             if isinstance(made, JointFit):
                 return FitFile.of(made)
-            return Refused.of(made)
+            return FitError.of(made)
 
         def read(answer: Answer) -> JointFit | FtlmError:
             if isinstance(answer, FitFile):
                 return answer.joint()
-            if isinstance(answer, Refused):
+            if isinstance(answer, FitError):
                 return answer.error()
             raise self._other("a fit", answer)
 
-        return self.recalled(("fit", structure, [dict(s) for s in starts], refine), compute, write, read)
+        return self.recall_or_compute(("fit", structure, [dict(s) for s in starts], refine), compute, write, read)
 
-    def judgement(
+    def validation(
         self, name: str, structure: Structure, joint: JointFit, fine: bool, compute: Callable[[], Trial]
     ) -> Trial:
         """Return the trial of a fitted candidate on validation data."""
@@ -430,17 +434,17 @@ class Store:
             return answer.trial(name, structure, joint)
 
         asked = ("judge", structure, joint.names, _bytes(joint.values), joint.initial, fine)
-        return self.recalled(asked, compute, JudgementFile.of, read)
+        return self.recall_or_compute(asked, compute, JudgementFile.of, read)
 
-    def subsets(self, structure: Structure, compute: Callable[[], list[Screened]]) -> list[Screened]:
+    def subsets(self, structure: Structure, compute: Callable[[], list[ScreenedSubset]]) -> list[ScreenedSubset]:
         """Return all screened subsets."""
 
-        def read(answer: Answer) -> list[Screened]:
+        def read(answer: Answer) -> list[ScreenedSubset]:
             if not isinstance(answer, SubsetsFile):
                 raise self._other("subsets", answer)
             return answer.subsets()
 
-        return self.recalled(("subsets", structure), compute, SubsetsFile.of, read)
+        return self.recall_or_compute(("subsets", structure), compute, SubsetsFile.of, read)
 
     def close(self) -> None:
         """Close the file and release the lock."""

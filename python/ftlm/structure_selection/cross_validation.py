@@ -10,7 +10,7 @@ from dataclasses import dataclass, field, replace
 import numpy as np
 
 from ftlm.data.run import Run, as_runs
-from ftlm.data.sampling import read
+from ftlm.data.sampling import drop_missing
 from ftlm.errors import DataError, FtlmError, ModelError
 from ftlm.estimation.free_parameters import FreeProblem
 from ftlm.estimation.output_error import JointFit, fit_output_error
@@ -18,17 +18,17 @@ from ftlm.model.model import Model
 from ftlm.simulation.discretization import prepare
 from ftlm.simulation.simulate import simulate
 from ftlm.structure.structure import Structure
-from ftlm.utils.linalg import length
-from ftlm.utils.statistics import colour
+from ftlm.utils.linalg import vector_norm
+from ftlm.utils.statistics import variance_inflation
 from ftlm.validation.comparison import compare
 
 #: Number of blocks of a run, and minimum number of samples of a block.
-BLOCKS = 4
-LEAST_BLOCK = 50
+BLOCKS_PER_RUN = 4
+MIN_BLOCK_SAMPLES = 50
 #: Relative tolerance of simulations on a block.
-TOLERANCE = 1e-4
+SIMULATION_TOLERANCE = 1e-4
 #: Lower limit of the fit [%] in scores; diverging candidates are not distinguished.
-LOST = -100.0
+MIN_FIT_PERCENT = -100.0
 
 
 @dataclass(frozen=True)
@@ -36,22 +36,22 @@ class Fold:
     """Estimation runs and validation data: another run, or samples of a run that are masked in the fit."""
 
     runs: tuple[Run, ...]
-    judged: Run
+    validation_run: Run
     rows: tuple[int, int] | None = None
 
     @property
     def name(self) -> str:
         """Name of the validation data."""
         if self.rows is None:
-            return self.judged.name
-        step = self.judged.step
-        return f"{self.judged.name} {self.rows[0] * step:g}-{self.rows[1] * step:g} s"
+            return self.validation_run.name
+        step = self.validation_run.step
+        return f"{self.validation_run.name} {self.rows[0] * step:g}-{self.rows[1] * step:g} s"
 
-    def seen(self, outputs: Sequence[str]) -> tuple[Run, ...]:
+    def estimation_runs(self, outputs: Sequence[str]) -> tuple[Run, ...]:
         """Runs for the fit, with the validation samples of the given outputs masked."""
         if self.rows is None:
             return self.runs
-        return tuple(masked(r, outputs, self.rows) if r is self.judged else r for r in self.runs)
+        return tuple(mask_outputs(r, outputs, self.rows) if r is self.validation_run else r for r in self.runs)
 
     def fit_percent(self, model: Model) -> dict[str, float]:
         """Return the fit of a simulation on the validation data in percent, by output.
@@ -62,22 +62,24 @@ class Fold:
         """
         outputs = model.outputs
         if self.rows is None:
-            return dict(compare(model, self.judged).fit_percent)
+            return dict(compare(model, self.validation_run).fit_percent)
         # Later rows tell nothing of motion from before the start that has died away by then.
         moving = self.rows[0] == 0 and model.structure.initial != "rest"
-        before = compare(model, self.judged if moving else masked(self.judged, outputs, self.rows))
-        answer = simulate(model, self.judged, tolerance=TOLERANCE, initial=before.initial[0])
+        before = compare(
+            model, self.validation_run if moving else mask_outputs(self.validation_run, outputs, self.rows)
+        )
+        answer = simulate(model, self.validation_run, tolerance=SIMULATION_TOLERANCE, initial=before.initial[0])
         out = {}
         for name in outputs:
-            measured, free = (r[name][self.rows[0] : self.rows[1]] for r in (self.judged, answer))
+            measured, free = (r[name][self.rows[0] : self.rows[1]] for r in (self.validation_run, answer))
             known = np.isfinite(measured)
             missed, size = measured[known] - free[known], measured[known] - np.mean(measured[known])
-            share = length(missed) / max(length(size), 1e-300)
+            share = vector_norm(missed) / max(vector_norm(size), 1e-300)
             out[name] = 100.0 * (1.0 - share)
         return out
 
 
-def masked(run: Run, outputs: Sequence[str], rows: tuple[int, int]) -> Run:
+def mask_outputs(run: Run, outputs: Sequence[str], rows: tuple[int, int]) -> Run:
     """Return a run with missing output samples in a range of rows."""
     signals = {n: np.array(run[n]) for n in run.outputs}
     for name in outputs:
@@ -109,7 +111,7 @@ class Folds:
 
     runs: tuple[Run, ...]
     parts: tuple[Fold, ...]
-    words: str
+    description: str
 
     @classmethod
     def of(cls, runs: Run | Sequence[Run], validation: str | Run | Sequence[Run]) -> Folds:
@@ -148,7 +150,7 @@ class Folds:
             return cls(every, tuple(parts), f"each of {len(every)} runs by the others")
         if validation != "blocks":
             raise ModelError(f"validation = {validation!r} is not known; use 'runs', 'blocks', or a run")
-        parts = [Fold(every, run, rows) for run in every for rows in blocks(run)]
+        parts = [Fold(every, run, rows) for run in every for rows in block_ranges(run)]
         return cls(every, tuple(parts), f"each of {len(parts)} blocks, its outputs unread, by the rest")
 
 
@@ -158,13 +160,14 @@ def _same(one: Run, other: Run) -> bool:
     return one.length == other.length and all(np.array_equal(one[n], other[n], equal_nan=True) for n in names)
 
 
-def blocks(run: Run) -> list[tuple[int, int]]:
+def block_ranges(run: Run) -> list[tuple[int, int]]:
     """Return row ranges of blocks of nearly equal length."""
-    if run.length < LEAST_BLOCK * BLOCKS:
+    if run.length < MIN_BLOCK_SAMPLES * BLOCKS_PER_RUN:
         raise DataError(
-            f"{run.name} has {run.length} rows, too few to be cut into {BLOCKS} blocks; give validation= another run"
+            f"{run.name} has {run.length} rows, too few to be cut into {BLOCKS_PER_RUN} blocks; give validation= "
+            "another run"
         )
-    return list(itertools.pairwise(np.linspace(0, run.length, BLOCKS + 1).astype(int).tolist()))
+    return list(itertools.pairwise(np.linspace(0, run.length, BLOCKS_PER_RUN + 1).astype(int).tolist()))
 
 
 @dataclass(frozen=True)
@@ -204,18 +207,18 @@ class Trial:
 
     name: str
     structure: Structure
-    numbers: int
+    parameters: int
     estimation: Mapping[str, float] = field(default_factory=dict)
     validation: Mapping[str, Mapping[str, float]] = field(default_factory=dict)
     scores: tuple[float, ...] = ()
     bic: float | None = None
     values: Mapping[str, float] = field(default_factory=dict)
     errors: Mapping[str, float] = field(default_factory=dict)
-    idle: tuple[str, ...] = ()
-    grows: bool = False
+    insignificant: tuple[str, ...] = ()
+    unstable: bool = False
     failed: str | None = None
     joint: JointFit | None = field(default=None, repr=False)
-    fine: bool = False
+    refined: bool = False
 
     @property
     def score(self) -> float:
@@ -223,7 +226,7 @@ class Trial:
         return float(np.mean(self.scores)) if self.scores else math.inf
 
     @property
-    def unseen(self) -> float:
+    def validation_fit(self) -> float:
         """Mean fit in percent on validation data."""
         fits = [v for part in self.validation.values() for v in part.values()]
         return float(np.mean(fits)) if fits else math.nan
@@ -234,30 +237,30 @@ class Trial:
         return {f"{output} of {name}": fit for name, part in self.validation.items() for output, fit in part.items()}
 
     @property
-    def least(self) -> float:
+    def worst_fold(self) -> float:
         """Worst fit in percent on validation data."""
         return min(self.parts.values(), default=math.nan)
 
     @property
-    def looseness(self) -> float:
+    def mean_relative_error(self) -> float:
         """Mean log relative standard error of the parameters; lower is better."""
         relative = [self.errors.get(n, math.inf) / max(abs(v), 1e-12) for n, v in self.values.items()]
         return float(np.mean([math.log(min(max(r, 1e-12), 1e12)) for r in relative])) if relative else 0.0
 
     @property
-    def seen(self) -> float:
+    def estimation_fit(self) -> float:
         """Mean fit in percent on estimation data."""
         return float(np.mean(list(self.estimation.values()))) if self.estimation else math.nan
 
 
-def decided(structure: Structure, runs: Sequence[Run]) -> Structure:
+def fix_initial_conditions(structure: Structure, runs: Sequence[Run]) -> Structure:
     """Return the structure with fixed initial conditions: none from rest, else Caputo's for any orders.
 
     A history has more terms the more orders are free, so a richer candidate could fit more than its model explains.
     """
     if structure.initial != "auto":
         return structure
-    start = prepare(runs, structure.as_given(), None, power_of_two=False, gaps=True)[0].initial
+    start = prepare(runs, structure.without_input_nonlinearities(), None, power_of_two=False, gaps=True)[0].initial
     return replace(structure, initial="rest" if start == "rest" else "caputo")
 
 
@@ -276,7 +279,7 @@ def fit(
     Friction missing in the initial guesses may have no descent direction at 0. Automatic initial guesses are then added
     to the given ones, in which it is 0.
     """
-    asked = decided(structure, runs)
+    asked = fix_initial_conditions(structure, runs)
     if near is not None:
         return fit_output_error(runs, asked, refine=refine, near=near)
     problem = FreeProblem.of(asked)
@@ -294,10 +297,10 @@ def fit(
     if not ends:
         assert last is not None
         raise last
-    return min(ends, key=power)
+    return min(ends, key=log_residual_power)
 
 
-def power(joint: JointFit) -> float:
+def log_residual_power(joint: JointFit) -> float:
     """Mean over outputs of ln of the mean square residual, unweighted."""
     return float(np.mean([2.0 * math.log(max(v, 1e-300)) for v in joint.noise.values()]))
 
@@ -305,47 +308,56 @@ def power(joint: JointFit) -> float:
 def model_of(structure: Structure, joint: JointFit, runs: Sequence[Run]) -> Model:
     """Return a fit as a model."""
     problem = FreeProblem.of(replace(structure, initial=joint.initial))
-    numbers = problem.named(list(joint.coefficients.values()))
-    made = decided(structure, runs).with_orders(joint.orders).with_coefficients(numbers).with_inputs(joint.inputs)
+    numbers = problem.coefficients_by_name(list(joint.coefficients.values()))
+    made = (
+        fix_initial_conditions(structure, runs)
+        .with_orders(joint.orders)
+        .with_coefficients(numbers)
+        .with_inputs(joint.inputs)
+    )
     return Model(made, orders=joint.orders)
 
 
-def judged(name: str, structure: Structure, folds: Folds, joint: JointFit, *, fine: bool = False) -> Trial:
+def validate_fit(name: str, structure: Structure, folds: Folds, joint: JointFit, *, fine: bool = False) -> Trial:
     """Refit a candidate on each fold from its fit on all runs, and evaluate it on the validation data."""
     model = model_of(structure, joint, folds.runs)
     estimation = compare(model, list(folds.runs)).fit_percent
     grows = not structure.has_friction and model.stability(coupling=structure.coupling).unstable_poles > 0
     start = dict(zip(joint.names, joint.values.tolist(), strict=True))
     # Fine, it was found on half its step as well: each fold tells from the same two grids whether they matter.
-    near = replace(joint, refinement=max(1, joint.refinement // 2)) if fine and joint.settled else joint
+    near = replace(joint, refinement=max(1, joint.refinement // 2)) if fine and joint.step_converged else joint
     validation: dict[str, dict[str, float]] = {}
     for fold in folds.parts:
-        runs = fold.seen(structure.outputs)
+        runs = fold.estimation_runs(structure.outputs)
         try:
             own = joint if runs is folds.runs else fit(runs, structure, [], near=near)
             validation[fold.name] = fold.fit_percent(model_of(structure, own, folds.runs))
         except FtlmError as error:
             # What is wrong is wrong with what is left, not with the runs as they were given.
             raise type(error)(f"without {fold.name}: {error}") from error
-    fits = [max(v, LOST) if math.isfinite(v) else LOST for part in validation.values() for v in part.values()]
+    fits = [
+        max(v, MIN_FIT_PERCENT) if math.isfinite(v) else MIN_FIT_PERCENT
+        for part in validation.values()
+        for v in part.values()
+    ]
     scores = tuple(math.log(max(1.0 - v / 100.0, 1e-12)) for v in fits)
     return Trial(
         name,
         structure,
-        numbers_of(structure, joint, folds),
+        parameter_count(structure, joint, folds),
         dict(estimation),
         validation,
         scores,
         values=start,
         errors=joint.standard_errors,
-        idle=idle(joint),
-        grows=grows,
+        insignificant=insignificant_coefficients(joint),
+        unstable=grows,
         joint=joint,
-        fine=fine,
+        refined=fine,
     )
 
 
-def least_unseen(joint: JointFit, folds: Folds) -> float:
+def validation_score_bound(joint: JointFit, folds: Folds) -> float:
     """Lower bound of the score on validation data from the fit on all runs; -infinity if there is none.
 
     A fit without a fold has at least the residual of the full fit on all runs, and at most its residual on the rest. So
@@ -354,29 +366,29 @@ def least_unseen(joint: JointFit, folds: Folds) -> float:
     """
     if not joint.converged:
         return -math.inf
-    pooled = {o: read(np.concatenate([part[o] for part in joint.residuals])) for o in joint.noise}
+    pooled = {o: drop_missing(np.concatenate([part[o] for part in joint.residuals])) for o in joint.noise}
     # Residuals are over the noise that they were weighted with.
     scale = {o: v / max(float(np.sqrt(np.mean(pooled[o] ** 2))), 1e-300) for o, v in joint.noise.items()}
     scores = []
     for fold in folds.parts:
-        place = next((k for k, run in enumerate(folds.runs) if run is fold.judged), None)
+        place = next((k for k, run in enumerate(folds.runs) if run is fold.validation_run), None)
         if place is None:
             return -math.inf
-        first, last = fold.rows or (0, fold.judged.length)
+        first, last = fold.rows or (0, fold.validation_run.length)
         if fold.rows is not None and first == 0 and joint.initial != "rest":
             # Judged with initial terms that all rows tell of, which may leave less there.
             return -math.inf
         for output, residuals in joint.residuals[place].items():
-            if residuals.size != fold.judged.length - 2:
+            if residuals.size != fold.validation_run.length - 2:
                 return -math.inf
-            left, there = residuals[max(first - 1, 0) : last - 1], fold.judged[output][first:last]
-            size = length(there - np.nanmean(there))
-            share = scale[output] * length(read(left)) / max(size, 1e-300)
-            scores.append(math.log(min(max(share, 1e-12), 1.0 - LOST / 100.0)))
+            left, there = residuals[max(first - 1, 0) : last - 1], fold.validation_run[output][first:last]
+            size = vector_norm(there - np.nanmean(there))
+            share = scale[output] * vector_norm(drop_missing(left)) / max(size, 1e-300)
+            scores.append(math.log(min(max(share, 1e-12), 1.0 - MIN_FIT_PERCENT / 100.0)))
     return float(np.mean(scores))
 
 
-def refined(trial: Trial, folds: Folds, joint: JointFit) -> Trial:
+def update_trial(trial: Trial, folds: Folds, joint: JointFit) -> Trial:
     """Return a trial with a fit on all runs on grids refined until converged."""
     estimation = compare(model_of(trial.structure, joint, folds.runs), list(folds.runs)).fit_percent
     return replace(
@@ -384,30 +396,30 @@ def refined(trial: Trial, folds: Folds, joint: JointFit) -> Trial:
         joint=joint,
         estimation=dict(estimation),
         errors=joint.standard_errors,
-        idle=idle(joint),
-        fine=True,
+        insignificant=insignificant_coefficients(joint),
+        refined=True,
         values=dict(zip(joint.names, joint.values.tolist(), strict=True)),
     )
 
 
-def idle(joint: JointFit) -> tuple[str, ...]:
+def insignificant_coefficients(joint: JointFit) -> tuple[str, ...]:
     """Coefficients that do not differ significantly from 0."""
     intervals = joint.intervals
     return tuple(n for n in joint.coefficients if intervals[n][0] <= 0.0 <= intervals[n][1])
 
 
-def numbers_of(structure: Structure, joint: JointFit, folds: Folds) -> int:
+def parameter_count(structure: Structure, joint: JointFit, folds: Folds) -> int:
     """Number of estimated parameters."""
     each = {"none": 0, "auto": 0, "constant": 1, "ramp": 2}[structure.offset]
     return len(joint.names) + each * len(structure.equations) * len(folds.runs)
 
 
-def spread(joint: JointFit) -> float:
+def scatter_factor(joint: JointFit) -> float:
     """Largest ratio of the variance of sums of residuals to that of white noise, at least 1."""
-    return max([1.0, *(colour(read(e)) for part in joint.residuals for e in part.values())])
+    return max([1.0, *(variance_inflation(drop_missing(e)) for part in joint.residuals for e in part.values())])
 
 
-def criterion(joint: JointFit, numbers: int, scatter: float) -> float:
+def schwarz_criterion(joint: JointFit, numbers: int, scatter: float) -> float:
     """Schwarz's criterion with `scatter` samples per effective sample; doi:10.1214/aos/1176344136."""
     samples = joint.samples / scatter
     each = samples / max(len(joint.noise), 1)

@@ -7,22 +7,22 @@ from dataclasses import dataclass, field
 from typing import Any
 
 from ftlm.estimation.result import Identification
-from ftlm.structure_selection.cross_validation import LOST, Trial
+from ftlm.structure_selection.cross_validation import MIN_FIT_PERCENT, Trial
 from ftlm.svg.figure import Figure
-from ftlm.svg.html_page import Page, Reported, Section, Table
+from ftlm.svg.html_page import Page, ReportMixin, Section, Table
 from ftlm.svg.line_chart import line_chart
 from ftlm.utils.files import to_frame
 from ftlm.utils.formatting import Cell
 from ftlm.validation.comparison import finite
 
 #: Maximum number of printed rows, and the fit [%] below which values are not distinguished.
-SHOWN, HOPELESS = 12, -1000.0
+MAX_PRINTED_ROWS, MIN_PRINTED_FIT_PERCENT = 12, -1000.0
 #: Note on an unstable candidate.
-GROWS = " (grows without bound)"
+UNSTABLE_NOTE = " (grows without bound)"
 
 
 @dataclass(frozen=True)
-class Selection(Reported):
+class Selection(ReportMixin):
     """Candidates evaluated on runs, the chosen one, and the reason.
 
     Parameters
@@ -62,10 +62,20 @@ class Selection(Reported):
         for place, trial in enumerate(self.trials):
             mark = "chosen: " if place == self.chosen else ""
             if trial.failed is not None:
-                out.append([f"{trial.name}: {trial.failed}", trial.numbers, None, None, None, None, ""])
+                out.append([f"{trial.name}: {trial.failed}", trial.parameters, None, None, None, None, ""])
                 continue
-            name = mark + trial.name + (GROWS if trial.grows else "")
-            out.append([name, trial.numbers, trial.seen, trial.unseen, trial.least, trial.bic, ", ".join(trial.idle)])
+            name = mark + trial.name + (UNSTABLE_NOTE if trial.unstable else "")
+            out.append(
+                [
+                    name,
+                    trial.parameters,
+                    trial.estimation_fit,
+                    trial.validation_fit,
+                    trial.worst_fold,
+                    trial.bic,
+                    ", ".join(trial.insignificant),
+                ]
+            )
         return out
 
     def table(self) -> Table:
@@ -92,11 +102,14 @@ class Selection(Reported):
         """Chart estimation and validation fit of the best candidate with each number of parameters."""
         best: dict[int, Trial] = {}
         for trial in (t for t in self.trials if t.failed is None):
-            if trial.numbers not in best or trial.score < best[trial.numbers].score:
-                best[trial.numbers] = trial
+            if trial.parameters not in best or trial.score < best[trial.parameters].score:
+                best[trial.parameters] = trial
         along = sorted(best)
-        seen, unseen = [best[n].seen for n in along], [max(best[n].unseen, LOST) for n in along]
-        chosen = [v if n == self.winner.numbers else math.nan for n, v in zip(along, unseen, strict=True)]
+        seen, unseen = (
+            [best[n].estimation_fit for n in along],
+            [max(best[n].validation_fit, MIN_FIT_PERCENT) for n in along],
+        )
+        chosen = [v if n == self.winner.parameters else math.nan for n, v in zip(along, unseen, strict=True)]
         return line_chart(
             [float(n) for n in along],
             [("where fitted", seen), ("where unseen", unseen), ("chosen", chosen)],
@@ -104,7 +117,7 @@ class Selection(Reported):
             x_label="numbers estimated",
             y_label="fit in %",
             dots=("chosen",),
-            caption=f"The best candidate with each number of estimates; chosen is one with {self.winner.numbers}.",
+            caption=f"The best candidate with each number of estimates; chosen is one with {self.winner.parameters}.",
         )
 
     def _page(self) -> Page:
@@ -126,10 +139,10 @@ class Selection(Reported):
             {
                 "rank": k + 1,
                 "structure": t.name,
-                "numbers": t.numbers,
-                "seen": t.seen,
-                "unseen": t.unseen,
-                "least": t.least,
+                "numbers": t.parameters,
+                "seen": t.estimation_fit,
+                "unseen": t.validation_fit,
+                "least": t.worst_fold,
                 "score": t.score,
                 "bic": math.nan if t.bic is None else t.bic,
                 "chosen": k == self.chosen,
@@ -149,15 +162,15 @@ class Selection(Reported):
             "candidates": [
                 {
                     "structure": t.name,
-                    "numbers": t.numbers,
+                    "numbers": t.parameters,
                     "estimation": dict(t.estimation),
                     "validation": {n: dict(v) for n, v in t.validation.items()},
                     "score": finite(t.score),
                     "bic": None if t.bic is None else finite(t.bic),
                     "values": dict(t.values),
                     "standard_errors": {n: finite(e) for n, e in t.errors.items()},
-                    "idle": list(t.idle),
-                    "grows": t.grows,
+                    "idle": list(t.insignificant),
+                    "grows": t.unstable,
                     "failed": t.failed,
                 }
                 for t in self.trials
@@ -169,13 +182,13 @@ class Selection(Reported):
     def __str__(self) -> str:
         lines = [f"{len(self.trials)} of {self.fitted} fitted candidates judged: {self.validation}"]
         lines.append(f"{'':2}{'unseen %':>9}{'least %':>9}{'fitted %':>10}{'numbers':>9}  structure")
-        for place, trial in enumerate(self.trials[:SHOWN]):
+        for place, trial in enumerate(self.trials[:MAX_PRINTED_ROWS]):
             mark = "> " if place == self.chosen else "  "
             lines.append(mark + _row(trial))
-        if self.chosen >= SHOWN:
+        if self.chosen >= MAX_PRINTED_ROWS:
             lines.append("> " + _row(self.winner))
-        if len(self.trials) > SHOWN:
-            lines.append(f"  … and {len(self.trials) - SHOWN} more")
+        if len(self.trials) > MAX_PRINTED_ROWS:
+            lines.append(f"  … and {len(self.trials) - MAX_PRINTED_ROWS} more")
         lines += [self.reason, *(f"warning: {w}" for w in self.warnings), "", str(self.best)]
         return "\n".join(lines)
 
@@ -183,11 +196,12 @@ class Selection(Reported):
 def _row(trial: Trial) -> str:
     """Text line of a candidate."""
     if trial.failed is not None:
-        return f"{'-':>9}{'-':>9}{'-':>10}{trial.numbers:>9}  {trial.name}: {trial.failed}"
-    told = trial.name + (GROWS if trial.grows else "")
-    return f"{percent(trial.unseen):>9}{percent(trial.least):>9}{percent(trial.seen):>10}{trial.numbers:>9}  {told}"
+        return f"{'-':>9}{'-':>9}{'-':>10}{trial.parameters:>9}  {trial.name}: {trial.failed}"
+    told = trial.name + (UNSTABLE_NOTE if trial.unstable else "")
+    validation, worst = format_fit(trial.validation_fit), format_fit(trial.worst_fold)
+    return f"{validation:>9}{worst:>9}{format_fit(trial.estimation_fit):>10}{trial.parameters:>9}  {told}"
 
 
-def percent(fit: float) -> str:
+def format_fit(fit: float) -> str:
     """Format a fit; values below the minimum are not distinguished."""
-    return f"{fit:.2f}" if not fit < HOPELESS else f"< {HOPELESS:.0f}"
+    return f"{fit:.2f}" if not fit < MIN_PRINTED_FIT_PERCENT else f"< {MIN_PRINTED_FIT_PERCENT:.0f}"

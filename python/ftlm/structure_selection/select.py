@@ -17,17 +17,23 @@ from ftlm.order_search.options import Settings
 from ftlm.simulation.discretization import prepare
 from ftlm.structure.parser import equation
 from ftlm.structure.structure import Structure
-from ftlm.structure_selection.candidates import Inside, named, signature, worded
+from ftlm.structure_selection.candidates import NestedStructures, describe_structure, name_candidates, signature
 from ftlm.structure_selection.checkpoint import Request, Store
-from ftlm.structure_selection.cross_validation import Folds, Trial, criterion, spread
-from ftlm.structure_selection.result import Selection, percent
-from ftlm.structure_selection.stepwise import MOST_ALIKE, SAME, Work, grown, listed
+from ftlm.structure_selection.cross_validation import Folds, Trial, scatter_factor, schwarz_criterion
+from ftlm.structure_selection.result import Selection, format_fit
+from ftlm.structure_selection.stepwise import (
+    MAX_SCORE_TOLERANCE,
+    SCORE_TOLERANCE,
+    CandidateEvaluator,
+    evaluate_list,
+    select_stepwise,
+)
 
 #: Integer values of the highest order of the candidates.
-ORDERS = (1, 2, 3, 4)
+AUTOMATIC_ORDERS = (1, 2, 3, 4)
 
 
-def automatic(runs: Sequence[Run], output: str | None = None) -> list[Structure]:
+def automatic_structures(runs: Sequence[Run], output: str | None = None) -> list[Structure]:
     """Return equations of one output with every input as an upper bound for the selection, one for each integer order.
 
     Each has all derivatives of the output below its order and each input. The highest order and those of one own term
@@ -51,10 +57,10 @@ def automatic(runs: Sequence[Run], output: str | None = None) -> list[Structure]
     if not first.inputs:
         raise ModelError("the runs have no input, and structure='auto' needs one; name inputs when loading")
     made = []
-    for order in ORDERS:
+    for order in AUTOMATIC_ORDERS:
         own = [f"a{k} D^mu{k} {output}" for k in range(order - 1, 0, -1)] + [f"a0 {output}"]
         driving = [f"b{j} D^gamma{j} {name}" for j, name in enumerate(first.inputs, 1)]
-        orders = {f"gamma{j}": _reach(first, name, order) for j, name in enumerate(first.inputs, 1)}
+        orders = {f"gamma{j}": _input_order_range(first, name, order) for j, name in enumerate(first.inputs, 1)}
         orders["alpha"] = (max(order - 0.9, 0.1), order + 0.9, 0.1)
         orders |= {f"mu{k}": (max(k - 0.9, 0.05), k + 0.9, 0.05) for k in range(1, order)}
         text = f"D^alpha {output} = {' + '.join([*own, *driving])}"
@@ -62,21 +68,21 @@ def automatic(runs: Sequence[Run], output: str | None = None) -> list[Structure]
     return made
 
 
-def _reach(run: Run, name: str, order: int) -> tuple[float, float, float]:
+def _input_order_range(run: Run, name: str, order: int) -> tuple[float, float, float]:
     """Range (low, high, increment) of the order of an input."""
     return (0.0, float(order) if run.intersample[name] == "foh" else max(order - 1.0, 0.05), 0.05)
 
 
 #: Difference of Schwarz criteria that is not significant; doi:10.1080/01621459.1995.10476572.
-ALIKE = 2.0
+BIC_TOLERANCE = 2.0
 #: Difference of Schwarz criteria that is very strong evidence; the same source.
-STRONG = 10.0
+BIC_STRONG_EVIDENCE = 10.0
 #: Minimum number of folds for a test on their scatter, and one-sided 95 % quantiles of Student's t from there on.
-FOLDS, STUDENT_95 = 3, (2.92, 2.35, 2.13, 2.02, 1.94, 1.89, 1.86, 1.83, 1.81)
+MIN_SCATTER_FOLDS, STUDENT_QUANTILES_95 = 3, (2.92, 2.35, 2.13, 2.02, 1.94, 1.89, 1.86, 1.83, 1.81)
 #: Score above which a candidate fails on a part, if it also exceeds the best score there by the second value.
-FAILS, OUTDONE = math.log(0.5), math.log(2.0)
+FAILURE_SCORE, FAILURE_SCORE_GAP = math.log(0.5), math.log(2.0)
 #: Maximum number of listed candidates.
-MOST = 10_000
+MAX_CANDIDATES = 10_000
 
 
 def select(
@@ -156,118 +162,138 @@ def select(
             f"candidates is {type(candidates).__name__}; use ftlm.equation(…), a list or a dictionary of structures, "
             "or 'auto'"
         )
-    if not isinstance(candidates, (str, Structure)) and len(candidates) > MOST:
+    if not isinstance(candidates, (str, Structure)) and len(candidates) > MAX_CANDIDATES:
         raise ModelError(
-            f"{len(candidates)} candidates are more than {MOST}; give one structure instead, whose inside is grown "
+            f"{len(candidates)} candidates are more than {MAX_CANDIDATES}; give one structure instead, whose inside "
+            "is grown "
             "step by step"
         )
-    every = named(candidates) if not isinstance(candidates, (str, Structure)) else {}
+    every = name_candidates(candidates) if not isinstance(candidates, (str, Structure)) else {}
     if isinstance(candidates, str) and candidates != "auto":
         raise ModelError(f"candidates = {candidates!r}; use 'auto', ftlm.equation(…), or a list of structures")
-    searched = automatic(folds.runs) if isinstance(candidates, str) else []
+    searched = automatic_structures(folds.runs) if isinstance(candidates, str) else []
     searched += [candidates] if isinstance(candidates, Structure) else []
-    idle = [worded(s) for s in (*searched, *every.values()) if not FreeProblem.of(s).names]
+    idle = [describe_structure(s) for s in (*searched, *every.values()) if not FreeProblem.of(s).names]
     if idle:
         raise ModelError(
             f"{idle[0]} has nothing to estimate; name a coefficient or an order, or use model.compare(runs)"
         )
     for structure in (*searched, *every.values()):
         # Refused here, once, and not as a failure of every candidate.
-        prepare(folds.runs, replace(structure.as_given(), offset="none"), None, power_of_two=False, gaps=True)
+        prepare(
+            folds.runs,
+            replace(structure.without_input_nonlinearities(), offset="none"),
+            None,
+            power_of_two=False,
+            gaps=True,
+        )
     if store is None:
-        return _found(Work(folds, workers, progress), searched, every)
-    judges = [f.judged for f in folds.parts if not any(f.judged is r for r in folds.runs)]
-    asked = Request.of(folds.runs, [searched, every], judges, folds.words)
+        return _run_selection(CandidateEvaluator(folds, workers, progress), searched, every)
+    judges = [f.validation_run for f in folds.parts if not any(f.validation_run is r for r in folds.runs)]
+    asked = Request.of(folds.runs, [searched, every], judges, folds.description)
     with Store(store, asked) as kept:
-        return _found(Work(folds, workers, progress, store=kept), searched, every)
+        return _run_selection(CandidateEvaluator(folds, workers, progress, store=kept), searched, every)
 
 
-def _found(work: Work, searched: Sequence[Structure], every: Mapping[str, Structure]) -> Selection:
+def _run_selection(
+    work: CandidateEvaluator, searched: Sequence[Structure], every: Mapping[str, Structure]
+) -> Selection:
     """Evaluate nested and listed structures, and choose."""
     for structure in searched:
-        grown(Inside(structure), work)
+        select_stepwise(NestedStructures(structure), work)
     if every:
-        listed(every, work)
-    return _chosen(work, work.folds)
+        evaluate_list(every, work)
+    return _choose(work, work.folds)
 
 
-def _chosen(work: Work, folds: Folds) -> Selection:
+def _choose(work: CandidateEvaluator, folds: Folds) -> Selection:
     """Rank the trials, choose one, and identify its structure."""
     there = [t for t in work.trials if t.joint is not None]
     if not there:
         why = next((f"; {t.name}: {t.failed}" for t in work.trials), "")
-        raise ConvergenceError(f"no candidate can be fitted to {folds.words}{why}")
+        raise ConvergenceError(f"no candidate can be fitted to {folds.description}{why}")
     kept: dict[str, Trial] = {}
     for trial in work.trials:
         key = signature(trial.structure)
         if key not in kept or trial.score < kept[key].score:
             kept[key] = trial
-    ranked = _ranked(list(kept.values()))
-    scatter = min(spread(t.joint) for t in there if t.joint is not None)
-    ranked = [t if t.joint is None else replace(t, bic=criterion(t.joint, t.numbers, scatter)) for t in ranked]
+    ranked = _rank_trials(list(kept.values()))
+    scatter = min(scatter_factor(t.joint) for t in there if t.joint is not None)
+    ranked = [
+        t if t.joint is None else replace(t, bic=schwarz_criterion(t.joint, t.parameters, scatter)) for t in ranked
+    ]
     best = ranked[0]
-    near = [k for k in _peers(ranked) if _as_good(ranked[k], best)]
+    near = [k for k in _peer_indices(ranked) if _predicts_equally(ranked[k], best)]
     # What the grid leaves is a fraction of an order, and to a criterion of thousands of samples a fraction counts.
-    for k, trial in zip(near, work.quietly(work.refined, [ranked[k] for k in near]), strict=True):
+    for k, trial in zip(near, work.map_items(work.refine_trial, [ranked[k] for k in near]), strict=True):
         ranked[k] = trial
-    scatter = min(spread(t.joint) for t in ranked if t.joint is not None)
-    ranked = [t if t.joint is None else replace(t, bic=criterion(t.joint, t.numbers, scatter)) for t in ranked]
+    scatter = min(scatter_factor(t.joint) for t in ranked if t.joint is not None)
+    ranked = [
+        t if t.joint is None else replace(t, bic=schwarz_criterion(t.joint, t.parameters, scatter)) for t in ranked
+    ]
     best, winner = ranked[0], _winner([ranked[k] for k in near])
-    found = identify(list(folds.runs), _as_judged(winner, folds), threads=work.threads)
+    found = identify(list(folds.runs), _with_validated_initial_conditions(winner, folds), threads=work.threads)
     warnings = []
-    if winner.joint is not None and found.joint is not None and found.joint.noise:
-        lower = [o for o, v in found.joint.noise.items() if v < 0.99 * winner.joint.noise.get(o, v)]
+    if winner.joint is not None and found.fit is not None and found.fit.noise:
+        lower = [o for o, v in found.fit.noise.items() if v < 0.99 * winner.joint.noise.get(o, v)]
         if lower:
             warnings.append(
                 f"from automatic starts the chosen structure fits {', '.join(lower)} better than where it was judged: "
                 "another optimum; .best is that one"
             )
-    if winner.unseen < 50.0:
+    if winner.validation_fit < 50.0:
         warnings.append(
-            f"the best candidate predicts unseen runs with {percent(winner.unseen)} %: none of them is the machine"
+            f"the best candidate predicts unseen runs with {format_fit(winner.validation_fit)} %: none of them is "
+            "the machine"
         )
-    worse = [f"{name} ({percent(fit)} %)" for name, fit in winner.parts.items() if not fit > 0.0]
+    worse = [f"{name} ({format_fit(fit)} %)" for name, fit in winner.parts.items() if not fit > 0.0]
     if worse:
         warnings.append(f"the chosen structure predicts worse than the mean of what was left out on {', '.join(worse)}")
     return Selection(
         tuple(ranked),
         ranked.index(winner),
         found,
-        folds.words,
+        folds.description,
         _reason(winner, best, ranked),
         work.done,
         tuple(warnings),
     )
 
 
-def _failures(every: Sequence[Trial]) -> list[list[str]]:
+def _failed_parts(every: Sequence[Trial]) -> list[list[str]]:
     """Parts that each trial predicts badly and another, stable one predicts far better."""
     left = [dict(zip(t.parts, t.scores, strict=False)) for t in every]
     least: dict[str, float] = {}
-    for scores in (part for part, t in zip(left, every, strict=True) if not t.grows):
+    for scores in (part for part, t in zip(left, every, strict=True) if not t.unstable):
         for name, score in scores.items():
             least[name] = min(score, least.get(name, math.inf))
-    return [[n for n, v in s.items() if v > FAILS and v > least.get(n, math.inf) + OUTDONE] for s in left]
+    return [
+        [n for n, v in s.items() if v > FAILURE_SCORE and v > least.get(n, math.inf) + FAILURE_SCORE_GAP] for s in left
+    ]
 
 
-def _ranked(every: Sequence[Trial]) -> list[Trial]:
+def _rank_trials(every: Sequence[Trial]) -> list[Trial]:
     """Sort trials, best first: fewest failures, then the mean score.
 
     A mean of logarithms offsets a failure on one block by good fits on the others, which a user cannot.
     """
-    failures = dict(zip(map(id, every), map(len, _failures(every)), strict=True))
-    return sorted(every, key=lambda t: (t.failed is not None, t.grows, failures[id(t)], t.score, t.numbers, t.name))
+    failures = dict(zip(map(id, every), map(len, _failed_parts(every)), strict=True))
+    return sorted(
+        every, key=lambda t: (t.failed is not None, t.unstable, failures[id(t)], t.score, t.parameters, t.name)
+    )
 
 
-def _peers(ranked: Sequence[Trial]) -> list[int]:
+def _peer_indices(ranked: Sequence[Trial]) -> list[int]:
     """Indices of trials that are no less stable, and fail no more often, than the best."""
-    best, failures = ranked[0], [len(f) for f in _failures(ranked)]
+    best, failures = ranked[0], [len(f) for f in _failed_parts(ranked)]
     return [
-        k for k, t in enumerate(ranked) if t.failed is None and t.grows == best.grows and failures[k] <= failures[0]
+        k
+        for k, t in enumerate(ranked)
+        if t.failed is None and t.unstable == best.unstable and failures[k] <= failures[0]
     ]
 
 
-def _as_good(trial: Trial, best: Trial) -> bool:
+def _predicts_equally(trial: Trial, best: Trial) -> bool:
     """Whether a trial predicts like the best: within 1 %, or up to 5 % if the difference over folds is not significant.
 
     The best is a maximum over many candidates, so one standard error would reject a true structure in one case of ten.
@@ -276,12 +302,14 @@ def _as_good(trial: Trial, best: Trial) -> bool:
     scatter.
     """
     apart = np.array(trial.scores) - np.array(best.scores)
-    far, likely = trial.score - best.score, _bic(trial) <= _bic(best) - STRONG
-    if apart.size < FOLDS:
-        return far <= SAME or (far <= MOST_ALIKE and likely)
+    far, likely = trial.score - best.score, _bic(trial) <= _bic(best) - BIC_STRONG_EVIDENCE
+    if apart.size < MIN_SCATTER_FOLDS:
+        return far <= SCORE_TOLERANCE or (far <= MAX_SCORE_TOLERANCE and likely)
     scatter = float(np.std(apart, ddof=1)) / math.sqrt(apart.size)
-    quantile = STUDENT_95[min(apart.size - FOLDS, len(STUDENT_95) - 1)]
-    return (far <= quantile * scatter and likely) or far <= max(SAME, min(quantile * scatter, MOST_ALIKE))
+    quantile = STUDENT_QUANTILES_95[min(apart.size - MIN_SCATTER_FOLDS, len(STUDENT_QUANTILES_95) - 1)]
+    return (far <= quantile * scatter and likely) or far <= max(
+        SCORE_TOLERANCE, min(quantile * scatter, MAX_SCORE_TOLERANCE)
+    )
 
 
 def _winner(near: Sequence[Trial]) -> Trial:
@@ -290,20 +318,20 @@ def _winner(near: Sequence[Trial]) -> Trial:
     From rest an equation differentiated throughout is the same equation, so the lowest order wins.
     """
     least = min(_bic(t) for t in near)
-    alike = [t for t in near if _bic(t) <= least + ALIKE]
-    return min(alike, key=lambda t: (t.numbers, _whole_order(t), t.score, t.looseness))
+    alike = [t for t in near if _bic(t) <= least + BIC_TOLERANCE]
+    return min(alike, key=lambda t: (t.parameters, _total_integer_order(t), t.score, t.mean_relative_error))
 
 
-def _whole_order(trial: Trial) -> int:
+def _total_integer_order(trial: Trial) -> int:
     """Sum over equations of the highest order rounded to an integer."""
-    return sum(round(e.order.partly(trial.values).constant) for e in trial.structure.equations)
+    return sum(round(e.order.substitute(trial.values).constant) for e in trial.structure.equations)
 
 
 def _bic(trial: Trial) -> float:
     return math.inf if trial.bic is None else trial.bic
 
 
-def _as_judged(trial: Trial, folds: Folds) -> Structure:
+def _with_validated_initial_conditions(trial: Trial, folds: Folds) -> Structure:
     """Return the structure with the initial terms of its validation.
 
     From rest no initial terms are needed, but they stay allowed: a later run may have nonzero initial conditions.
@@ -315,46 +343,45 @@ def _as_judged(trial: Trial, folds: Folds) -> Structure:
 
 def _reason(winner: Trial, best: Trial, ranked: Sequence[Trial]) -> str:
     """Describe why the winner was chosen."""
-    lead = f"Chosen: {winner.name} ({winner.numbers} numbers, {percent(winner.unseen)} % where unseen)"
-    peers = [ranked[k] for k in _peers(ranked)]
+    lead = f"Chosen: {winner.name} ({winner.parameters} numbers, {format_fit(winner.validation_fit)} % where unseen)"
+    peers = [ranked[k] for k in _peer_indices(ranked)]
     if winner is best:
         lead += ", which predicts best"
     else:
-        more = best.numbers - winner.numbers
+        more = best.parameters - winner.parameters
         lead += (
             f", which leaves {100 * (math.exp(winner.score - best.score) - 1):.2g} % more than the best prediction"
             + (f" with {more} numbers fewer" if more > 0 else "")
             + " and has the least Schwarz criterion of those that predict alike"
         )
     for word, others in (
-        ("fewer", [t for t in peers if t.numbers < winner.numbers]),
-        ("more", [t for t in peers if t.numbers > winner.numbers]),
+        ("fewer", [t for t in peers if t.parameters < winner.parameters]),
+        ("more", [t for t in peers if t.parameters > winner.parameters]),
     ):
         if others:
             near = min(others, key=lambda t: t.score)
             share = 100 * (math.exp(near.score - winner.score) - 1)
-            lead += (
-                f"; the best with {word} ({near.numbers}) leaves {abs(share):.3g} % {'more' if share >= 0 else 'less'}"
-            )
-    return lead + "." + _failing(winner, ranked)
+            side = "more" if share >= 0 else "less"
+            lead += f"; the best with {word} ({near.parameters}) leaves {abs(share):.3g} % {side}"
+    return lead + "." + _failure_text(winner, ranked)
 
 
-def _failing(winner: Trial, ranked: Sequence[Trial]) -> str:
+def _failure_text(winner: Trial, ranked: Sequence[Trial]) -> str:
     """Describe better candidates that fail on a part, and failures of the winner."""
-    failures = dict(zip(map(id, ranked), _failures(ranked), strict=True))
+    failures = dict(zip(map(id, ranked), _failed_parts(ranked), strict=True))
     told = ""
-    ahead = [t for t in ranked if failures[id(t)] and t.score < winner.score and t.grows == winner.grows]
+    ahead = [t for t in ranked if failures[id(t)] and t.score < winner.score and t.unstable == winner.unstable]
     if ahead:
         other = min(ahead, key=lambda t: t.score)
         name, share = failures[id(other)][0], 100 * (1 - math.exp(other.score - winner.score))
         told += (
             f" {other.name} leaves {share:.2g} % less on the mean and is not chosen: it fails on {name}, with "
-            f"{percent(other.parts[name])} % where the chosen one has {percent(winner.parts[name])}."
+            f"{format_fit(other.parts[name])} % where the chosen one has {format_fit(winner.parts[name])}."
         )
     for name in failures[id(winner)]:
-        other = max((t for t in ranked if name in t.parts and not t.grows), key=lambda t: t.parts[name])
+        other = max((t for t in ranked if name in t.parts and not t.unstable), key=lambda t: t.parts[name])
         told += (
-            f" It fails on {name}, with {percent(winner.parts[name])} % where {other.name} has "
-            f"{percent(other.parts[name])}, which fails elsewhere."
+            f" It fails on {name}, with {format_fit(winner.parts[name])} % where {other.name} has "
+            f"{format_fit(other.parts[name])}, which fails elsewhere."
         )
     return told

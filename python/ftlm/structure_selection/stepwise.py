@@ -13,29 +13,29 @@ from typing import Protocol, TypeVar
 from ftlm.data.run import Run
 from ftlm.errors import FtlmError
 from ftlm.estimation.free_parameters import FreeProblem
-from ftlm.estimation.objective import Grid
-from ftlm.estimation.output_error import COARSE_SHARE, JointFit, given, output_sizes
+from ftlm.estimation.objective import Objective
+from ftlm.estimation.output_error import COARSE_SHARE, JointFit, output_deviations, start_from_values
 from ftlm.structure.structure import Structure
-from ftlm.structure_selection.best_subset import Screened, screened
-from ftlm.structure_selection.candidates import Change, Inside, Variant, signature, worded
+from ftlm.structure_selection.best_subset import ScreenedSubset, screen_subsets
+from ftlm.structure_selection.candidates import Change, NestedStructures, Variant, describe_structure, signature
 from ftlm.structure_selection.checkpoint import Store
 from ftlm.structure_selection.cross_validation import (
     Folds,
     Trial,
-    criterion,
-    decided,
     fit,
-    judged,
-    least_unseen,
-    numbers_of,
-    refined,
-    spread,
+    fix_initial_conditions,
+    parameter_count,
+    scatter_factor,
+    schwarz_criterion,
+    update_trial,
+    validate_fit,
+    validation_score_bound,
 )
-from ftlm.utils.resources import pool
+from ftlm.utils.resources import interruptible_pool
 
 #: Number of samples of the subsampled records, maximum number of evaluations of an optimization on them (the budget of
 #: a rung of the multistart), and ratio to the lowest cost above which a candidate is excluded.
-COARSE_SAMPLES, SECOND_LAP, CONTENDER = 1200, 60, 3.0
+PRESCREEN_SAMPLES, PRESCREEN_EVALUATIONS, MAX_PRESCREEN_COST_RATIO = 1200, 60, 3.0
 
 Item = TypeVar("Item")
 MadeGlance = TypeVar("MadeGlance")
@@ -43,14 +43,14 @@ MadeGlance = TypeVar("MadeGlance")
 Start = tuple[Structure, Sequence[Mapping[str, float]]]
 
 
-class Pool(Protocol):
+class TaskPool(Protocol):
     """Pool that maps a function over items, in their order."""
 
-    def quietly(self, work: Callable[[Item], MadeGlance], items: Sequence[Item]) -> list[MadeGlance]:
+    def map_items(self, work: Callable[[Item], MadeGlance], items: Sequence[Item]) -> list[MadeGlance]:
         """Return the results for the items, in their order."""
 
 
-def contenders(runs: Sequence[Run], starts: Sequence[Start], least: int, pool: Pool) -> list[int]:
+def prescreen(runs: Sequence[Run], starts: Sequence[Start], least: int, pool: TaskPool) -> list[int]:
     """Return indices of the structures to fit on all samples, in their order.
 
     A structure is excluded if its cost on subsampled records, with the budget of a rung of the multistart, exceeds the
@@ -58,34 +58,41 @@ def contenders(runs: Sequence[Run], starts: Sequence[Start], least: int, pool: P
     and structures with friction are not prescreened.
     """
     every = list(range(len(starts)))
-    decimation = max(1, round(min(run.length - 1 for run in runs) / COARSE_SAMPLES))
+    decimation = max(1, round(min(run.length - 1 for run in runs) / PRESCREEN_SAMPLES))
     if decimation == 1 or len(starts) <= least or any(s.has_friction for s, _ in starts):
         return every
 
     def level(start: Start) -> float:
         structure, points = start
         try:
-            return _level(runs, decided(structure, runs), points, decimation)
+            return _prescreen_cost(runs, fix_initial_conditions(structure, runs), points, decimation)
         except FtlmError:
             # The fit on all samples says why.
             return math.inf
 
-    levels = pool.quietly(level, starts)
-    limit = CONTENDER * min(levels)
+    levels = pool.map_items(level, starts)
+    limit = MAX_PRESCREEN_COST_RATIO * min(levels)
     ahead = sorted(every, key=lambda k: (levels[k], k))[:least]
     return [k for k in every if levels[k] <= limit or k in ahead]
 
 
-def _level(runs: Sequence[Run], structure: Structure, points: Sequence[Mapping[str, float]], decimation: int) -> float:
+def _prescreen_cost(
+    runs: Sequence[Run], structure: Structure, points: Sequence[Mapping[str, float]], decimation: int
+) -> float:
     """Lowest cost of optimizations from some initial guesses on subsampled records, outputs weighted equally."""
     problem = FreeProblem.of(structure)
-    grid = Grid(
-        problem, runs, [1.0 / (COARSE_SHARE * size) for size in output_sizes(runs, structure)], decimation=decimation
+    grid = Objective(
+        problem,
+        runs,
+        [1.0 / (COARSE_SHARE * size) for size in output_deviations(runs, structure)],
+        decimation=decimation,
     )
     found = math.inf
     for point in points:
         try:
-            found = min(found, grid.descend(given(problem, point), SECOND_LAP).level)
+            found = min(
+                found, grid.minimize(start_from_values(problem, point), PRESCREEN_EVALUATIONS).cost_per_residual
+            )
         except FtlmError:
             # A start whose free run is not finite is no start.
             continue
@@ -94,30 +101,30 @@ def _level(runs: Sequence[Run], structure: Structure, points: Sequence[Mapping[s
 
 Made = TypeVar("Made")
 #: Initial guesses of an order that becomes free, relative to its integer value.
-SHIFTS = (0.0, -0.4, 0.4)
+INITIAL_ORDER_SHIFTS = (0.0, -0.4, 0.4)
 #: Initial guesses of a free input parameter, as fractions of its interval.
-SHARES = (0.1, 0.3, 0.6, 0.9)
+INITIAL_INPUT_FRACTIONS = (0.1, 0.3, 0.6, 0.9)
 #: Number of consecutive steps without a better prediction at which forward selection terminates.
-PATIENCE = 2
+MAX_IDLE_STEPS = 2
 #: Relative decrease of the validation residual that counts as a better prediction.
-BETTER = 0.005
+MIN_SCORE_IMPROVEMENT = 0.005
 #: Relative difference of validation residuals up to which two predictions count as equal.
-SAME = 0.01
+SCORE_TOLERANCE = 0.01
 #: Upper limit of that difference, for any scatter over folds.
-MOST_ALIKE = 0.05
+MAX_SCORE_TOLERANCE = 0.05
 #: Screened subsets are fitted if their residual is within this relative margin of the best one, up to this number. The
 #: best subset of each size is fitted in addition.
-NEAR, LEADING = 0.03, 8
+SUBSET_SCORE_MARGIN, MAX_FITTED_SUBSETS = 0.03, 8
 #: Number of listed candidates above which the total time is estimated first.
-MANY = 200
+TIME_ESTIMATE_CANDIDATES = 200
 #: Score gap to the best initial structure above which one is not extended, for equations without optional terms.
-DOMINATED = math.log(2.0)
+MAX_ROOT_SCORE_GAP = math.log(2.0)
 #: Number of changes per step, best by criterion, that are evaluated on validation data.
-JUDGED = 2
+VALIDATED_CHANGES = 2
 
 
 @dataclass
-class Work:
+class CandidateEvaluator:
     """Evaluation of candidates, and its progress callback.
 
     Parameters
@@ -143,53 +150,53 @@ class Work:
     known: int = 0
     trials: list[Trial] = field(default_factory=list)
 
-    def each(self, work: Callable[[Item], Made], items: Sequence[Item]) -> list[Made]:
+    def map_candidates(self, work: Callable[[Item], Made], items: Sequence[Item]) -> list[Made]:
         """Return the results for candidates, in their order, with progress reports."""
         self.known += len(items)
-        return self._in_order(work, items, self._told)
+        return self._in_order(work, items, self._report_progress)
 
-    def quietly(self, work: Callable[[Item], Made], items: Sequence[Item]) -> list[Made]:
+    def map_items(self, work: Callable[[Item], Made], items: Sequence[Item]) -> list[Made]:
         """Return the results for items, in their order, without progress reports."""
         return self._in_order(work, items, lambda: None)
 
-    def _told(self) -> None:
+    def _report_progress(self) -> None:
         self.done += 1
         if self.progress is not None:
             self.progress(self.done, self.known)
 
     def _in_order(self, work: Callable[[Item], Made], items: Sequence[Item], told: Callable[[], None]) -> list[Made]:
         out: list[Made] = []
-        with pool(self.threads) as workers:
+        with interruptible_pool(self.threads) as workers:
             for made in workers.map(work, items):
                 out.append(made)
                 told()
         return out
 
-    def judge(self, name: str, structure: Structure, joint: JointFit | FtlmError, *, fine: bool = False) -> Trial:
+    def validate(self, name: str, structure: Structure, joint: JointFit | FtlmError, *, fine: bool = False) -> Trial:
         """Evaluate a fitted candidate on validation data."""
         if isinstance(joint, FtlmError):
             return Trial(name, structure, len(FreeProblem.of(structure).names), failed=str(joint))
 
         def compute() -> Trial:
             try:
-                return judged(name, structure, self.folds, joint, fine=fine)
+                return validate_fit(name, structure, self.folds, joint, fine=fine)
             except FtlmError as error:
-                return Trial(name, structure, numbers_of(structure, joint, self.folds), failed=str(error))
+                return Trial(name, structure, parameter_count(structure, joint, self.folds), failed=str(error))
 
-        return compute() if self.store is None else self.store.judgement(name, structure, joint, fine, compute)
+        return compute() if self.store is None else self.store.validation(name, structure, joint, fine, compute)
 
-    def refined(self, trial: Trial) -> Trial:
+    def refine_trial(self, trial: Trial) -> Trial:
         """Return a candidate refitted until its parameters are independent of the step of the grid."""
-        if trial.fine:
+        if trial.refined:
             return trial
-        joint = self.fitted(trial.structure, [trial.values])
+        joint = self.fit_candidate(trial.structure, [trial.values])
         try:
             # On a finer grid it may have no finite free run: it stays what it was judged as.
-            return trial if isinstance(joint, FtlmError) else refined(trial, self.folds, joint)
+            return trial if isinstance(joint, FtlmError) else update_trial(trial, self.folds, joint)
         except FtlmError:
             return trial
 
-    def fitted(
+    def fit_candidate(
         self, structure: Structure, starts: Sequence[Mapping[str, float]], *, refine: bool = True
     ) -> JointFit | FtlmError:
         """Fit a candidate on all runs; return the error if the fit fails."""
@@ -202,17 +209,17 @@ class Work:
 
         return compute() if self.store is None else self.store.fit(structure, starts, refine, compute)
 
-    def screened(self, inside: Inside) -> list[Screened]:
+    def best_subsets(self, inside: NestedStructures) -> list[ScreenedSubset]:
         """Return every subset of input terms, best first."""
 
-        def compute() -> list[Screened]:
-            return screened(inside, self.folds, self)
+        def compute() -> list[ScreenedSubset]:
+            return screen_subsets(inside, self.folds, self)
 
         return compute() if self.store is None else self.store.subsets(inside.structure, compute)
 
 
 @dataclass(frozen=True)
-class Fitted:
+class FittedVariant:
     """A variant with its fit."""
 
     change: Change
@@ -220,7 +227,7 @@ class Fitted:
     bic: float
 
 
-def starts_from(
+def initial_guesses(
     structure: Structure, values: Mapping[str, float], whole: Mapping[str, float]
 ) -> list[dict[str, float]]:
     """Return initial guesses from known `values`, orders that were `whole`, and coefficients that were 0.
@@ -231,15 +238,17 @@ def starts_from(
     usual: dict[str, list[float]] = {}
     for name, (low, high) in zip(problem.orders, problem.bounds, strict=True):
         at = whole.get(name, 0.5 * (low + high))
-        usual[name] = [min(max(at + shift, low), high) for shift in SHIFTS]
+        usual[name] = [min(max(at + shift, low), high) for shift in INITIAL_ORDER_SHIFTS]
     rubs = {n for e in structure.equations if e.friction is not None for n in e.friction.names}
     usual |= {n: [0.0] for n in problem.coefficients if n not in rubs}
-    usual |= {i.name: [i.bounds[0] + s * (i.bounds[1] - i.bounds[0]) for s in SHARES] for i in problem.inputs}
+    usual |= {
+        i.name: [i.bounds[0] + s * (i.bounds[1] - i.bounds[0]) for s in INITIAL_INPUT_FRACTIONS] for i in problem.inputs
+    }
     places = {n: [values[n]] if n in values else places for n, places in usual.items()}
     return [dict(zip(places, point, strict=True)) for point in itertools.product(*places.values())]
 
 
-def grown(inside: Inside, work: Work) -> list[Trial]:
+def select_stepwise(inside: NestedStructures, work: CandidateEvaluator) -> list[Trial]:
     """Select structures stepwise from the simplest ones upwards, then downwards; return all validated trials in order.
 
     Each integer value of the highest orders is an initial structure of its own: the best of the simplest structures
@@ -248,95 +257,103 @@ def grown(inside: Inside, work: Work) -> list[Trial]:
     input terms for best-subset screening, selection starts from the best subset. If no term is optional, the structure
     with all orders free is a second initial structure.
     """
-    subsets = work.screened(inside)
-    found = _from_subsets(inside, work, subsets)
+    subsets = work.best_subsets(inside)
+    found = _select_from_subsets(inside, work, subsets)
     if found:
         # What was screened is not fitted again because it is one thing more, or less, than something.
-        return _finished(inside, work, found, {signature(inside.build(s.change.variant)) for s in subsets})
+        return _eliminate_from_ends(inside, work, found, {signature(inside.build(s.change.variant)) for s in subsets})
     if not inside.droppable:
-        return _from_everything(inside, work)
-    changes = _new(inside, inside.skeletons(), set())
-    joints = work.each(lambda c: work.fitted(inside.build(c.variant), [], refine=False), changes)
+        return _select_from_full(inside, work)
+    changes = _untried_changes(inside, inside.simplest(), set())
+    joints = work.map_candidates(lambda c: work.fit_candidate(inside.build(c.variant), [], refine=False), changes)
     roots: dict[tuple[float | None, ...], list[tuple[Change, JointFit | FtlmError]]] = {}
     for change, joint in zip(changes, joints, strict=True):
-        roots.setdefault(inside.top(change.variant), []).append((change, joint))
+        roots.setdefault(inside.highest_orders(change.variant), []).append((change, joint))
     if all(isinstance(j, FtlmError) for j in joints):
-        work.trials += [work.judge(c.words, inside.build(c.variant), j) for c, j in zip(changes, joints, strict=True)]
-    ends: list[tuple[Trial, Fitted]] = []
+        work.trials += [
+            work.validate(c.words, inside.build(c.variant), j) for c, j in zip(changes, joints, strict=True)
+        ]
+    ends: list[tuple[Trial, FittedVariant]] = []
     tried: set[str] = set()
     for pairs in roots.values():
         ahead = _by_criterion(inside, work, pairs)[:1]
-        ends += [_upwards(inside, work, one, tried) for one in ahead]
+        ends += [_select_forward(inside, work, one, tried) for one in ahead]
     if not ends:
         return work.trials
-    first = min(ends, key=lambda end: _rank(end[0]))
+    first = min(ends, key=lambda end: _ranking_key(end[0]))
     joined = [values_of(j) for c, j in zip(changes, joints, strict=True) if not isinstance(j, FtlmError)]
-    from_above = _downwards(inside, work, first[1], joined, tried)
+    from_above = _eliminate_from_full(inside, work, first[1], joined, tried)
     ends += [] if from_above is None else [from_above]
-    return _finished(inside, work, ends, tried)
+    return _eliminate_from_ends(inside, work, ends, tried)
 
 
-def _finished(inside: Inside, work: Work, ends: Sequence[tuple[Trial, Fitted]], tried: set[str]) -> list[Trial]:
+def _eliminate_from_ends(
+    inside: NestedStructures, work: CandidateEvaluator, ends: Sequence[tuple[Trial, FittedVariant]], tried: set[str]
+) -> list[Trial]:
     """Eliminate terms backward from each forward-selection result that is as good as the best."""
-    least = min(_rank(trial) for trial, _ in ends)
+    least = min(_ranking_key(trial) for trial, _ in ends)
     for trial, at in ends:
-        if (trial.grows, trial.score) <= (least[0], least[1] + SAME):
-            _pruned(inside, work, trial, at, tried)
+        if (trial.unstable, trial.score) <= (least[0], least[1] + SCORE_TOLERANCE):
+            _eliminate_backward(inside, work, trial, at, tried)
     return work.trials
 
 
-def _from_everything(inside: Inside, work: Work) -> list[Trial]:
+def _select_from_full(inside: NestedStructures, work: CandidateEvaluator) -> list[Trial]:
     """Select from integer orders upwards, and from all orders free downwards, for equations without optional terms.
 
     Forward selection from integer orders is skipped if their validation residual far exceeds that with all orders free.
     """
     structure = inside.structure
     full = Variant(frozenset(structure.coefficient_names), (), structure.offset == "constant")
-    changes = _new(inside, [*inside.skeletons(), Change(worded(inside.build(full)), full)], set())
-    joints = work.each(lambda c: work.fitted(inside.build(c.variant), [], refine=False), changes)
+    changes = _untried_changes(
+        inside, [*inside.simplest(), Change(describe_structure(inside.build(full)), full)], set()
+    )
+    joints = work.map_candidates(lambda c: work.fit_candidate(inside.build(c.variant), [], refine=False), changes)
     pairs = list(zip(changes, joints, strict=True))
     roots = _by_criterion(inside, work, [p for p in pairs if p[0].variant == full])
     roots += _by_criterion(inside, work, [p for p in pairs if p[0].variant != full])[:1]
     if not roots:
-        work.trials += [work.judge(c.words, inside.build(c.variant), j) for c, j in pairs]
+        work.trials += [work.validate(c.words, inside.build(c.variant), j) for c, j in pairs]
         return work.trials
-    first = _judged(inside, work, roots, beyond=-math.inf, margin=DOMINATED)
+    first = _validate_variants(inside, work, roots, beyond=-math.inf, margin=MAX_ROOT_SCORE_GAP)
     tried = {_key(inside, r.change) for r in roots}
     least = min(trial.score for trial in first)
     ends = [
-        _upwards(inside, work, at, tried, trial)
+        _select_forward(inside, work, at, tried, trial)
         for trial, at in reversed(list(zip(first, roots, strict=False)))
-        if trial.score <= least + DOMINATED
+        if trial.score <= least + MAX_ROOT_SCORE_GAP
     ]
-    return _finished(inside, work, ends, tried)
+    return _eliminate_from_ends(inside, work, ends, tried)
 
 
-def _from_subsets(inside: Inside, work: Work, subsets: Sequence[Screened]) -> list[tuple[Trial, Fitted]]:
+def _select_from_subsets(
+    inside: NestedStructures, work: CandidateEvaluator, subsets: Sequence[ScreenedSubset]
+) -> list[tuple[Trial, FittedVariant]]:
     """Fit and validate the best subsets; extend the best of them by free orders."""
     if not subsets:
         return []
-    ahead = [s for s in subsets if s.score <= subsets[0].score + NEAR][:LEADING]
-    by_size: dict[int, Screened] = {}
+    ahead = [s for s in subsets if s.score <= subsets[0].score + SUBSET_SCORE_MARGIN][:MAX_FITTED_SUBSETS]
+    by_size: dict[int, ScreenedSubset] = {}
     for one in subsets:
         by_size.setdefault(len(one.start), one)
     ahead += [s for s in by_size.values() if s not in ahead]
 
-    def from_lattice(subset: Screened) -> JointFit | FtlmError:
-        return work.fitted(inside.build(subset.change.variant), [subset.start], refine=False)
+    def from_lattice(subset: ScreenedSubset) -> JointFit | FtlmError:
+        return work.fit_candidate(inside.build(subset.change.variant), [subset.start], refine=False)
 
-    joints = work.each(from_lattice, ahead)
+    joints = work.map_candidates(from_lattice, ahead)
     steps = _by_criterion(inside, work, [(s.change, j) for s, j in zip(ahead, joints, strict=True)])
     if not steps:
         return []
-    ends = list(zip(_judged(inside, work, steps), steps, strict=True))
+    ends = list(zip(_validate_variants(inside, work, steps), steps, strict=True))
     tried = {signature(inside.build(s.change.variant)) for s in subsets}
-    first = min(ends, key=lambda end: _rank(end[0]))
-    return [first, _upwards(inside, work, first[1], tried, first[0])]
+    first = min(ends, key=lambda end: _ranking_key(end[0]))
+    return [first, _select_forward(inside, work, first[1], tried, first[0])]
 
 
-def _rank(trial: Trial) -> tuple[bool, float]:
+def _ranking_key(trial: Trial) -> tuple[bool, float]:
     """Sort key of a candidate: instability first, then the score."""
-    return trial.grows, trial.score
+    return trial.unstable, trial.score
 
 
 def values_of(joint: JointFit) -> dict[str, float]:
@@ -344,21 +361,25 @@ def values_of(joint: JointFit) -> dict[str, float]:
     return dict(zip(joint.names, joint.values.tolist(), strict=True))
 
 
-def _upwards(
-    inside: Inside, work: Work, chosen: Fitted, tried: set[str], judged_already: Trial | None = None
-) -> tuple[Trial, Fitted]:
+def _select_forward(
+    inside: NestedStructures,
+    work: CandidateEvaluator,
+    chosen: FittedVariant,
+    tried: set[str],
+    judged_already: Trial | None = None,
+) -> tuple[Trial, FittedVariant]:
     """Add one thing at a time while prediction improves; return the best result on the way."""
-    best = judged_already or _judged(inside, work, [chosen])[0]
+    best = judged_already or _validate_variants(inside, work, [chosen])[0]
     best_at, idle = chosen, 0
     tried.add(_key(inside, chosen.change))
-    while idle < PATIENCE:
-        larger = _new(inside, inside.larger(chosen.change.variant), tried)
-        ahead = _tried(inside, work, chosen, larger)[:JUDGED]
+    while idle < MAX_IDLE_STEPS:
+        larger = _untried_changes(inside, inside.larger(chosen.change.variant), tried)
+        ahead = _fit_changes(inside, work, chosen, larger)[:VALIDATED_CHANGES]
         if not ahead:
             break
-        found = _judged(inside, work, ahead, beyond=_hopeless(best))
+        found = _validate_variants(inside, work, ahead, beyond=_max_relevant_score(best))
         tried |= {_key(inside, s.change) for s in ahead}
-        place = min(range(len(found)), key=lambda k: (_rank(found[k]), k))
+        place = min(range(len(found)), key=lambda k: (_ranking_key(found[k]), k))
         chosen = ahead[place]
         if _is_better(found[place], best):
             best, best_at, idle = found[place], chosen, 0
@@ -367,47 +388,58 @@ def _upwards(
     return best, best_at
 
 
-def _hopeless(best: Trial) -> float:
+def _max_relevant_score(best: Trial) -> float:
     """Score above which a candidate is neither better than the best nor equal to it."""
-    return math.inf if best.grows else best.score + MOST_ALIKE
+    return math.inf if best.unstable else best.score + MAX_SCORE_TOLERANCE
 
 
 def _is_better(trial: Trial, than: Trial) -> bool:
     """Whether a candidate predicts significantly better than another."""
-    return _rank(trial) < (than.grows, than.score - BETTER)
+    return _ranking_key(trial) < (than.unstable, than.score - MIN_SCORE_IMPROVEMENT)
 
 
-def _downwards(
-    inside: Inside, work: Work, low: Fitted, others: Sequence[Mapping[str, float]], tried: set[str]
-) -> tuple[Trial, Fitted] | None:
+def _eliminate_from_full(
+    inside: NestedStructures,
+    work: CandidateEvaluator,
+    low: FittedVariant,
+    others: Sequence[Mapping[str, float]],
+    tried: set[str],
+) -> tuple[Trial, FittedVariant] | None:
     """Eliminate one term at a time from the full structure at integer orders; return the best on the way."""
     full = inside.richest(low.change.variant)
     if len(full.kept) - len(low.change.variant.kept) < 2:
         return None
     structure = inside.build(full)
-    starts = [starts_from(structure, known, full.held())[0] for known in (values_of(low.joint), *others)]
-    (joint,) = work.each(lambda item: work.fitted(item, starts, refine=False), [structure])
+    starts = [
+        initial_guesses(structure, known, full.integer_order_values())[0] for known in (values_of(low.joint), *others)
+    ]
+    (joint,) = work.map_candidates(lambda item: work.fit_candidate(item, starts, refine=False), [structure])
     if isinstance(joint, FtlmError):
         return None
-    at = Fitted(Change(worded(structure), full), joint, 0.0)
-    found = _judged(inside, work, [at])
+    at = FittedVariant(Change(describe_structure(structure), full), joint, 0.0)
+    found = _validate_variants(inside, work, [at])
     best, best_at = found[0], at
     while True:
         changes = [c for c in inside.smaller(at.change.variant) if len(c.variant.kept) < len(at.change.variant.kept)]
-        ahead = _tried(inside, work, at, changes)
+        ahead = _fit_changes(inside, work, at, changes)
         if not ahead:
             return best, best_at
         at = ahead[0]
         if _key(inside, at.change) in tried:
             continue
         tried.add(_key(inside, at.change))
-        (trial,) = _judged(inside, work, [at])
-        if _rank(trial) <= (best.grows, best.score + BETTER):
+        (trial,) = _validate_variants(inside, work, [at])
+        if _ranking_key(trial) <= (best.unstable, best.score + MIN_SCORE_IMPROVEMENT):
             best, best_at = trial, at
 
 
-def _judged(
-    inside: Inside, work: Work, ahead: Sequence[Fitted], *, beyond: float = math.inf, margin: float = 0.0
+def _validate_variants(
+    inside: NestedStructures,
+    work: CandidateEvaluator,
+    ahead: Sequence[FittedVariant],
+    *,
+    beyond: float = math.inf,
+    margin: float = 0.0,
 ) -> list[Trial]:
     """Evaluate fitted variants on validation data: all, or only the first ones if the others cannot matter.
 
@@ -415,102 +447,116 @@ def _judged(
     exceeds their best score by more than the margin.
     """
 
-    def one(fitted: Fitted) -> Trial:
-        return work.judge(_name(inside, fitted), inside.build(fitted.change.variant), fitted.joint)
+    def one(fitted: FittedVariant) -> Trial:
+        return work.validate(_name(inside, fitted), inside.build(fitted.change.variant), fitted.joint)
 
-    least = [least_unseen(f.joint, work.folds) for f in ahead]
+    least = [validation_score_bound(f.joint, work.folds) for f in ahead]
     first = next((k for k, level in enumerate(least) if k > 0 and level > beyond), len(ahead))
-    found = work.each(one, ahead[:first])
-    best = min(found, key=_rank, default=None)
-    if best is not None and (best.grows or any(level <= best.score + margin for level in least[first:])):
-        found += work.each(one, ahead[first:])
+    found = work.map_candidates(one, ahead[:first])
+    best = min(found, key=_ranking_key, default=None)
+    if best is not None and (best.unstable or any(level <= best.score + margin for level in least[first:])):
+        found += work.map_candidates(one, ahead[first:])
     work.trials += found
     return found
 
 
-def _tried(inside: Inside, work: Work, at: Fitted, changes: Sequence[Change]) -> list[Fitted]:
+def _fit_changes(
+    inside: NestedStructures, work: CandidateEvaluator, at: FittedVariant, changes: Sequence[Change]
+) -> list[FittedVariant]:
     """Fit changes from the current optimum, best first; for long records only survivors of the prescreening."""
     values = values_of(at.joint)
     starts: list[Start] = []
     for change in changes:
         structure = inside.build(change.variant)
-        whole = {**at.change.variant.held(), **change.variant.held()}
-        starts.append((structure, starts_from(structure, values, whole)))
-    ahead = contenders(work.folds.runs, starts, JUDGED, work)
-    joints = work.each(lambda k: work.fitted(*starts[k], refine=False), ahead)
+        whole = {**at.change.variant.integer_order_values(), **change.variant.integer_order_values()}
+        starts.append((structure, initial_guesses(structure, values, whole)))
+    ahead = prescreen(work.folds.runs, starts, VALIDATED_CHANGES, work)
+    joints = work.map_candidates(lambda k: work.fit_candidate(*starts[k], refine=False), ahead)
     return _by_criterion(inside, work, [(changes[k], joint) for k, joint in zip(ahead, joints, strict=True)])
 
 
-def _by_criterion(inside: Inside, work: Work, pairs: Sequence[tuple[Change, JointFit | FtlmError]]) -> list[Fitted]:
+def _by_criterion(
+    inside: NestedStructures, work: CandidateEvaluator, pairs: Sequence[tuple[Change, JointFit | FtlmError]]
+) -> list[FittedVariant]:
     """Sort fitted variants by Schwarz's criterion, with the correlation of the best residuals among them."""
     there = [(c, j) for c, j in pairs if not isinstance(j, FtlmError)]
     if not there:
         return []
-    scatter = min(spread(j) for _, j in there)
-    count = [numbers_of(inside.build(c.variant), j, work.folds) for c, j in there]
-    every = [Fitted(c, j, criterion(j, n, scatter)) for (c, j), n in zip(there, count, strict=True)]
+    scatter = min(scatter_factor(j) for _, j in there)
+    count = [parameter_count(inside.build(c.variant), j, work.folds) for c, j in there]
+    every = [FittedVariant(c, j, schwarz_criterion(j, n, scatter)) for (c, j), n in zip(there, count, strict=True)]
     return sorted(every, key=lambda f: f.bic)
 
 
-def _pruned(inside: Inside, work: Work, best: Trial, at: Fitted, tried: set[str]) -> None:
+def _eliminate_backward(
+    inside: NestedStructures, work: CandidateEvaluator, best: Trial, at: FittedVariant, tried: set[str]
+) -> None:
     """Eliminate one thing at a time while prediction does not get worse."""
     while True:
-        changes = [c for c in _new(inside, inside.smaller(at.change.variant), tried) if _beside(c, at)]
-        steps = _tried(inside, work, at, changes)
+        changes = [
+            c for c in _untried_changes(inside, inside.smaller(at.change.variant), tried) if _is_adjacent_integer(c, at)
+        ]
+        steps = _fit_changes(inside, work, at, changes)
         tried |= {_key(inside, c) for c in changes}
-        found = _judged(inside, work, steps[:JUDGED], beyond=_hopeless(best))
-        better = [(t, s) for t, s in zip(found, steps, strict=False) if _rank(t) <= (best.grows, best.score + BETTER)]
+        found = _validate_variants(inside, work, steps[:VALIDATED_CHANGES], beyond=_max_relevant_score(best))
+        better = [
+            (t, s)
+            for t, s in zip(found, steps, strict=False)
+            if _ranking_key(t) <= (best.unstable, best.score + MIN_SCORE_IMPROVEMENT)
+        ]
         if not better:
             return
-        best, at = min(better, key=lambda pair: _rank(pair[0]))
+        best, at = min(better, key=lambda pair: _ranking_key(pair[0]))
 
 
-def _beside(change: Change, at: Fitted) -> bool:
+def _is_adjacent_integer(change: Change, at: FittedVariant) -> bool:
     """Whether orders that become integer move to an adjacent integer of their estimate."""
     values = values_of(at.joint)
-    return all(abs(v - values[n]) < 1.0 for n, v in change.variant.whole if n in values)
+    return all(abs(v - values[n]) < 1.0 for n, v in change.variant.integer_orders if n in values)
 
 
-def _key(inside: Inside, change: Change) -> str:
+def _key(inside: NestedStructures, change: Change) -> str:
     return signature(inside.build(change.variant))
 
 
-def _new(inside: Inside, changes: Iterable[Change], tried: set[str]) -> list[Change]:
+def _untried_changes(inside: NestedStructures, changes: Iterable[Change], tried: set[str]) -> list[Change]:
     """Return changes to untried variants, each once."""
     return list({key: c for c in changes if (key := _key(inside, c)) not in tried}.values())
 
 
-def _name(inside: Inside, fitted: Fitted) -> str:
-    return worded(inside.build(fitted.change.variant))
+def _name(inside: NestedStructures, fitted: FittedVariant) -> str:
+    return describe_structure(inside.build(fitted.change.variant))
 
 
-def listed(candidates: Mapping[str, Structure], work: Work) -> list[Trial]:
+def evaluate_list(candidates: Mapping[str, Structure], work: CandidateEvaluator) -> list[Trial]:
     """Evaluate listed candidates, each from automatic initial guesses."""
 
     def one(item: tuple[str, Structure]) -> Trial:
         name, structure = item
-        return work.judge(name, structure, work.fitted(structure, []), fine=True)
+        return work.validate(name, structure, work.fit_candidate(structure, []), fine=True)
 
     items = list(candidates.items())
     # What a store gives back takes no time, and tells none.
-    if len(items) > MANY and not (work.store is not None and len(work.store)):
+    if len(items) > TIME_ESTIMATE_CANDIDATES and not (work.store is not None and len(work.store)):
         begun = work.clock()
-        work.trials += work.each(one, items[: work.threads])
+        work.trials += work.map_candidates(one, items[: work.threads])
         took = work.clock() - begun
         rest = len(items) - work.threads
         warnings.warn(
-            f"{len(items)} candidates: the first {work.threads} took {duration(took)}, so the other {rest} take about "
-            f"{duration(took * rest / work.threads)} on {work.threads} threads; Ctrl-C ends it, and a structure whose "
+            f"{len(items)} candidates: the first {work.threads} took {format_duration(took)}, so the other {rest} "
+            "take about "
+            f"{format_duration(took * rest / work.threads)} on {work.threads} threads; Ctrl-C ends it, and a "
+            "structure whose "
             "inside is searched needs far fewer fits",
             UserWarning,
             stacklevel=3,
         )
         items = items[work.threads :]
-    work.trials += work.each(one, items)
+    work.trials += work.map_candidates(one, items)
     return work.trials
 
 
-def duration(seconds: float) -> str:
+def format_duration(seconds: float) -> str:
     """Format seconds as seconds, minutes or hours, with two digits."""
     for unit, size in (("h", 3600.0), ("min", 60.0)):
         if seconds >= 2.0 * size:

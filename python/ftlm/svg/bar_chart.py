@@ -10,18 +10,18 @@ from markupsafe import Markup
 from numpy.typing import ArrayLike
 
 from ftlm.errors import DataError
-from ftlm.svg.figure import NARROW, SMALL, TINY, Figure, svg, svg_text, text_width, ticks
-from ftlm.svg.line_chart import LINES
-from ftlm.utils.formatting import number, shortened
+from ftlm.svg.figure import MIN_DIFFERENCE, NARROW_WIDTH_PX, SMALL_WIDTH_PX, Figure, svg, svg_text, text_width, ticks
+from ftlm.svg.line_chart import LINE_STYLES
+from ftlm.utils.formatting import number, truncate_text
 from ftlm.utils.validation import Floats
 
 #: Most bars of a histogram, and its height [px].
-MOST_BARS = 41
-HEIGHT = 190.0
+MAX_BARS = 41
+HISTOGRAM_HEIGHT_PX = 190.0
 #: Height of one bar of a grouped bar chart [px].
-BAR = 16.0
+BAR_HEIGHT_PX = 16.0
 #: Longest label beside a bar [characters].
-MOST_LETTERS = 26
+MAX_NAME_CHARACTERS = 26
 
 
 def histogram(values: ArrayLike, *, title: str, x_label: str, caption: str = "") -> Figure:
@@ -48,9 +48,9 @@ def histogram(values: ArrayLike, *, title: str, x_label: str, caption: str = "")
     # As many bars as Sturges and the spread of outliers ask for, symmetric about the mean.
     mean, deviation = float(np.mean(there)), float(np.std(there))
     reach = float(np.max(np.abs(there - mean)))
-    if reach <= max(1e-12 * abs(mean), TINY):
-        reach = 0.1 * abs(mean) if abs(mean) > TINY else 1.0
-    bars = min(MOST_BARS, 2 * math.ceil(math.log2(there.size)) + 1)
+    if reach <= max(1e-12 * abs(mean), MIN_DIFFERENCE):
+        reach = 0.1 * abs(mean) if abs(mean) > MIN_DIFFERENCE else 1.0
+    bars = min(MAX_BARS, 2 * math.ceil(math.log2(there.size)) + 1)
     edges = mean + np.linspace(-reach, reach, bars + 1)
     counts, _ = np.histogram(there, edges)
     width = edges[1] - edges[0]
@@ -82,11 +82,11 @@ def _histogram(
     narrow: bool,
 ) -> Markup:
     title, described, x_label = words
-    width = NARROW if narrow else SMALL
+    width = NARROW_WIDTH_PX if narrow else SMALL_WIDTH_PX
     highest = 1.05 * max(float(counts.max()), float(curve.max()))
     low, high = float(edges[0]), float(edges[-1])
     upward, across = ticks(0.0, highest, 4), ticks(low, high, 4 if narrow else 6)
-    left, top, h = max(30.0, 10 + max(map(text_width, upward.labels))), 26.0, HEIGHT - 66
+    left, top, h = max(30.0, 10 + max(map(text_width, upward.labels))), 26.0, HISTOGRAM_HEIGHT_PX - 66
     w = width - left - 14.0
 
     def place(x: float, y: float) -> tuple[float, float]:
@@ -100,10 +100,12 @@ def _histogram(
     )
     for a, b, count in zip(edges[:-1], edges[1:], counts.tolist(), strict=True):
         (x, y), (right, bottom) = place(float(a), count), place(float(b), 0.0)
-        out.append(bar.format(x, y, max(right - x - 0.8, 0.4), bottom - y, LINES[2][0]))
+        out.append(bar.format(x, y, max(right - x - 0.8, 0.4), bottom - y, LINE_STYLES[2][0]))
     path = "M" + "L".join("{:.1f} {:.1f}".format(*place(float(x), float(y))) for x, y in zip(at, curve, strict=True))
     out.append(
-        Markup('<path class="line1" fill="none" stroke="{}" stroke-width="1.6" d="{}"/>').format(LINES[1][0], path)
+        Markup('<path class="line1" fill="none" stroke="{}" stroke-width="1.6" d="{}"/>').format(
+            LINE_STYLES[1][0], path
+        )
     )
     out.append(
         Markup('<path fill="none" stroke="currentColor" stroke-opacity="0.55" d="M{:.1f} {:.1f}h{:.1f}"/>').format(
@@ -120,7 +122,7 @@ def _histogram(
     factor = f" ({across.factor})" if across.factor else ""
     out += [svg_text(4, top - 12, "samples", "start"), svg_text(left + w, top + h + 34, x_label + factor, "end")]
     out.append(Markup("</g>"))
-    return svg(width, round(HEIGHT), title, described, out, narrow=narrow)
+    return svg(width, round(HISTOGRAM_HEIGHT_PX), title, described, out, narrow=narrow)
 
 
 def bar_chart(
@@ -157,9 +159,9 @@ def bar_chart(
         Nothing to draw, more than five series, or a series without one value per name.
     """
     tables = [(name, np.asarray(values, dtype=np.float64)) for name, values in groups]
-    if not names or not 0 < len(tables) < len(LINES):
+    if not names or not 0 < len(tables) < len(LINE_STYLES):
         raise DataError(
-            f"{len(names)} names and {len(tables)} groups of bars; give names, and 1 to {len(LINES) - 1} groups"
+            f"{len(names)} names and {len(tables)} groups of bars; give names, and 1 to {len(LINE_STYLES) - 1} groups"
         )
     for name, values in tables:
         if values.shape != (len(names),):
@@ -174,7 +176,9 @@ def bar_chart(
         for k, thing in enumerate(names)
     )
     words = (title, described, x_label)
-    wide, small = (_bars(names, tables, (low, end), words, NARROW if n else width, narrow=n) for n in (False, True))
+    wide, small = (
+        _bars(names, tables, (low, end), words, NARROW_WIDTH_PX if n else width, narrow=n) for n in (False, True)
+    )
     return Figure(title, wide, small, caption)
 
 
@@ -188,10 +192,10 @@ def _bars(
     narrow: bool,
 ) -> Markup:
     title, described, x_label = words
-    shown = [shortened(n, 16 if narrow else MOST_LETTERS) for n in names]
+    shown = [truncate_text(n, 16 if narrow else MAX_NAME_CHARACTERS) for n in names]
     left, value = 10 + max(map(text_width, shown)), 52.0
     top = 8.0 + 18.0 * (len(tables) > 1)
-    w, step = width - left - value, BAR * len(tables) + 8
+    w, step = width - left - value, BAR_HEIGHT_PX * len(tables) + 8
     low, high = ends
     out = []
     across = ticks(low, high, 4 if narrow else 8)
@@ -207,21 +211,21 @@ def _bars(
     )
     texts = []
     for i, name in enumerate(shown):
-        texts.append(svg_text(left - 6, top + step * i + BAR * len(tables) / 2 + 6, name, "end"))
+        texts.append(svg_text(left - 6, top + step * i + BAR_HEIGHT_PX * len(tables) / 2 + 6, name, "end"))
         for k, (_, values) in enumerate(tables):
-            v, y = float(values[i]), top + step * i + BAR * k + 2
+            v, y = float(values[i]), top + step * i + BAR_HEIGHT_PX * k + 2
             inside = min(max(v, low), high) if math.isfinite(v) else low
             length = w * (inside - low) / (high - low)
-            out.append(bar.format(k + 1, left, y, max(length, 0.0), BAR - 3, LINES[k + 1][0], "0.85"))
+            out.append(bar.format(k + 1, left, y, max(length, 0.0), BAR_HEIGHT_PX - 3, LINE_STYLES[k + 1][0], "0.85"))
             text = number(v, 4) if math.isfinite(v) else "–"
-            texts.append(svg_text(left + length + 5, y + BAR - 5, text, "start"))
+            texts.append(svg_text(left + length + 5, y + BAR_HEIGHT_PX - 5, text, "start"))
     axis = Markup('<path fill="none" stroke="currentColor" stroke-opacity="0.55" d="M{:.1f} {:.1f}v{:.1f}"/>')
     out += [axis.format(left, top, h), Markup('<g font-size="12" fill="currentColor">'), *texts]
     place = left
     for k, (name, _) in enumerate(tables if len(tables) > 1 else ()):
         out.append(
             Markup('<rect class="shade{}" x="{:.1f}" y="3" width="14" height="10" fill="{}"/>').format(
-                k + 1, place, LINES[k + 1][0]
+                k + 1, place, LINE_STYLES[k + 1][0]
             )
         )
         out.append(svg_text(place + 19, 12, name, "start"))

@@ -10,15 +10,15 @@ from markupsafe import Markup
 from numpy.typing import ArrayLike
 
 from ftlm.errors import DataError
-from ftlm.svg.figure import LETTER, NARROW, SMALL, Figure, svg, svg_text, text_width, ticks
-from ftlm.svg.line_chart import LINES
+from ftlm.svg.figure import LETTER_WIDTH_PX, NARROW_WIDTH_PX, SMALL_WIDTH_PX, Figure, svg, svg_text, text_width, ticks
+from ftlm.svg.line_chart import LINE_STYLES
 from ftlm.utils.formatting import number
 from ftlm.utils.validation import Complex
 
 #: Height of the plot, and half the size of a cross [px].
-HEIGHT, CROSS = 260.0, 5.0
+PLANE_HEIGHT_PX, CROSS_HALF_SIZE_PX = 260.0, 5.0
 #: Axis limits relative to the farthest point.
-MARGIN = 1.18
+PLANE_MARGIN_FACTOR = 1.18
 
 
 def plane_chart(
@@ -59,19 +59,22 @@ def plane_chart(
     listed = ", ".join(f"{number(v.real, 3)} {'−' if v.imag < 0 else '+'} {number(abs(v.imag), 3)}j" for v in values)
     described = f"{values.size} points in the plane: {listed or 'none'}. {inside} in the shaded sector."
     wide, small = (
-        _drawing(values, far, sector, (title, described, x_label, y_label), narrow=narrow) for narrow in (False, True)
+        _draw_plane(values, far, sector, (title, described, x_label, y_label), narrow=narrow)
+        for narrow in (False, True)
     )
     return Figure(title, wide, small, caption)
 
 
-def _drawing(values: Complex, far: float, sector: float, words: tuple[str, str, str, str], *, narrow: bool) -> Markup:
+def _draw_plane(
+    values: Complex, far: float, sector: float, words: tuple[str, str, str, str], *, narrow: bool
+) -> Markup:
     title, described, x_label, y_label = words
-    width = NARROW if narrow else SMALL
-    upward = ticks(-far * MARGIN, far * MARGIN, 5)
+    width = NARROW_WIDTH_PX if narrow else SMALL_WIDTH_PX
+    upward = ticks(-far * PLANE_MARGIN_FACTOR, far * PLANE_MARGIN_FACTOR, 5)
     left, top = max(30.0, 10 + max(map(text_width, upward.labels))), 26.0
-    w, h = width - left - 14.0, HEIGHT
+    w, h = width - left - 14.0, PLANE_HEIGHT_PX
     # As many pixels a unit in both directions: far fits in the shorter one.
-    scale = min(w, h) / (2 * far * MARGIN)
+    scale = min(w, h) / (2 * far * PLANE_MARGIN_FACTOR)
     x0, y0 = left + w / 2, top + h / 2
     across = ticks(-w / 2 / scale, w / 2 / scale, 4 if narrow else 8)
     out = [Markup('<g class="grid" fill="none" stroke="currentColor" stroke-opacity="0.14">')]
@@ -85,25 +88,30 @@ def _drawing(values: Complex, far: float, sector: float, words: tuple[str, str, 
     # Beyond a right angle the sector also covers what lies above and below its arms' ends.
     arms = [(x, -y), (reach, -reach), (reach, reach), (x, y)]
     path = "M0 0" + "".join(f"L{a:.1f} {b:.1f}" for a, b in arms) + "Z"
-    out.append(Markup('<path class="shade1" fill="{}" fill-opacity="0.16" d="{}"/>').format(LINES[1][0], path))
+    out.append(Markup('<path class="shade1" fill="{}" fill-opacity="0.16" d="{}"/>').format(LINE_STYLES[1][0], path))
     edge = Markup('<path class="line1" fill="none" stroke="{}" stroke-width="1.2" stroke-dasharray="5 3" d="{}"/>')
-    out.append(edge.format(LINES[1][0], f"M{x:.1f} {-y:.1f}L0 0L{x:.1f} {y:.1f}"))
+    out.append(edge.format(LINE_STYLES[1][0], f"M{x:.1f} {-y:.1f}L0 0L{x:.1f} {y:.1f}"))
     axes = Markup(
         '<path fill="none" stroke="currentColor" stroke-opacity="0.55" d="M{:.1f} 0h{:.1f}M0 {:.1f}v{:.1f}"/>'
     )
     out.append(axes.format(-w / 2, w, -h / 2, h))
     for value in values.tolist():
         a, b = value.real * scale, -value.imag * scale
-        cross = f"M{a - CROSS:.1f} {b - CROSS:.1f}l{2 * CROSS} {2 * CROSS}m0 {-2 * CROSS}l{-2 * CROSS} {2 * CROSS}"
+        c = CROSS_HALF_SIZE_PX
+        cross = f"M{a - c:.1f} {b - c:.1f}l{2 * c} {2 * c}m0 {-2 * c}l{-2 * c} {2 * c}"
         out.append(
-            Markup('<path class="line2" fill="none" stroke="{}" stroke-width="2.2" d="{}"/>').format(LINES[2][0], cross)
+            Markup('<path class="line2" fill="none" stroke="{}" stroke-width="2.2" d="{}"/>').format(
+                LINE_STYLES[2][0], cross
+            )
         )
     out.append(Markup('</svg><g font-size="12" fill="currentColor">'))
     for v, label in zip(upward.values, upward.labels, strict=True):
         out.append(svg_text(left - 6, y0 - v * scale + 4, label, "end"))
     for v, label in zip(across.values, across.labels, strict=True):
         # A label at the edge would be cut off.
-        place = min(max(x0 + v * scale, left + LETTER * len(label) / 2), width - LETTER * len(label) / 2 - 2)
+        place = min(
+            max(x0 + v * scale, left + LETTER_WIDTH_PX * len(label) / 2), width - LETTER_WIDTH_PX * len(label) / 2 - 2
+        )
         out.append(svg_text(place, top + h + 16, label, "middle"))
     factor = f" ({upward.factor})" if upward.factor else ""
     out += [svg_text(4, top - 12, y_label + factor, "start"), svg_text(left + w, top + h + 34, x_label + factor, "end")]
@@ -112,9 +120,9 @@ def _drawing(values: Complex, far: float, sector: float, words: tuple[str, str, 
 
 
 #: Height of the plot and radius of a dot [px].
-HEIGHT_LOCUS, DOT = 240.0, 2.6
+LOCUS_HEIGHT_PX, DOT_RADIUS_PX = 240.0, 2.6
 #: Margin around the data as a share of their range.
-MARGIN_LOCUS = 0.06
+LOCUS_MARGIN_SHARE = 0.06
 
 
 def locus_chart(
@@ -144,30 +152,30 @@ def locus_chart(
         where = f"value {int(np.argmax(bad))} of {dots.size} is not finite" if dots.size else "there is no value"
         raise DataError(f"measured: {where}; leave it out")
     line = line[np.isfinite(line)]
-    ends = f"from {_said(dots[0])} to {_said(dots[-1])}"
+    ends = f"from {_complex_text(dots[0])} to {_complex_text(dots[-1])}"
     described = f"Locus in the complex plane. {dots.size} measured points {ends}, and the model's curve."
     wide, small = (
-        _drawing_locus(line, dots, (title, described, x_label, y_label), narrow=narrow) for narrow in (False, True)
+        _draw_locus(line, dots, (title, described, x_label, y_label), narrow=narrow) for narrow in (False, True)
     )
     return Figure(title, wide, small, caption)
 
 
-def _said(value: complex) -> str:
+def _complex_text(value: complex) -> str:
     return f"{number(value.real, 3)} {'−' if value.imag < 0 else '+'} {number(abs(value.imag), 3)}j"
 
 
-def _drawing_locus(line: Complex, dots: Complex, words: tuple[str, str, str, str], *, narrow: bool) -> Markup:
+def _draw_locus(line: Complex, dots: Complex, words: tuple[str, str, str, str], *, narrow: bool) -> Markup:
     title, described, x_label, y_label = words
-    width = NARROW if narrow else SMALL
+    width = NARROW_WIDTH_PX if narrow else SMALL_WIDTH_PX
     # Dots decide the frame; a curve that strays from them leaves it.
     low, high = complex(dots.real.min(), dots.imag.min()), complex(dots.real.max(), dots.imag.max())
     reach = max(high.real - low.real, high.imag - low.imag) or abs(high) or 1.0
-    pad = MARGIN_LOCUS * reach
+    pad = LOCUS_MARGIN_SHARE * reach
     spread_x, spread_y = high.real - low.real + 2 * pad, high.imag - low.imag + 2 * pad
     guess = ticks(low.imag - pad, low.imag - pad + spread_y, 5)
     left, top = max(34.0, 10 + max(map(text_width, guess.labels))), 48.0
     w = width - left - 14.0
-    scale = min(w / spread_x, HEIGHT_LOCUS / spread_y)
+    scale = min(w / spread_x, LOCUS_HEIGHT_PX / spread_y)
     h = max(scale * spread_y, 90.0)
     x0, y0 = (low.real + high.real) / 2 - w / scale / 2, (low.imag + high.imag) / 2 - h / scale / 2
     upward, across = ticks(y0, y0 + h / scale, max(2, round(h / 48))), ticks(x0, x0 + w / scale, 4 if narrow else 8)
@@ -194,14 +202,16 @@ def _drawing_locus(line: Complex, dots: Complex, words: tuple[str, str, str, str
     if places:
         path = "M" + "L".join(f"{x:.1f} {y:.1f}" for x, y in places)
         curve = Markup('<path class="line1" fill="none" stroke="{}" stroke-width="1.5" d="{}"/>')
-        out.append(curve.format(LINES[1][0], path))
+        out.append(curve.format(LINE_STYLES[1][0], path))
     dot = Markup('<circle class="line0" fill="none" stroke="{}" stroke-width="1.6" cx="{:.1f}" cy="{:.1f}" r="{}"/>')
-    out += [dot.format(LINES[0][0], right(v.real), down(v.imag), DOT) for v in dots.tolist()]
+    out += [dot.format(LINE_STYLES[0][0], right(v.real), down(v.imag), DOT_RADIUS_PX) for v in dots.tolist()]
     out.append(Markup('</svg><g font-size="12" fill="currentColor">'))
     for v, label in zip(upward.values, upward.labels, strict=True):
         out.append(svg_text(left - 6, down(v) + 4, label, "end"))
     for v, label in zip(across.values, across.labels, strict=True):
-        place = min(max(right(v), left + LETTER * len(label) / 2), width - LETTER * len(label) / 2 - 2)
+        place = min(
+            max(right(v), left + LETTER_WIDTH_PX * len(label) / 2), width - LETTER_WIDTH_PX * len(label) / 2 - 2
+        )
         out.append(svg_text(place, top + h + 16, label, "middle"))
     ratios = [f" ({axis.factor})" if axis.factor else "" for axis in (upward, across)]
     out += [
@@ -210,11 +220,11 @@ def _drawing_locus(line: Complex, dots: Complex, words: tuple[str, str, str, str
     ]
     out.append(
         Markup('<path class="line1" fill="none" stroke="{}" stroke-width="1.5" d="M{:.1f} 12h20"/>').format(
-            LINES[1][0], left
+            LINE_STYLES[1][0], left
         )
     )
     out.append(svg_text(left + 26, 16, "model", "start"))
-    out.append(dot.format(LINES[0][0], left + 90, 12, DOT))
+    out.append(dot.format(LINE_STYLES[0][0], left + 90, 12, DOT_RADIUS_PX))
     out.append(svg_text(left + 100, 16, "measured", "start"))
     out.append(Markup("</g>"))
     return svg(width, round(top + h + 44), title, described, out, narrow=narrow)

@@ -12,15 +12,15 @@ import numpy as np
 from markupsafe import Markup
 from numpy.typing import ArrayLike, NDArray
 
-from ftlm.utils.formatting import SUPERSCRIPTS
+from ftlm.utils.formatting import SUPERSCRIPT_DIGITS
 from ftlm.utils.validation import Floats
 
 #: Width of the drawing for narrow screens; its text is as large as in the wide one.
-NARROW = 360
+NARROW_WIDTH_PX = 360
 #: Width of charts that stand side by side.
-SMALL = 520
+SMALL_WIDTH_PX = 520
 #: Width of a character and height of a line at 12 px [px].
-LETTER, LINE = 6.7, 15
+LETTER_WIDTH_PX, LINE_HEIGHT_PX = 6.7, 15
 
 
 @dataclass(frozen=True)
@@ -96,15 +96,15 @@ def svg_text(x: float, y: float, text: str, anchor: str) -> Markup:
 
 def text_width(text: str) -> float:
     """Approximate width of a text [px]."""
-    return LETTER * sum(2 if unicodedata.east_asian_width(c) in "WF" else 1 for c in text)
+    return LETTER_WIDTH_PX * sum(2 if unicodedata.east_asian_width(c) in "WF" else 1 for c in text)
 
 
 #: Points of a line in the wide chart: two per pixel column, so that no peak is lost.
-POINTS = 1500
+MAX_LINE_POINTS = 1500
 #: Smallest difference between axis limits; denormal numbers have too few digits.
-TINY = 1e-290
+MIN_DIFFERENCE = 1e-290
 #: Lines that leave the range of the measured line by more than this many times its height do not extend the axis.
-STRAY = 3.0
+MAX_STRAY_HEIGHTS = 3.0
 
 
 @dataclass(frozen=True)
@@ -143,7 +143,7 @@ def ticks(low: float, high: float, most: int = 6) -> Ticks:
     shift = 0 if 1e-3 <= largest < 1e5 else 3 * math.floor(math.log10(largest) / 3)
     decimals = max(0, shift - exponent)
     labels = [f"{Decimal(m).scaleb(exponent - shift):.{decimals}f}".replace("-", "−") for m in multiples]
-    return Ticks(values, labels, f"×10{str(shift).translate(SUPERSCRIPTS)}" if shift else "", shift)
+    return Ticks(values, labels, f"×10{str(shift).translate(SUPERSCRIPT_DIGITS)}" if shift else "", shift)
 
 
 def log_ticks(low: float, high: float, most: int) -> Ticks:
@@ -152,7 +152,7 @@ def log_ticks(low: float, high: float, most: int) -> Ticks:
     first, last = math.ceil(low / every - 1e-9), math.floor(high / every + 1e-9)
     powers = [k * every for k in range(first, last + 1)]
     if len(powers) >= 3:
-        labels = [f"{10.0**p:g}" if -3 <= p <= 4 else f"10{str(p).translate(SUPERSCRIPTS)}" for p in powers]
+        labels = [f"{10.0**p:g}" if -3 <= p <= 4 else f"10{str(p).translate(SUPERSCRIPT_DIGITS)}" for p in powers]
         return Ticks([float(p) for p in powers], labels)
     fine = [(s, p) for p in range(math.floor(low), math.ceil(high) + 1) for s in (1, 2, 5)]
     inside = [(s, p) for s, p in fine if low <= math.log10(s) + p <= high]
@@ -164,7 +164,7 @@ def log_ticks(low: float, high: float, most: int) -> Ticks:
     return Ticks([v for v, _ in kept], [label for _, label in kept], found.factor)
 
 
-def decimate(y: ArrayLike, most: int = POINTS) -> NDArray[np.intp]:
+def decimate(y: ArrayLike, most: int = MAX_LINE_POINTS) -> NDArray[np.intp]:
     """Return indices of points that represent a line: first, last, minimum and maximum of every block.
 
     Parameters
@@ -198,13 +198,13 @@ def limits(values: list[Floats], margin: float) -> tuple[float, float]:
     if finite.size == 0:
         return 0.0, 1.0
     low, high = float(np.min(finite)), float(np.max(finite))
-    if high - low <= max(1e-12 * max(abs(low), abs(high)), TINY):
-        spread = 0.1 * abs(low) if abs(low) > TINY else 1.0
+    if high - low <= max(1e-12 * max(abs(low), abs(high)), MIN_DIFFERENCE):
+        spread = 0.1 * abs(low) if abs(low) > MIN_DIFFERENCE else 1.0
         return low - spread, high + spread
     return low - margin * (high - low), high + margin * (high - low)
 
 
-def snapped(low: float, high: float) -> tuple[float, float]:
+def snap_limits(low: float, high: float) -> tuple[float, float]:
     """Extend limits to a near tick: block pulses begin half a step after 0 and end half a step before 10."""
     values = ticks(low - 0.01 * (high - low), high + 0.01 * (high - low), 9).values
     return min(low, values[0]), max(high, values[-1])

@@ -12,8 +12,8 @@ from markupsafe import Markup
 from numpy.typing import ArrayLike, NDArray
 
 from ftlm.errors import DataError
-from ftlm.svg.figure import LETTER, NARROW, SMALL, Figure, svg, svg_text, text_width
-from ftlm.utils.formatting import number, shortened, symbol
+from ftlm.svg.figure import LETTER_WIDTH_PX, NARROW_WIDTH_PX, SMALL_WIDTH_PX, Figure, svg, svg_text, text_width
+from ftlm.utils.formatting import number, symbol, truncate_text
 from ftlm.utils.validation import Floats
 
 
@@ -47,7 +47,7 @@ class Landscape:
 
 
 #: From best to worst, reversed viridis: dark is good on white, and lightness is monotone.
-HEAT = ("#440154", "#472c7a", "#3b518b", "#2c718e", "#21908d", "#27ad81", "#5cc863", "#aadc32", "#fde725")
+HEAT_COLORS = ("#440154", "#472c7a", "#3b518b", "#2c718e", "#21908d", "#27ad81", "#5cc863", "#aadc32", "#fde725")
 NO_SCORE = "#9aa3ad"
 
 
@@ -88,7 +88,7 @@ def _classes(scores: Floats, low: float, high: float) -> NDArray[np.intp]:
     first, span = math.log(low), math.log(high) - math.log(low)
     with np.errstate(divide="ignore", invalid="ignore"):
         place = (np.log(scores) - first) / (span if span > 0 else 1.0)
-    steps = np.clip(np.nan_to_num(place * len(HEAT)), 0, len(HEAT) - 1)
+    steps = np.clip(np.nan_to_num(place * len(HEAT_COLORS)), 0, len(HEAT_COLORS) - 1)
     return np.where(np.isfinite(place), steps, -1).astype(np.intp)
 
 
@@ -99,7 +99,7 @@ def _rectangle(x: float, y: float, width: float, height: str, colour: str) -> Ma
     )
 
 
-def _picked(count: int, most: int) -> list[int]:
+def _label_indices(count: int, most: int) -> list[int]:
     """Indices of the cells that get a label, first and last included."""
     return sorted({round(k) for k in np.linspace(0, count - 1, most).tolist()})
 
@@ -107,19 +107,19 @@ def _picked(count: int, most: int) -> list[int]:
 def _heat_drawing(
     landscape: Landscape, ends: tuple[float, float], best: tuple[int, int], title: str, described: str, *, narrow: bool
 ) -> Markup:
-    width = NARROW if narrow else SMALL
+    width = NARROW_WIDTH_PX if narrow else SMALL_WIDTH_PX
     rows, columns = landscape.scores.shape
     x_marks, y_marks = ([f"{v:g}" for v in axis] for axis in (landscape.x, landscape.y))
     longest = max(map(len, x_marks))
-    left, top, below = max(46.0, LETTER * max(map(len, y_marks)) + 12), 26.0, 84.0
-    w, h = width - left - max(14.0, LETTER * longest / 2), min(max(rows * 6.0, 140.0), 300.0)
+    left, top, below = max(46.0, LETTER_WIDTH_PX * max(map(len, y_marks)) + 12), 26.0, 84.0
+    w, h = width - left - max(14.0, LETTER_WIDTH_PX * longest / 2), min(max(rows * 6.0, 140.0), 300.0)
     cell_w, cell_h, bottom = w / columns, h / rows, top + h
     out = []
     for i, row in enumerate(_classes(landscape.scores, *ends).tolist()):
         j = 0
         # Cells alike in a row are one rectangle.
         for step, alike in groupby(row):
-            count, colour = len(list(alike)), HEAT[step] if step >= 0 else NO_SCORE
+            count, colour = len(list(alike)), HEAT_COLORS[step] if step >= 0 else NO_SCORE
             place = left + j * cell_w, bottom - (i + 1) * cell_h
             out.append(_rectangle(*place, count * cell_w, f"{cell_h + 0.3:.1f}", colour))
             j += count
@@ -127,29 +127,31 @@ def _heat_drawing(
     ring = Markup('<circle cx="{:.1f}" cy="{:.1f}" r="7" fill="none" stroke="{}" stroke-width="{}"/>')
     out += [ring.format(*centre, colour, thickness) for colour, thickness in (("#fff", 4), ("#d1480a", 2))]
     out.append(Markup('<g font-size="12" fill="currentColor">'))
-    fit = max(2, min(columns, 5 if narrow else 9, int(w / (LETTER * longest + 14))))
-    out += [svg_text(left + (k + 0.5) * cell_w, bottom + 16, x_marks[k], "middle") for k in _picked(columns, fit)]
-    for k in _picked(rows, min(rows, 7)):
+    fit = max(2, min(columns, 5 if narrow else 9, int(w / (LETTER_WIDTH_PX * longest + 14))))
+    out += [
+        svg_text(left + (k + 0.5) * cell_w, bottom + 16, x_marks[k], "middle") for k in _label_indices(columns, fit)
+    ]
+    for k in _label_indices(rows, min(rows, 7)):
         out.append(svg_text(left - 6, bottom - (k + 0.5) * cell_h + 4, y_marks[k], "end"))
     across, upward = landscape.names
     out.append(svg_text(4, top - 12, f"order {symbol(upward)}", "start"))
     out.append(svg_text(left + w, bottom + 34, f"order {symbol(across)}", "end"))
     size = 20.0 if narrow else 26.0
     out.append(svg_text(left, bottom + 76, f"score {number(ends[0], 3)}", "start"))
-    out.append(svg_text(left + size * len(HEAT), bottom + 76, number(ends[1], 3), "end"))
+    out.append(svg_text(left + size * len(HEAT_COLORS), bottom + 76, number(ends[1], 3), "end"))
     out.append(Markup("</g>"))
-    out += [_rectangle(left + k * size, bottom + 48, size, "12", colour) for k, colour in enumerate(HEAT)]
+    out += [_rectangle(left + k * size, bottom + 48, size, "12", colour) for k, colour in enumerate(HEAT_COLORS)]
     return svg(width, round(bottom + below), title, described, out, narrow=narrow)
 
 
 #: From -1 to 1, blue over light gray to vermilion; black text is readable in the middle.
-SCALE = ("#1f4e8c", "#4b80bd", "#8fb3d9", "#c8d9ea", "#eceff1", "#f4d5c4", "#e9a27f", "#cf6535", "#9c3009")
+CORRELATION_COLORS = ("#1f4e8c", "#4b80bd", "#8fb3d9", "#c8d9ea", "#eceff1", "#f4d5c4", "#e9a27f", "#cf6535", "#9c3009")
 #: Indices of colors that need white text.
-DARK = {0, 1, 7, 8}
+DARK_COLOR_INDICES = {0, 1, 7, 8}
 NO_VALUE = "#9aa3ad"
 #: Largest cell, and smallest cell with a number [px].
-LARGEST_CELL, ROOM = 46.0, 30.0
-MOST_LETTERS = 12
+MAX_CELL_PX, MIN_LABELED_CELL_PX = 46.0, 30.0
+MAX_NAME_CHARACTERS = 12
 
 
 def correlation_map(names: Sequence[str], values: ArrayLike, *, title: str, caption: str = "") -> Figure:
@@ -182,15 +184,15 @@ def correlation_map(names: Sequence[str], values: ArrayLike, *, title: str, capt
     at = np.unravel_index(int(np.argmax(np.abs(off))), off.shape)
     farthest = f"{names[int(at[0])]} and {names[int(at[1])]} {number(float(off[at]), 3)}"
     described = f"Correlations of {', '.join(names)}. The largest: {farthest}."
-    wide, small = (_drawing(names, matrix, title, described, narrow=narrow) for narrow in (False, True))
+    wide, small = (_draw_matrix(names, matrix, title, described, narrow=narrow) for narrow in (False, True))
     return Figure(title, wide, small, caption)
 
 
-def _drawing(names: Sequence[str], matrix: Floats, title: str, described: str, *, narrow: bool) -> Markup:
-    width, count = (NARROW if narrow else SMALL), len(names)
-    labels = [shortened(symbol(n), MOST_LETTERS) for n in names]
+def _draw_matrix(names: Sequence[str], matrix: Floats, title: str, described: str, *, narrow: bool) -> Markup:
+    width, count = (NARROW_WIDTH_PX if narrow else SMALL_WIDTH_PX), len(names)
+    labels = [truncate_text(symbol(n), MAX_NAME_CHARACTERS) for n in names]
     left = 10 + max(map(text_width, labels))
-    cell = min((width - left - 8) / count, LARGEST_CELL)
+    cell = min((width - left - 8) / count, MAX_CELL_PX)
     # Names above the columns stand upright where they have no room.
     turned = max(map(text_width, labels)) > cell - 4
     top = 8 + (max(map(text_width, labels)) if turned else 16)
@@ -200,11 +202,15 @@ def _drawing(names: Sequence[str], matrix: Floats, title: str, described: str, *
         for j in range(count):
             value = float(matrix[i, j])
             known = np.isfinite(value)
-            step = int(np.clip(round((value + 1) / 2 * (len(SCALE) - 1)), 0, len(SCALE) - 1)) if known else -1
+            step = (
+                int(np.clip(round((value + 1) / 2 * (len(CORRELATION_COLORS) - 1)), 0, len(CORRELATION_COLORS) - 1))
+                if known
+                else -1
+            )
             x, y = left + j * cell, top + i * cell
-            out.append(box.format(x, y, cell - 1, cell - 1, SCALE[step] if known else NO_VALUE))
-            if cell >= ROOM and i != j:
-                ink = "#fff" if step in DARK or not known else "#15181c"
+            out.append(box.format(x, y, cell - 1, cell - 1, CORRELATION_COLORS[step] if known else NO_VALUE))
+            if cell >= MIN_LABELED_CELL_PX and i != j:
+                ink = "#fff" if step in DARK_COLOR_INDICES or not known else "#15181c"
                 text = f"{value:.2f}".replace("0.", ".").replace("-", "−") if known else "–"
                 texts.append(
                     Markup(
@@ -225,8 +231,8 @@ def _drawing(names: Sequence[str], matrix: Floats, title: str, described: str, *
             out.append(svg_text(x, top - 6, label, "middle"))
     foot = top + count * cell + 12
     size = 18.0 if narrow else 22.0
-    out += [box.format(left + k * size, foot, size, 10, colour) for k, colour in enumerate(SCALE)]
+    out += [box.format(left + k * size, foot, size, 10, colour) for k, colour in enumerate(CORRELATION_COLORS)]
     out.append(svg_text(left, foot + 24, "−1", "start"))
-    out.append(svg_text(left + size * len(SCALE) / 2, foot + 24, "0", "middle"))
-    out.append(svg_text(left + size * len(SCALE), foot + 24, "1", "end"))
+    out.append(svg_text(left + size * len(CORRELATION_COLORS) / 2, foot + 24, "0", "middle"))
+    out.append(svg_text(left + size * len(CORRELATION_COLORS), foot + 24, "1", "end"))
     return svg(width, round(foot + 32), title, described, [*out, *texts, Markup("</g>")], narrow=narrow)

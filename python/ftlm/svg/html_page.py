@@ -22,7 +22,7 @@ from ftlm.utils.files import write_atomically
 from ftlm.utils.formatting import Cell, number
 
 #: Columns from which a table has small type, so that the paper's fifteen columns fit a laptop screen.
-DENSE = 12
+DENSE_MIN_COLUMNS = 12
 NOT_IN_MODEL = "–"
 
 
@@ -98,7 +98,7 @@ class Table:
         """Return the table in a container that scrolls horizontally on narrow screens."""
         classes = [Markup(' class="{}"').format(c) if c else Markup("") for c in self._classes()]
         # The title is outside the scrolling container, so that it wraps; the label repeats it for screen readers.
-        dense = " dense" if len(self.columns) >= DENSE else " wrap" if self.wrap else ""
+        dense = " dense" if len(self.columns) >= DENSE_MIN_COLUMNS else " wrap" if self.wrap else ""
         dense += " stacked" if self.stacked else ""
         out = [Markup('<div class="table{}"><p class="title">{}</p>').format(dense, self.title)]
         out.append(Markup('<div class="scroll" role="group" tabindex="0" aria-label="{}">').format(self.title))
@@ -183,7 +183,7 @@ def _template() -> Template:
 
 
 @cache
-def look() -> Markup:
+def style_sheet() -> Markup:
     """Common style sheet of all pages."""
     return Markup(resources.files("ftlm.svg").joinpath("style.css").read_text("utf-8"))  # our own file
 
@@ -244,7 +244,7 @@ def write_page(
         lead=lead,
         sections=list(sections),
         version=__version__,
-        look=look(),
+        look=style_sheet(),
         chart_css=chart_css(),
         script=script,
         script_hash=digest,
@@ -263,7 +263,7 @@ class Page:
     lead: str
 
 
-class Reported(ABC):
+class ReportMixin(ABC):
     """Mixin of results with an HTML report of their own."""
 
     @abstractmethod

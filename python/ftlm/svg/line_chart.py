@@ -13,33 +13,33 @@ from numpy.typing import ArrayLike
 
 from ftlm.errors import DataError
 from ftlm.svg.figure import (
-    LETTER,
-    LINE,
-    NARROW,
-    POINTS,
-    STRAY,
+    LETTER_WIDTH_PX,
+    LINE_HEIGHT_PX,
+    MAX_LINE_POINTS,
+    MAX_STRAY_HEIGHTS,
+    NARROW_WIDTH_PX,
     Figure,
     Ticks,
     decimate,
     limits,
     log_ticks,
-    snapped,
+    snap_limits,
     svg,
     svg_text,
     text_width,
     ticks,
 )
-from ftlm.utils.formatting import number, shortened
+from ftlm.utils.formatting import number, truncate_text
 from ftlm.utils.validation import Floats
 
 #: Positions of a slider, more than its track has pixels.
-PLACES = 750
+SLIDER_POSITIONS = 750
 #: Quantization levels over the range of a line: five digits.
-PARTS = 1e5
+READOUT_LEVELS = 1e5
 
 
-def readings(
-    x: Floats, lines: Sequence[tuple[str, int, Floats]], x_label: str, y_label: str, places: int = PLACES
+def slider_readout(
+    x: Floats, lines: Sequence[tuple[str, int, Floats]], x_label: str, y_label: str, places: int = SLIDER_POSITIONS
 ) -> str:
     """Return line values at the slider positions as JSON of integers.
 
@@ -63,33 +63,33 @@ def readings(
     there = np.flatnonzero(np.isfinite(x))
     if not there.size or not lines:
         return ""
-    chosen = there[:: max(1, math.ceil(there.size / min(places, PLACES)))]
+    chosen = there[:: max(1, math.ceil(there.size / min(places, SLIDER_POSITIONS)))]
     begin = None
     if len(lines) > 1:
         apart = np.abs(lines[0][2][there] - lines[1][2][there])
         if np.isfinite(apart).any():
             begin = there[int(np.nanargmax(apart))]
     chosen = np.unique(np.append(chosen, [there[-1], *([] if begin is None else [begin])]))
-    name, unit = _parted(x_label)
+    name, unit = _split_unit(x_label)
     told = {
         "name": name,
         "unit": unit,
-        "y": _parted(y_label)[1],
-        "at": _whole(x[chosen]),
+        "y": _split_unit(y_label)[1],
+        "at": _scaled_integers(x[chosen]),
         "begin": 0 if begin is None else int(np.searchsorted(chosen, begin)),
         "apart": begin is not None,
-        "lines": [{"name": n, "style": s, "at": _whole(y[chosen])} for n, s, y in lines],
+        "lines": [{"name": n, "style": s, "at": _scaled_integers(y[chosen])} for n, s, y in lines],
     }
     return json.dumps(told, separators=(",", ":"), allow_nan=False)
 
 
-def _parted(label: str) -> tuple[str, str]:
+def _split_unit(label: str) -> tuple[str, str]:
     """Split an axis label into name and unit."""
     bare, bracket, unit = label.rpartition(" [")
     return (bare, unit[:-1]) if bracket and unit.endswith("]") else (label, "")
 
 
-def _whole(values: Floats) -> list[object]:
+def _scaled_integers(values: Floats) -> list[object]:
     """Return a power of ten and integers whose product is the values; null for missing ones."""
     finite = values[np.isfinite(values)]
     if not finite.size:
@@ -97,23 +97,23 @@ def _whole(values: Floats) -> list[object]:
     low, high = float(finite.min()), float(finite.max())
     largest = max(abs(low), abs(high))
     # Beyond twelve digits of the largest value a browser's numbers have no whole ones.
-    fine = max((high / PARTS - low / PARTS), largest * 1e-12, 1e-290)
+    fine = max((high / READOUT_LEVELS - low / READOUT_LEVELS), largest * 1e-12, 1e-290)
     power = math.floor(math.log10(fine))
     scaled = values / 10.0**power
     return [power, [None if math.isnan(v) else round(v) for v in scaled.tolist()]]
 
 
 #: Values beyond this are gaps, because their differences overflow.
-HUGE = 1e300
+MAX_DRAWN_VALUE = 1e300
 #: Coordinates inside the plot are integer tenths of a pixel.
-SUB = 10
+TENTHS_PER_PIXEL = 10
 #: Diameter of a dot [px].
-DOT = 4.6
+DOT_DIAMETER_PX = 4.6
 #: Longest label beside a line [characters]; the legend of the narrow chart allows twice as many.
-MOST_LETTERS = 22
+MAX_LABEL_CHARACTERS = 22
 #: (light, dark, dashes). Vermilion, blue, green, purple after Okabe and Ito, darkened to a contrast of 3:1 on white and
 #: lightened for dark mode; dashes distinguish lines without color. The first style is neutral.
-LINES = (
+LINE_STYLES = (
     ("#3d4650", "#7f8b97", ""),
     ("#d1480a", "#ff8f45", ""),
     ("#0a6cb0", "#5ab8f5", "8 3"),
@@ -122,7 +122,7 @@ LINES = (
     ("#7a6300", "#e6cb4f", "14 4"),
 )
 #: Name prefixes of lines in the neutral style.
-NEUTRAL = ("measured", "simulated arm")
+NEUTRAL_PREFIXES = ("measured", "simulated arm")
 
 
 @dataclass(frozen=True)
@@ -146,7 +146,10 @@ class _Plot:
     def tenths(self, x: Floats, y: Floats) -> tuple[list[int], list[int]]:
         """Coordinates in integer tenths of a pixel, clipped near the plot to keep them short."""
         down = np.clip(self.down(y) - self.top, -self.height, 2 * self.height)
-        xs, ys = (np.rint(places * SUB).astype(np.int64).tolist() for places in (self.across(x) - self.left, down))
+        xs, ys = (
+            np.rint(places * TENTHS_PER_PIXEL).astype(np.int64).tolist()
+            for places in (self.across(x) - self.left, down)
+        )
         return xs, ys
 
 
@@ -183,7 +186,7 @@ class _Chart:
     stems: bool
 
     @property
-    def named(self) -> list[_Line]:
+    def named_lines(self) -> list[_Line]:
         return [line for line in self.lines if line.name]
 
     def ticks(self, *, narrow: bool) -> tuple[Ticks, Ticks]:
@@ -205,7 +208,7 @@ def line_chart(
     log_x: bool = False,
     log_y: bool = False,
     caption: str = "",
-    points: int = POINTS,
+    points: int = MAX_LINE_POINTS,
     bands: Sequence[tuple[ArrayLike, ArrayLike]] = (),
     stems: bool = False,
     dots: Collection[str] = (),
@@ -249,10 +252,10 @@ def line_chart(
     DataError
         No line, or a line whose length differs from that of x.
     """
-    drawn, notes = _checked(x, lines, x_label, log_x, log_y, dots)
+    drawn, notes = _prepare_lines(x, lines, x_label, log_x, log_y, dots)
     x_low, x_high = limits([drawn[0].x[np.isfinite(drawn[0].x)]], 0.02 if stems else 0.0)
     if not (log_x or stems):
-        x_low, x_high = snapped(x_low, x_high)
+        x_low, x_high = snap_limits(x_low, x_high)
     shades = [_shade(drawn[k], low, high, log_y) for k, (low, high) in enumerate(bands[: len(drawn)])]
     # Edges of shades widen the axis and are never told to have left it, so they are lines of no name and no neutral.
     edges = [_Line("", 1, b.x, y) for b in shades for y in (b.low, b.high) if np.isfinite(y).any()]
@@ -263,7 +266,7 @@ def line_chart(
     notes += [f"{name} leaves the axis (to {number(10.0**far if log_y else far, 3)})." for name, far in strays]
     described = f"Line chart. {y_label} against {x_label}" + ("; logarithmic vertical axis" if log_y else "")
     described += "; logarithmic horizontal axis. " if log_x else ". "
-    described += " ".join(_described(line, log_y) for line in drawn)
+    described += " ".join(_describe_line(line, log_y) for line in drawn)
     chart = _Chart(
         title, described, x_label, y_label, drawn, shades, (x_low, x_high, y_low, y_high), log_x, log_y, stems
     )
@@ -271,9 +274,9 @@ def line_chart(
     if slider and not (log_x or log_y):
         # A page of many charts has few points a line, and room for as few to be read out.
         values = [(line.name, line.style, line.y) for line in drawn]
-        read = readings(drawn[0].x, values, x_label, y_label, max(2, points // 2))
-    wide = _drawing(chart, width, height, points, narrow=False, read=read)
-    small = _drawing(chart, NARROW, 240, max(4, points // 2), narrow=True)
+        read = slider_readout(drawn[0].x, values, x_label, y_label, max(2, points // 2))
+    wide = _draw_chart(chart, width, height, points, narrow=False, read=read)
+    small = _draw_chart(chart, NARROW_WIDTH_PX, 240, max(4, points // 2), narrow=True)
     return Figure(title, wide, small, " ".join(([caption] if caption else []) + notes))
 
 
@@ -291,11 +294,11 @@ def _shade(line: _Line, low: ArrayLike, high: ArrayLike, log_y: bool) -> _Shade:
         if values.shape != line.x.shape:
             raise DataError(f"a band of {line.name!r} has shape {values.shape}, x {line.x.shape}; give one length")
         values = _logarithms(values) if log_y else values
-        edges.append(np.where(np.abs(values) < HUGE, values, np.nan))
+        edges.append(np.where(np.abs(values) < MAX_DRAWN_VALUE, values, np.nan))
     return _Shade(line.style, line.x, *edges)
 
 
-def _checked(
+def _prepare_lines(
     x: ArrayLike, lines: Sequence[tuple[str, ArrayLike]], x_label: str, log_x: bool, log_y: bool, dots: Collection[str]
 ) -> tuple[list[_Line], list[str]]:
     """Return lines ready to draw, and notes about values that cannot be drawn."""
@@ -308,7 +311,7 @@ def _checked(
         y = np.array(values, dtype=np.float64)
         if y.ndim != 1 or y.shape != across.shape:
             raise DataError(f"line {name!r} has shape {y.shape}, x {across.shape}; give arrays of one length")
-        bad = ~(np.isfinite(y) & np.isfinite(across)) | (np.abs(y) > HUGE)
+        bad = ~(np.isfinite(y) & np.isfinite(across)) | (np.abs(y) > MAX_DRAWN_VALUE)
         if np.any(bad) and name not in dots:
             first = across[int(np.argmax(bad))]
             where = f" (first at {x_label} = {first:.4g})" if np.isfinite(first) else ""
@@ -319,8 +322,8 @@ def _checked(
             if np.any(below):
                 notes.append(f"{name}: {np.sum(below)} values of 0 or less have no place on a logarithmic axis.")
             y = _logarithms(y)
-        neutral = name.startswith(NEUTRAL)
-        style = 0 if neutral else 1 + coloured % (len(LINES) - 1)
+        neutral = name.startswith(NEUTRAL_PREFIXES)
+        style = 0 if neutral else 1 + coloured % (len(LINE_STYLES) - 1)
         coloured += not neutral
         drawn.append(_Line(name, style, across, y, name in dots))
     return drawn, notes
@@ -335,7 +338,7 @@ def _y_limits(lines: list[_Line]) -> tuple[float, float, list[tuple[str, float]]
         return low, high, []
     # A free run that runs away would flatten what it is to be compared with.
     bottom, top = limits(neutral, 0.0)
-    reach = STRAY * (top - bottom)
+    reach = MAX_STRAY_HEIGHTS * (top - bottom)
     floor, ceiling = bottom - reach, top + reach
     strays = []
     for y, line in zip(every, lines, strict=True):
@@ -345,7 +348,7 @@ def _y_limits(lines: list[_Line]) -> tuple[float, float, list[tuple[str, float]]
     return max(low, floor), min(high, ceiling), strays
 
 
-def _described(line: _Line, log_y: bool) -> str:
+def _describe_line(line: _Line, log_y: bool) -> str:
     finite = line.y[np.isfinite(line.y)]
     if finite.size == 0:
         return f"{line.name}: no value that can be drawn."
@@ -354,15 +357,15 @@ def _described(line: _Line, log_y: bool) -> str:
     return f"{line.name or 'Values'}: from {low} to {high}, at the end {last}."
 
 
-def _drawing(chart: _Chart, width: int, height: int, points: int, *, narrow: bool, read: str = "") -> Markup:
+def _draw_chart(chart: _Chart, width: int, height: int, points: int, *, narrow: bool, read: str = "") -> Markup:
     across, upward = chart.ticks(narrow=narrow)
-    named = chart.named
+    named = chart.named_lines
     legend = _legend(named, width) if narrow else []
     left = max(30.0, 10 + max(map(text_width, upward.labels)))
     # Beside the lines: a gap, a swatch, the label.
-    side = max((text_width(shortened(line.name, MOST_LETTERS)) for line in named), default=0.0)
+    side = max((text_width(truncate_text(line.name, MAX_LABEL_CHARACTERS)) for line in named), default=0.0)
     right = 14.0 if narrow or not named else 34 + side
-    top = 26.0 + (LINE * (legend[-1][2] + 1) + 5 if legend else 0)
+    top = 26.0 + (LINE_HEIGHT_PX * (legend[-1][2] + 1) + 5 if legend else 0)
     if narrow:
         height += int(top - 26)
     plot = _Plot(left, top, width - left - right, height - top - 40.0, chart.frame)
@@ -398,16 +401,18 @@ def _curves(chart: _Chart, plot: _Plot, points: int) -> list[Markup]:
         Markup(
             '<svg class="plot" preserveAspectRatio="none" x="{:.1f}" y="{:.1f}" width="{:.1f}" height="{:.1f}" '
             'viewBox="0 0 {:.0f} {:.0f}">'
-        ).format(plot.left, plot.top, plot.width, plot.height, plot.width * SUB, plot.height * SUB)
+        ).format(
+            plot.left, plot.top, plot.width, plot.height, plot.width * TENTHS_PER_PIXEL, plot.height * TENTHS_PER_PIXEL
+        )
     ]
     shaded = Markup('<path class="shade{}" fill="{}" fill-opacity="0.2" d="{}"/>')
     for shade in chart.shades:
         if d := _outline(shade, plot, points):
-            out.append(shaded.format(shade.style, LINES[shade.style][0], d))
+            out.append(shaded.format(shade.style, LINE_STYLES[shade.style][0], d))
     if chart.stems:
-        zero = float(plot.down(0.0) - plot.top) * SUB
+        zero = float(plot.down(0.0) - plot.top) * TENTHS_PER_PIXEL
         axis = Markup('<path fill="none" stroke="currentColor" stroke-opacity="0.55" d="M0 {:.0f}h{:.0f}"/>')
-        out.append(axis.format(zero, plot.width * SUB))
+        out.append(axis.format(zero, plot.width * TENTHS_PER_PIXEL))
     # The neutral line lies beneath the others.
     for line in sorted(chart.lines, key=lambda item: item.style != 0 or item.dots):
         if d := _stem_path(line, plot) if chart.stems else _path(line, plot, points):
@@ -426,7 +431,7 @@ def _labels(chart: _Chart, plot: _Plot, across: Ticks, upward: Ticks, width: int
         out.append(svg_text(float(plot.across(v)), bottom + 16, label, "middle"))
     out.append(Markup("</g>"))
     y_text, x_text = (
-        shortened(f"{label} ({axis.factor})" if axis.factor else label, int((width - 8) / LETTER))
+        truncate_text(f"{label} ({axis.factor})" if axis.factor else label, int((width - 8) / LETTER_WIDTH_PX))
         for label, axis in ((chart.y_label, upward), (chart.x_label, across))
     )
     out += [svg_text(4, plot.top - 12, y_text, "start"), svg_text(left + w, bottom + 34, x_text, "end")]
@@ -459,15 +464,15 @@ def _outline(shade: _Shade, plot: _Plot, points: int) -> str:
 
 def _stem_path(line: _Line, plot: _Plot) -> str:
     kept = np.flatnonzero(np.isfinite(line.y) & np.isfinite(line.x))
-    zero = round(float(plot.down(0.0) - plot.top) * SUB)
+    zero = round(float(plot.down(0.0) - plot.top) * TENTHS_PER_PIXEL)
     return "".join(f"M{x} {zero}V{y}" for x, y in zip(*plot.tenths(line.x[kept], line.y[kept]), strict=True))
 
 
 def _stroke(style: int, *, dots: bool = False) -> Markup:
-    light, _, dashes = LINES[style]
+    light, _, dashes = LINE_STYLES[style]
     dashes = "" if dots else dashes
     # The measured line is wide enough to show on both sides of one that follows it exactly.
-    thickness = DOT if dots else 3.4 if style == 0 else 1.5
+    thickness = DOT_DIAMETER_PX if dots else 3.4 if style == 0 else 1.5
     dash = Markup(' stroke-dasharray="{}"').format(dashes) if dashes else ""
     # The page's style sheet replaces the colour in the dark; the attribute serves wherever there is no page.
     return Markup(
@@ -504,18 +509,18 @@ def _end_labels(lines: list[_Line], plot: _Plot) -> list[Markup]:
         finite = line.y[np.isfinite(line.y)]
         ends.append(float(np.clip(plot.down(finite[-1]), top, bottom)) if finite.size else (top + bottom) / 2)
     # Lines that end together keep the order in which they were given.
-    order = sorted(range(len(lines)), key=lambda i: (round(ends[i] / LINE), i))
+    order = sorted(range(len(lines)), key=lambda i: (round(ends[i] / LINE_HEIGHT_PX), i))
     places = [ends[i] for i in order]
     for k in range(1, len(places)):
-        places[k] = max(places[k], places[k - 1] + LINE)
+        places[k] = max(places[k], places[k - 1] + LINE_HEIGHT_PX)
     if places[-1] > bottom:
         places[-1] = bottom
         for k in range(len(places) - 2, -1, -1):
-            places[k] = min(places[k], places[k + 1] - LINE)
+            places[k] = min(places[k], places[k + 1] - LINE_HEIGHT_PX)
     out = []
     for i, y in zip(order, places, strict=True):
         out.append(_swatch(lines[i], x + 8, y, 16))
-        out.append(svg_text(x + 28, y + 4, shortened(lines[i].name, MOST_LETTERS), "start"))
+        out.append(svg_text(x + 28, y + 4, truncate_text(lines[i].name, MAX_LABEL_CHARACTERS), "start"))
     return out
 
 
@@ -523,7 +528,7 @@ def _legend(lines: list[_Line], width: int) -> list[tuple[_Line, float, int]]:
     """Position of every legend entry above a narrow chart: (line, x, row)."""
     entries, x, row = [], 4.0, 0
     for line in lines:
-        needed = 26 + text_width(shortened(line.name, 2 * MOST_LETTERS)) + 14
+        needed = 26 + text_width(truncate_text(line.name, 2 * MAX_LABEL_CHARACTERS)) + 14
         if x > 4 and x + needed > width:
             x, row = 4.0, row + 1
         entries.append((line, x, row))
@@ -534,17 +539,19 @@ def _legend(lines: list[_Line], width: int) -> list[tuple[_Line, float, int]]:
 def _legend_marks(entries: list[tuple[_Line, float, int]]) -> list[Markup]:
     out = []
     for line, x, row in entries:
-        y = 8.0 + LINE * row
+        y = 8.0 + LINE_HEIGHT_PX * row
         out.append(_swatch(line, x, y, 20))
-        out.append(svg_text(x + 26, y + 4, shortened(line.name, 2 * MOST_LETTERS), "start"))
+        out.append(svg_text(x + 26, y + 4, truncate_text(line.name, 2 * MAX_LABEL_CHARACTERS), "start"))
     return out
 
 
 def chart_css() -> Markup:
     """CSS rules of the line colors, light and dark."""
-    light = "".join(f"--line{i}:{c};" for i, (c, _, _) in enumerate(LINES))
-    dark = "".join(f"--line{i}:{c};" for i, (_, c, _) in enumerate(LINES))
-    rules = "".join(f".line{i}{{stroke:var(--line{i})}}.shade{i}{{fill:var(--line{i})}}" for i in range(len(LINES)))
+    light = "".join(f"--line{i}:{c};" for i, (c, _, _) in enumerate(LINE_STYLES))
+    dark = "".join(f"--line{i}:{c};" for i, (_, c, _) in enumerate(LINE_STYLES))
+    rules = "".join(
+        f".line{i}{{stroke:var(--line{i})}}.shade{i}{{fill:var(--line{i})}}" for i in range(len(LINE_STYLES))
+    )
     return Markup(
         f":root{{{light}}}@media screen and (prefers-color-scheme:dark){{:root{{{dark}}}}}{rules}"  # our constants
     )

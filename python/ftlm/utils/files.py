@@ -17,19 +17,19 @@ import msgspec
 
 from ftlm._core import __version__
 from ftlm.errors import DataError, ModelError
-from ftlm.utils.validation import shown, words_of
+from ftlm.utils.validation import error_text, short_repr
 
 #: INFO: files read and written, start and end of fits. WARNING: findings that make a result doubtful.
-LOG = logging.getLogger("ftlm")
-LOG.addHandler(logging.NullHandler())
+PACKAGE_LOGGER = logging.getLogger("ftlm")
+PACKAGE_LOGGER.addHandler(logging.NullHandler())
 
 
 #: Binary mode on systems that distinguish text from bytes.
-_NEW = os.O_WRONLY | os.O_CREAT | os.O_EXCL | getattr(os, "O_BINARY", 0)
+_NEW_FILE_FLAGS = os.O_WRONLY | os.O_CREAT | os.O_EXCL | getattr(os, "O_BINARY", 0)
 
 
 @dataclass(frozen=True)
-class Words:
+class FileMessages:
     """Wording of errors about a file that cannot be written.
 
     Parameters
@@ -49,38 +49,42 @@ class Words:
     overwrite: str = "force=True (--force)"
     failed: str = "cannot be written: {}; choose another folder"
 
-    def shown(self, path: Path) -> str:
+    def format_path(self, path: Path) -> str:
         """Return a path as text."""
         return repr(str(path)) if self.quoted else str(path)
 
 
 #: Wording for models, pages and tables; for runs; for outputs of commands.
-PLAIN = Words()
-RUN = Words(
+DEFAULT_MESSAGES = FileMessages()
+RUN_MESSAGES = FileMessages(
     quoted=True,
     folder="give the name of a file in it",
     failed="cannot be written ({}); check the folder and the space left",
 )
-COMMAND = Words(folder="name a file in it", overwrite="--force")
+COMMAND_MESSAGES = FileMessages(folder="name a file in it", overwrite="--force")
 
 
-def check_new(path: str | os.PathLike[str], *, force: bool, words: Words = PLAIN) -> Path:
+def check_new(path: str | os.PathLike[str], *, force: bool, words: FileMessages = DEFAULT_MESSAGES) -> Path:
     """Raise for the name of a folder, or of an existing file without ``force``."""
     file = Path(path)
     if words.folder and file.is_dir():
-        raise DataError(f"{words.shown(file)} is a folder; {words.folder}")
-    there = _status(file)
+        raise DataError(f"{words.format_path(file)} is a folder; {words.folder}")
+    there = _link_status(file)
     # A dangling link is a file that someone meant to be there.
     if there is not None and not force:
-        raise DataError(f"{words.shown(file)} exists; choose another name, or overwrite it with {words.overwrite}")
+        raise DataError(
+            f"{words.format_path(file)} exists; choose another name, or overwrite it with {words.overwrite}"
+        )
     if there is not None and not stat.S_ISREG(there.st_mode) and not stat.S_ISDIR(there.st_mode):
         # A device of the system would be gone, and what stands behind a link is not what was asked for.
         kind = "a link" if stat.S_ISLNK(there.st_mode) else "a device, pipe or socket"
-        raise DataError(f"{words.shown(file)} is {kind}, no regular file, and is not overwritten; choose another name")
+        raise DataError(
+            f"{words.format_path(file)} is {kind}, no regular file, and is not overwritten; choose another name"
+        )
     return file
 
 
-def _status(file: Path) -> os.stat_result | None:
+def _link_status(file: Path) -> os.stat_result | None:
     """Return the status of a path without following links; None if it does not exist."""
     try:
         return file.lstat()
@@ -88,7 +92,7 @@ def _status(file: Path) -> os.stat_result | None:
         return None
 
 
-def check_free(*paths: str | os.PathLike[str] | None, force: bool, words: Words = PLAIN) -> None:
+def check_free(*paths: str | os.PathLike[str] | None, force: bool, words: FileMessages = DEFAULT_MESSAGES) -> None:
     """Raise before the computation for paths that could not be written after it; None is skipped."""
     for path in paths:
         if path is None:
@@ -96,10 +100,11 @@ def check_free(*paths: str | os.PathLike[str] | None, force: bool, words: Words 
         file = check_new(path, force=force, words=words)
         folder = file.absolute().parent
         if not folder.is_dir():
-            raise DataError(f"{words.shown(file.parent)} is no folder; make it first")
+            raise DataError(f"{words.format_path(file.parent)} is no folder; make it first")
         if not os.access(folder, os.W_OK):
             raise DataError(
-                f"{words.shown(file)} cannot be written: {words.shown(file.parent)} is read-only; choose another folder"
+                f"{words.format_path(file)} cannot be written: {words.format_path(file.parent)} is read-only; "
+                "choose another folder"
             )
 
 
@@ -114,7 +119,9 @@ def check_folder(folder: Path, names: Iterable[str], *, force: bool) -> None:
         raise DataError(f"{folder / there[0]} exists ({len(there)} such files); choose another folder, or --force")
 
 
-def write_atomically(path: str | os.PathLike[str], content: bytes, *, force: bool, words: Words = PLAIN) -> Path:
+def write_atomically(
+    path: str | os.PathLike[str], content: bytes, *, force: bool, words: FileMessages = DEFAULT_MESSAGES
+) -> Path:
     """Write a temporary file, flush it to disk and rename it: readers see the old content or the new one.
 
     Raises
@@ -126,10 +133,10 @@ def write_atomically(path: str | os.PathLike[str], content: bytes, *, force: boo
     try:
         # In its folder, since no rename crosses disks; short, so that long names have room.
         beside = file.with_name(f".{file.name}.{secrets.token_hex(4)}")
-        there = _status(file)
+        there = _link_status(file)
         # Never through a link that another program left. The permissions are those that a new file has here, or those
         # of the file that is overwritten, from the first byte on.
-        descriptor = os.open(beside, _NEW, 0o666 if there is None else stat.S_IMODE(there.st_mode) & 0o777)
+        descriptor = os.open(beside, _NEW_FILE_FLAGS, 0o666 if there is None else stat.S_IMODE(there.st_mode) & 0o777)
         try:
             with os.fdopen(descriptor, "wb") as stream:
                 stream.write(content)
@@ -137,7 +144,7 @@ def write_atomically(path: str | os.PathLike[str], content: bytes, *, force: boo
                 if there is not None and hasattr(os, "fchmod"):
                     os.fchmod(stream.fileno(), stat.S_IMODE(there.st_mode) & 0o777)
                 os.fsync(stream.fileno())
-            if force or not _named(beside, file):
+            if force or not _move_exclusively(beside, file):
                 os.replace(beside, file)
         except FileExistsError:
             with contextlib.suppress(OSError):
@@ -151,7 +158,7 @@ def write_atomically(path: str | os.PathLike[str], content: bytes, *, force: boo
             raise
     except (OSError, ValueError) as error:
         why = error.strerror if isinstance(error, OSError) else None
-        raise DataError(f"{words.shown(file)} {words.failed.format(why or error)}") from error
+        raise DataError(f"{words.format_path(file)} {words.failed.format(why or error)}") from error
     # The rename itself survives a power cut only when the folder is on disk too; not every system can do that.
     with contextlib.suppress(OSError):
         descriptor = os.open(file.parent, os.O_RDONLY)
@@ -159,11 +166,11 @@ def write_atomically(path: str | os.PathLike[str], content: bytes, *, force: boo
             os.fsync(descriptor)
         finally:
             os.close(descriptor)
-    LOG.info("written: %s (%d bytes)", file, len(content))
+    PACKAGE_LOGGER.info("written: %s (%d bytes)", file, len(content))
     return file
 
 
-def _named(beside: Path, file: Path) -> bool:
+def _move_exclusively(beside: Path, file: Path) -> bool:
     """Rename a file to a name that must not exist; raise if it was created meanwhile.
 
     On file systems without hard links return False and leave an empty file of that name as a placeholder.
@@ -173,26 +180,26 @@ def _named(beside: Path, file: Path) -> bool:
     except FileExistsError:
         raise
     except (OSError, NotImplementedError):
-        os.close(os.open(file, _NEW, 0o666))
+        os.close(os.open(file, _NEW_FILE_FLAGS, 0o666))
         return False
     beside.unlink()
     return True
 
 
 #: Longest name in a message.
-LONGEST = 300
+MAX_NAME_CHARACTERS = 300
 
 
-class Versioned(Protocol):
+class SchemaRecord(Protocol):
     """Content of a versioned document."""
 
     schema: int
 
 
-T = TypeVar("T", bound=Versioned)
+T = TypeVar("T", bound=SchemaRecord)
 
 
-class Head(msgspec.Struct):
+class FileHeader(msgspec.Struct):
     """Header of every document, readable in files of later versions, too."""
 
     format: str
@@ -201,7 +208,7 @@ class Head(msgspec.Struct):
 
 
 @dataclass(frozen=True)
-class Saved(Generic[T]):
+class JsonFormat(Generic[T]):
     """Format of a versioned JSON document.
 
     Parameters
@@ -221,8 +228,8 @@ class Saved(Generic[T]):
     what: str
     source: str
     kind: type[T]
-    latest: int
-    most: int = 1 << 20
+    latest_schema: int
+    max_bytes: int = 1 << 20
 
     def read(self, path: str | os.PathLike[str]) -> T:
         """Read and decode a file.
@@ -233,7 +240,7 @@ class Saved(Generic[T]):
             A file that cannot be read, is too large, has another format, or is of a later version.
         """
         if not isinstance(path, (str, os.PathLike)):
-            raise DataError(f"path = {shown(path)} is no path of a file; give {self.source}")
+            raise DataError(f"path = {short_repr(path)} is no path of a file; give {self.source}")
         file = Path(path)
         try:
             content = self._content(file)
@@ -241,43 +248,50 @@ class Saved(Generic[T]):
             raise
         except (OSError, ValueError) as error:
             # What no file system takes is not put into words as it is.
-            name = str(file) if str(file).isprintable() and len(str(file)) <= LONGEST else shown(str(file), LONGEST)
+            name = (
+                str(file)
+                if str(file).isprintable() and len(str(file)) <= MAX_NAME_CHARACTERS
+                else short_repr(str(file), MAX_NAME_CHARACTERS)
+            )
             why = (error.strerror if isinstance(error, OSError) else None) or error
             raise DataError(f"{self.what} {name} cannot be read: {why}; check the path") from error
         try:
             return msgspec.json.decode(content, type=self.kind)
         except (msgspec.MsgspecError, ValueError, RecursionError) as error:
             self._check_later(file, content)
-            raise DataError(f"{file} is no ftlm {self.what}: {words_of(error, LONGEST)}; give {self.source}") from error
+            raise DataError(
+                f"{file} is no ftlm {self.what}: {error_text(error, MAX_NAME_CHARACTERS)}; give {self.source}"
+            ) from error
 
     def _content(self, file: Path) -> bytes:
         """Return the bytes of a regular file within the size limit."""
         state = file.stat()
         if not stat.S_ISREG(state.st_mode):
             raise DataError(f"{file} is no regular file; give {self.source}")
-        if state.st_size > self.most:
+        if state.st_size > self.max_bytes:
             raise DataError(
-                f"{file} has {state.st_size} bytes, no {self.what} is larger than {self.most}; give {self.source}"
+                f"{file} has {state.st_size} bytes, no {self.what} is larger than {self.max_bytes}; give {self.source}"
             )
         return file.read_bytes()
 
     def _check_later(self, file: Path, content: bytes) -> None:
         """Raise if a file that cannot be decoded comes from a later version."""
         try:
-            head = msgspec.json.decode(content, type=Head)
+            head = msgspec.json.decode(content, type=FileHeader)
         except (msgspec.MsgspecError, ValueError, RecursionError):
             return
-        if head.format == f"ftlm-{self.what}" and head.schema > self.latest:
-            raise self._later(file, head.schema, head.written_by)
+        if head.format == f"ftlm-{self.what}" and head.schema > self.latest_schema:
+            raise self._newer_version_error(file, head.schema, head.written_by)
 
-    def _later(self, path: str | os.PathLike[str], schema: int, writer: str = "") -> DataError:
-        by = f", {shown(writer, LONGEST)}" if writer else ""
+    def _newer_version_error(self, path: str | os.PathLike[str], schema: int, writer: str = "") -> DataError:
+        by = f", {short_repr(writer, MAX_NAME_CHARACTERS)}" if writer else ""
         return DataError(
-            f"{path} is a {self.what} of a later version of ftlm{by}: it has schema {shown(schema)}, and this version, "
-            f"{__version__}, reads up to {self.latest}; upgrade ftlm"
+            f"{path} is a {self.what} of a later version of ftlm{by}: it has schema {short_repr(schema)}, and this "
+            "version, "
+            f"{__version__}, reads up to {self.latest_schema}; upgrade ftlm"
         )
 
-    def check_schema(self, path: str | os.PathLike[str], read: Versioned, of: int) -> None:
+    def check_schema(self, path: str | os.PathLike[str], read: SchemaRecord, of: int) -> None:
         """Raise if the schema is later than this version, or than the content needs.
 
         Raises
@@ -285,8 +299,8 @@ class Saved(Generic[T]):
         DataError
             A schema beyond the latest that this version reads, or beyond that of the content.
         """
-        if read.schema > self.latest:
-            raise self._later(path, read.schema, getattr(read, "written_by", ""))
+        if read.schema > self.latest_schema:
+            raise self._newer_version_error(path, read.schema, getattr(read, "written_by", ""))
         if not 1 <= read.schema <= of:
             raise DataError(
                 f"{path} says that it has schema {read.schema}, and what it holds has schema {of}; give {self.source}"

@@ -11,12 +11,12 @@ from numbers import Integral
 from markupsafe import Markup
 
 #: Significant digits of estimates: more than their accuracy, enough for comparison with the paper.
-DIGITS = 5
-DIVERGED = "diverged"
+SIGNIFICANT_DIGITS = 5
+DIVERGED_TEXT = "diverged"
 #: Line length [characters]: largest and smallest.
-WIDTH, NARROW = 110, 40
-_EQUATION = re.compile(r"D\^?\S* \S+ = ")
-GREEK = {
+MAX_LINE_CHARACTERS, MIN_LINE_CHARACTERS = 110, 40
+_EQUATION_PATTERN = re.compile(r"D\^?\S* \S+ = ")
+GREEK_LETTERS = {
     "alpha": "α",
     "beta": "β",
     "gamma": "γ",
@@ -28,25 +28,25 @@ GREEK = {
     "phi": "φ",
     "omega": "ω",
 }
-_SUBSCRIPTS = str.maketrans("0123456789", "₀₁₂₃₄₅₆₇₈₉")
-SUPERSCRIPTS = str.maketrans("-0123456789", "⁻⁰¹²³⁴⁵⁶⁷⁸⁹")
-SYMBOL = re.compile(rf"({'|'.join(GREEK)}|[A-Za-z])_?(\d*)", re.ASCII)
+_SUBSCRIPT_DIGITS = str.maketrans("0123456789", "₀₁₂₃₄₅₆₇₈₉")
+SUPERSCRIPT_DIGITS = str.maketrans("-0123456789", "⁻⁰¹²³⁴⁵⁶⁷⁸⁹")
+SYMBOL_PATTERN = re.compile(rf"({'|'.join(GREEK_LETTERS)}|[A-Za-z])_?(\d*)", re.ASCII)
 
 
 def symbol(name: str) -> str:
     """Return a name as a symbol: ``theta12`` becomes θ₁₂; other names are unchanged."""
-    found = SYMBOL.fullmatch(name)
+    found = SYMBOL_PATTERN.fullmatch(name)
     if not found:
         return name
-    return GREEK.get(found[1], found[1]) + found[2].translate(_SUBSCRIPTS)
+    return GREEK_LETTERS.get(found[1], found[1]) + found[2].translate(_SUBSCRIPT_DIGITS)
 
 
 def symbol_html(name: str) -> Markup:
     """Return the symbol with an HTML subscript, escaped."""
-    found = SYMBOL.fullmatch(name)
+    found = SYMBOL_PATTERN.fullmatch(name)
     if not found:
         return Markup("<i>{}</i>").format(name)
-    stem = Markup("<i>{}</i>").format(GREEK.get(found[1], found[1]))
+    stem = Markup("<i>{}</i>").format(GREEK_LETTERS.get(found[1], found[1]))
     return stem + Markup("<sub>{}</sub>").format(found[2]) if found[2] else stem
 
 
@@ -57,28 +57,28 @@ class Exact(float):
 Cell = str | float | None
 
 
-def number(value: float, digits: int = DIGITS) -> str:
+def number(value: float, digits: int = SIGNIFICANT_DIGITS) -> str:
     """Return a number with this many significant digits; infinity is "∞ diverged"."""
     if isinstance(value, Integral):
         return f"{value:,}".replace(",", "\u202f")
     if math.isnan(value):
         return "undefined"
     if math.isinf(value):
-        return f"{'−' if value < 0 else ''}∞ {DIVERGED}"
+        return f"{'−' if value < 0 else ''}∞ {DIVERGED_TEXT}"
     if value == 0:
         return "0"
     text = f"{value:.10g}" if isinstance(value, Exact) else f"{value:#.{digits}g}"
     mantissa, _, exponent = text.partition("e")
     mantissa = mantissa.removesuffix(".").replace("-", "−")
-    return f"{mantissa}×10{str(int(exponent)).translate(SUPERSCRIPTS)}" if exponent else mantissa
+    return f"{mantissa}×10{str(int(exponent)).translate(SUPERSCRIPT_DIGITS)}" if exponent else mantissa
 
 
-def unbounded(value: float, spec: str = ".3g") -> str:
+def format_bound(value: float, spec: str = ".3g") -> str:
     """Format a standard error or an interval bound; infinity (not identifiable) is ∞."""
     return f"{'−' if value < 0 else ''}∞" if math.isinf(value) else f"{value:{spec}}"
 
 
-def shortened(text: str, most: int) -> str:
+def truncate_text(text: str, most: int) -> str:
     """Truncate a text with an ellipsis."""
     return text if len(text) <= most else text[: most - 1] + "…"
 
@@ -95,13 +95,15 @@ def with_error(value: float, error: float | None) -> str:
 
 def columns() -> int:
     """Line length [characters] of the terminal or of ``COLUMNS``, within bounds."""
-    return min(max(shutil.get_terminal_size((WIDTH, 40)).columns, NARROW), WIDTH)
+    return min(
+        max(shutil.get_terminal_size((MAX_LINE_CHARACTERS, 40)).columns, MIN_LINE_CHARACTERS), MAX_LINE_CHARACTERS
+    )
 
 
-def wrapped(text: str, lead: str = "", further: str | None = None) -> list[str]:
+def wrap_text(text: str, lead: str = "", further: str | None = None) -> list[str]:
     """Wrap a text to the line length; continuation lines are indented, by `further` if given."""
     # Equations break between their terms; what is ± something, or so many per cent, stays together.
-    bound = re.sub(" (?![+-] )" if _EQUATION.match(text) else " (?=[±%])|(?<=±) ", "\u00a0", text)
+    bound = re.sub(" (?![+-] )" if _EQUATION_PATTERN.match(text) else " (?=[±%])|(?<=±) ", "\u00a0", text)
     lines = textwrap.wrap(
         bound,
         columns(),

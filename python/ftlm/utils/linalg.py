@@ -14,7 +14,7 @@ from ftlm import _core
 from ftlm.utils.validation import Floats
 
 #: Rows that are stacked at a time.
-ROWS = 1 << 12
+BLOCK_ROWS = 1 << 12
 
 
 def dot(one: Floats, other: Floats) -> float:
@@ -27,12 +27,12 @@ def projections(columns: Floats, row: Floats) -> Floats:
     return np.asarray(np.einsum("ij,i->j", columns, row))
 
 
-def length(row: Floats) -> float:
+def vector_norm(row: Floats) -> float:
     """Euclidean norm of a vector."""
     return float(np.sqrt(dot(row, row)))
 
 
-def triangle(tall: Floats) -> Floats:
+def triangular_factor(tall: Floats) -> Floats:
     """Triangular factor R of the QR factorization of a tall matrix.
 
     Orthogonal transformations preserve the inner products of the columns, and with them all least-squares problems.
@@ -40,28 +40,28 @@ def triangle(tall: Floats) -> Floats:
     return _core.triangle(np.ascontiguousarray(tall.T))
 
 
-def turned_rows(columns: Sequence[Floats]) -> Floats:
+def blockwise_triangular_factor(columns: Sequence[Floats]) -> Floats:
     """Return the triangular factor of a matrix given by columns, without stacking all rows at once."""
     whole = np.zeros((0, len(columns)))
-    for first in range(0, len(columns[0]), ROWS):
-        part = np.stack([column[first : first + ROWS] for column in columns])
+    for first in range(0, len(columns[0]), BLOCK_ROWS):
+        part = np.stack([column[first : first + BLOCK_ROWS] for column in columns])
         whole = _core.triangle(np.hstack([whole.T, part]))
     return whole
 
 
-def singular(tall: Floats) -> tuple[Floats, Floats, Floats]:
+def thin_svd(tall: Floats) -> tuple[Floats, Floats, Floats]:
     """Thin singular value decomposition: the matrix is left * sizes @ right."""
     left, sizes, right = _core.singular(np.ascontiguousarray(tall.T))
     return left.reshape(sizes.size, len(tall)).T, sizes, right.reshape(sizes.size, tall.shape[1])
 
 
-def solved(tall: Floats, wanted: Floats, rcond: float | None) -> Floats:
+def minimum_norm_solution(tall: Floats, wanted: Floats, rcond: float | None) -> Floats:
     """Minimum-norm least-squares solution; singular values below a share ``rcond`` of the largest are zero.
 
     Without ``rcond`` the cutoff is the rounding level.
     """
     columns = tall.shape[1]
-    both = triangle(np.column_stack([tall, wanted]))
+    both = triangular_factor(np.column_stack([tall, wanted]))
     if rcond is None:
         rcond = float(np.finfo(np.float64).eps) * max(tall.shape)
     return np.asarray(np.linalg.lstsq(both[:, :columns], both[:, columns], rcond=rcond)[0])
@@ -70,6 +70,6 @@ def solved(tall: Floats, wanted: Floats, rcond: float | None) -> Floats:
 def orthonormal(columns: Floats, least: float) -> Floats:
     """Orthonormal basis of columns of any scale; directions below a share ``least`` are dropped."""
     sizes = np.linalg.norm(columns, axis=0)
-    directions, spread, _ = singular(columns / np.where(sizes > 0, sizes, 1.0))
+    directions, spread, _ = thin_svd(columns / np.where(sizes > 0, sizes, 1.0))
     kept: Floats = directions[:, spread > least * spread.max(initial=0.0)]
     return kept

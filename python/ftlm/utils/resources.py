@@ -17,15 +17,15 @@ from ftlm import _core
 from ftlm.errors import ModelError
 
 #: Environment variable with the limit: bytes, or a number with K, M, G or T (powers of 1024).
-GIVEN = "FTLM_MEMORY"
+MEMORY_VARIABLE = "FTLM_MEMORY"
 #: Default share of the available memory. The rest is for records, threads and other programs.
-SHARE = 0.8
+DEFAULT_MEMORY_SHARE = 0.8
 #: Limit if the system reports no available memory.
-UNKNOWN = 2 << 30
-_SYSTEM = Path("/")
+FALLBACK_MEMORY_BYTES = 2 << 30
+_SYSTEM_ROOT = Path("/")
 
 
-def memory_limit(system: Path = _SYSTEM) -> int:
+def memory_limit(system: Path = _SYSTEM_ROOT) -> int:
     """Return the limit [bytes] of regressors, products, test vectors and layouts of a search together.
 
     Parameters
@@ -38,22 +38,24 @@ def memory_limit(system: Path = _SYSTEM) -> int:
     ModelError
         ``FTLM_MEMORY`` is no positive size.
     """
-    given = os.environ.get(GIVEN, "")
+    given = os.environ.get(MEMORY_VARIABLE, "")
     if given:
         size = re.fullmatch(r"([0-9]{1,18})([KMGT]?)(?:i?B)?", given.strip(), re.ASCII)
         count = int(size[1]) << 10 * " KMGT".index(size[2] or " ") if size else 0
         if not 0 < count < 1 << 63:
-            raise ModelError(f"{GIVEN}={given!r} is no size of memory; give bytes, or a number with K, M, G or T")
+            raise ModelError(
+                f"{MEMORY_VARIABLE}={given!r} is no size of memory; give bytes, or a number with K, M, G or T"
+            )
         return count
-    return int(SHARE * (available_memory(system) or UNKNOWN / SHARE))
+    return int(DEFAULT_MEMORY_SHARE * (available_memory(system) or FALLBACK_MEMORY_BYTES / DEFAULT_MEMORY_SHARE))
 
 
-def available_memory(system: Path = _SYSTEM) -> int | None:
+def available_memory(system: Path = _SYSTEM_ROOT) -> int | None:
     """Return the memory [bytes] that this process can still take before swapping; None if the system reports none.
 
     Minimum of the kernel's available memory and of the remainder of every control group of this process.
     """
-    left = [*_of_kernel(system), *_of_groups(system)]
+    left = [*_kernel_available_bytes(system), *_cgroup_available_bytes(system)]
     if not left:
         try:
             left = [os.sysconf("SC_PHYS_PAGES") * os.sysconf("SC_PAGE_SIZE") // 2]
@@ -69,12 +71,12 @@ def _text(path: Path) -> str:
         return ""
 
 
-def _of_kernel(system: Path) -> list[int]:
+def _kernel_available_bytes(system: Path) -> list[int]:
     found = re.search(r"^MemAvailable:\s+([0-9]+) kB", _text(system / "proc/meminfo"), re.MULTILINE)
     return [int(found[1]) << 10] if found else []
 
 
-def _of_groups(system: Path) -> list[int]:
+def _cgroup_available_bytes(system: Path) -> list[int]:
     """Remaining memory of each control group, v1 and v2; reclaimable page cache counts as free."""
     left = []
     for line in _text(system / "proc/self/cgroup").splitlines():
@@ -103,37 +105,37 @@ def _of_groups(system: Path) -> list[int]:
 
 #: Length of the timed FFT, duration of the measurement [s], and time of one FFT on the reference machine [s], two
 #: cores of an idle x86-64 server.
-LENGTH, TIMED, KNOWN = 4096, 0.03, 1.5e-5
+BENCHMARK_FFT_LENGTH, BENCHMARK_DURATION_S, REFERENCE_FFT_TIME_S = 4096, 0.03, 1.5e-5
 #: Range of the actual duration of an output-error fit relative to its estimate. The number and length of useful starts
 #: is not known in advance.
-FITS = (0.4, 6.0)
+FIT_TIME_FACTORS = (0.4, 6.0)
 #: Samples beyond which the duration grows more slowly: most evaluations use a part of the record.
-LONG = 10_000
+LONG_RECORD_SAMPLES = 10_000
 #: Speedup per additional core.
-PARALLEL = 0.7
+PARALLEL_EFFICIENCY = 0.7
 
 
-def pace() -> float:
+def machine_slowdown() -> float:
     """Return the time per unit of work on one core relative to the reference machine, at the current load."""
-    values, count = np.ones(LENGTH), 0
+    values, count = np.ones(BENCHMARK_FFT_LENGTH), 0
     begun = time.perf_counter()
-    while time.perf_counter() - begun < TIMED:
+    while time.perf_counter() - begun < BENCHMARK_DURATION_S:
         np.fft.rfft(values)
         count += 1
-    return max((time.perf_counter() - begun) / max(count, 1) / KNOWN, 0.1)
+    return max((time.perf_counter() - begun) / max(count, 1) / REFERENCE_FFT_TIME_S, 0.1)
 
 
-def expected(seconds: float, threads: int) -> float:
+def estimate_duration(seconds: float, threads: int) -> float:
     """Return the estimated duration [s] here of work that takes ``seconds`` on one core of the reference machine."""
-    return seconds * pace() / (1.0 + PARALLEL * (max(threads, 1) - 1))
+    return seconds * machine_slowdown() / (1.0 + PARALLEL_EFFICIENCY * (max(threads, 1) - 1))
 
 
-def between(seconds: float, came_to: tuple[float, float] = FITS) -> tuple[float, float]:
+def duration_bounds(seconds: float, came_to: tuple[float, float] = FIT_TIME_FACTORS) -> tuple[float, float]:
     """Return the range of a duration from its estimate and a range of factors."""
     return came_to[0] * seconds, came_to[1] * seconds
 
 
-def by_output_error(samples: int, numbers: int) -> float:
+def output_error_cost(samples: int, numbers: int) -> float:
     """Return the time [s] of an output-error fit on one core of the reference machine.
 
     Actual times are within :data:`FIT_TIME_FACTORS` of it.
@@ -141,22 +143,22 @@ def by_output_error(samples: int, numbers: int) -> float:
     The multistart grows with the square of the number of parameters, the rest with the samples of all runs and outputs.
     Long records grow more slowly because most of their fit uses a part of them.
     """
-    return 0.04 * numbers**2 + 3.5e-4 * min(samples, LONG) + 2e-5 * samples
+    return 0.04 * numbers**2 + 3.5e-4 * min(samples, LONG_RECORD_SAMPLES) + 2e-5 * samples
 
 
-_STOP: ContextVar[_core.Stop | None] = ContextVar("stop", default=None)
+_STOP_FLAG: ContextVar[_core.Stop | None] = ContextVar("stop", default=None)
 
 
-def stop() -> _core.Stop | None:
+def stop_flag() -> _core.Stop | None:
     """Return the stop flag of this worker thread; None in the main thread."""
-    return _STOP.get()
+    return _STOP_FLAG.get()
 
 
 @contextmanager
-def pool(threads: int) -> Iterator[ThreadPoolExecutor]:
+def interruptible_pool(threads: int) -> Iterator[ThreadPoolExecutor]:
     """Thread pool that cancels running computations and queued tasks when the main thread is interrupted."""
-    flag = stop() or _core.Stop()
-    with ThreadPoolExecutor(threads, initializer=_STOP.set, initargs=(flag,)) as made:
+    flag = stop_flag() or _core.Stop()
+    with ThreadPoolExecutor(threads, initializer=_STOP_FLAG.set, initargs=(flag,)) as made:
         try:
             yield made
         except BaseException as error:

@@ -15,16 +15,16 @@ REST_SIGMAS = 5.0
 #: Nor are first values beyond this share of the signal's standard deviation, for signals without noise.
 REST_SHARE = 1e-3
 #: Median absolute deviation of a normal variable in standard deviations.
-MAD = 0.6744897501960817
+MAD_OVER_SIGMA = 0.6744897501960817
 #: Residuals below this share of an output's standard deviation are rounding and discretization errors.
-ROUNDING = 3e-5
+NEGLIGIBLE_RESIDUAL_SHARE = 3e-5
 #: Huber threshold in standard deviations: 95 % efficiency under normal noise.
-BEND = 1.345
+HUBER_THRESHOLD = 1.345
 #: Significance level of tests.
-LEVEL = 0.01
+SIGNIFICANCE_LEVEL = 0.01
 #: Half-widths of 95 % and 99 % intervals in standard deviations.
 NORMAL_95 = 1.959963984540054
-NORMAL_99 = NormalDist().inv_cdf(1 - LEVEL / 2)
+NORMAL_99 = NormalDist().inv_cdf(1 - SIGNIFICANCE_LEVEL / 2)
 
 
 def is_rest(samples: Floats) -> bool:
@@ -33,11 +33,11 @@ def is_rest(samples: Floats) -> bool:
     Only the first sample is tested, because a machine at rest may respond within a few samples.
     """
     there = samples[~np.isnan(samples)]
-    noise = noise_of(samples)
+    noise = estimate_noise(samples)
     return bool(abs(there[0]) <= REST_SIGMAS * noise + REST_SHARE * float(np.std(there)))
 
 
-def noise_of(samples: Floats) -> float:
+def estimate_noise(samples: Floats) -> float:
     """Standard deviation of white noise on a smooth signal, from the median of second differences."""
     bends = np.diff(samples, 2)
     bends = bends[~np.isnan(bends)]
@@ -49,7 +49,7 @@ def noise_of(samples: Floats) -> float:
 
 def robust_deviation(values: Floats) -> float:
     """Standard deviation of normal values from the median of their absolute values."""
-    return float(np.median(np.abs(values))) / MAD if values.size else 0.0
+    return float(np.median(np.abs(values))) / MAD_OVER_SIGMA if values.size else 0.0
 
 
 def huber_excess(few: Floats, many: Floats) -> float:
@@ -62,9 +62,9 @@ def huber_excess(few: Floats, many: Floats) -> float:
     if not np.all(np.isfinite(few)) or (scale == 0.0 and np.any(few)):
         return float("inf")
     one, other = (np.abs(e) / (scale or 1.0) for e in (few, many))
-    losses = [np.where(r <= BEND, r**2, BEND * (2.0 * r - BEND)) for r in (one, other)]
+    losses = [np.where(r <= HUBER_THRESHOLD, r**2, HUBER_THRESHOLD * (2.0 * r - HUBER_THRESHOLD)) for r in (one, other)]
     # Both means are those of the loss's slope and curvature; under normal noise their ratio is 0.86.
-    slope, curvature = np.mean(np.minimum(other, BEND) ** 2), np.mean(other <= BEND)
+    slope, curvature = np.mean(np.minimum(other, HUBER_THRESHOLD) ** 2), np.mean(other <= HUBER_THRESHOLD)
     return float(np.sum(losses[0] - losses[1]) * curvature / slope) if slope > 0 else 0.0
 
 
@@ -101,10 +101,10 @@ def chi_squared(degrees: int, level: float) -> float:
 
 def chi_squared_99(degrees: int) -> float:
     """99 % quantile of chi-squared; see :func:`chi_squared`."""
-    return chi_squared(degrees, LEVEL)
+    return chi_squared(degrees, SIGNIFICANCE_LEVEL)
 
 
-def colour(series: Floats) -> float:
+def variance_inflation(series: Floats) -> float:
     """Variance of the series' sum relative to white noise of the same variance, at least 1 (Bartlett)."""
     lags = min(int(4 * series.size ** (1.0 / 3.0)), series.size - 1)
     if lags < 2:
@@ -119,7 +119,7 @@ def is_white(series: Floats, lags: int = 25) -> bool:
 
 
 #: Relative range below which a signal is constant up to rounding.
-CONSTANT = 1e-12
+CONSTANT_TOLERANCE = 1e-12
 
 
 def autoregression(series: Sequence[Floats], most: int) -> Floats:
@@ -135,20 +135,20 @@ def autoregression(series: Sequence[Floats], most: int) -> Floats:
     most
         Largest order.
     """
-    return coloured(series, most)[0]
+    return fit_whitening_filter(series, most)[0]
 
 
-def coloured(series: Sequence[Floats], most: int) -> tuple[Floats, float]:
+def fit_whitening_filter(series: Sequence[Floats], most: int) -> tuple[Floats, float]:
     """Return the whitening filter of :func:`autoregression` and the variance of the whitened series."""
     return _core.coloured(series, most)
 
 
-def colour_covariances(through: Floats, power: float, count: int) -> Floats:
+def colored_noise_covariances(through: Floats, power: float, count: int) -> Floats:
     """Autocovariances at lags 0 to ``count`` - 1 of noise that a filter turns into white noise of this power."""
     return _core.colour_covariances(through, power, count)
 
 
-def whitened(series: Sequence[Floats], through: Floats) -> list[Floats]:
+def whiten_series(series: Sequence[Floats], through: Floats) -> list[Floats]:
     """Return mean-free series after a whitening filter, without the samples of its start-up.
 
     Output samples that depend on a missing sample are zero.
@@ -162,4 +162,4 @@ def whitened(series: Sequence[Floats], through: Floats) -> list[Floats]:
 
 def is_constant(series: Sequence[Floats]) -> bool:
     """Whether no series varies by more than rounding."""
-    return all(float(np.ptp(x)) <= CONSTANT * float(np.max(np.abs(x))) for x in series)
+    return all(float(np.ptp(x)) <= CONSTANT_TOLERANCE * float(np.max(np.abs(x))) for x in series)

@@ -15,12 +15,12 @@ from numpy.typing import ArrayLike, NDArray
 from ftlm.errors import DataError, ModelError
 
 #: Environment variable with the default number of threads.
-THREADS = "FTLM_THREADS"
+THREADS_VARIABLE = "FTLM_THREADS"
 #: NumPy dtype kinds of real numbers. `float` drops the imaginary part of a complex number and counts days of a date.
-_REAL = frozenset("fiuO")
+_REAL_DTYPE_KINDS = frozenset("fiuO")
 
 
-def shown(value: object, most: int = 60) -> str:
+def short_repr(value: object, most: int = 60) -> str:
     """Return a value's representation for an error message, truncated; a long integer by its number of bits."""
     if type(value) is int and value.bit_length() > 3 * most:
         # A long integer has no decimal form in Python.
@@ -32,7 +32,7 @@ def shown(value: object, most: int = 60) -> str:
     return text if len(text) <= most else f"{text[:most]}…"
 
 
-def words_of(error: BaseException, most: int = 500) -> str:
+def error_text(error: BaseException, most: int = 500) -> str:
     """Return the message of a foreign exception, truncated and reduced to encodable characters."""
     try:
         text = str(error)
@@ -45,14 +45,14 @@ def check_choice(name: str, value: object, known: Iterable[str]) -> None:
     """Raise unless a value is one of some strings."""
     words = list(known)
     if not isinstance(value, str) or value not in words:
-        raise ModelError(f"{name} = {shown(value)} is not known; use {' or '.join(map(repr, words))}")
+        raise ModelError(f"{name} = {short_repr(value)} is not known; use {' or '.join(map(repr, words))}")
 
 
 def _is_number(value: object) -> bool:
     """Whether a value may be a real number; complex values are excluded."""
     if isinstance(value, (str, bytes, bytearray, bool, complex)):
         return False
-    return getattr(getattr(value, "dtype", None), "kind", "f") in _REAL
+    return getattr(getattr(value, "dtype", None), "kind", "f") in _REAL_DTYPE_KINDS
 
 
 def whole_number(value: object) -> int | None:
@@ -73,7 +73,7 @@ def check_seed(seed: object) -> int:
     except TypeError:
         number = -1
     if number < 0:
-        raise ModelError(f"seed = {shown(seed)} is not a whole number from 0")
+        raise ModelError(f"seed = {short_repr(seed)} is not a whole number from 0")
     return number
 
 
@@ -98,10 +98,10 @@ def real_number(name: str, value: object) -> float:
             raise TypeError
         return float(value)  # type: ignore[arg-type]
     except (TypeError, ValueError, OverflowError):
-        raise ModelError(f"{name} = {shown(value)} is not a number; give one") from None
+        raise ModelError(f"{name} = {short_repr(value)} is not a number; give one") from None
 
 
-def listed(names: Iterable[object], most: int = 40) -> str:
+def join_names(names: Iterable[object], most: int = 40) -> str:
     """Return quoted names joined by commas, at most ``most`` of them, for an error message."""
     every = [repr(name) for name in names]
     if not every:
@@ -174,9 +174,9 @@ def check_threads(threads: int | None) -> int:
         Fewer than one or more than 1024 threads, or an invalid ``FTLM_THREADS``.
     """
     if threads is None:
-        given = os.environ.get(THREADS, "").strip()
+        given = os.environ.get(THREADS_VARIABLE, "").strip()
         if given and not (given.isascii() and given.isdecimal() and len(given) < 5 and 1 <= int(given) <= 1024):
-            raise ModelError(f"{THREADS}={given!r} is no number of threads; give 1 to 1024, or leave it out")
+            raise ModelError(f"{THREADS_VARIABLE}={given!r} is no number of threads; give 1 to 1024, or leave it out")
         return int(given) if given else available_threads()
     count = whole_number(threads)
     if count is None or not 1 <= count <= 1024:
@@ -206,7 +206,7 @@ def as_floats(name: str, values: object) -> NDArray[np.float64]:
     return np.asarray(array, dtype=np.float64, order="C")
 
 
-def along(
+def apply_along_axis(
     name: str, values: ArrayLike, axis: int, work: Callable[[NDArray[np.float64]], NDArray[np.float64]]
 ) -> NDArray[np.float64]:
     """Apply ``work``, which maps rows to rows, along one axis of an array."""
@@ -226,12 +226,12 @@ _SIGNAL_NAME = re.compile(r"[^\W\d][\w.\[\]]*")
 
 
 def is_run_name(name: object) -> bool:
-    """Return whether a run may be called this."""
+    """Whether an object is a valid run name."""
     return isinstance(name, str) and 0 < len(name) <= _NAME_LENGTH and name.isprintable() and name[0] not in "=+-@"
 
 
 def check_run_name(name: object) -> None:
-    """Refuse what cannot be written into any file as the name of a run."""
+    """Raise if a run name cannot be written into every file format."""
     if not is_run_name(name):
         raise DataError(
             f"name={name!r} cannot name a run; use 1 to {_NAME_LENGTH} printable characters, not beginning with = + - @"
@@ -239,7 +239,7 @@ def check_run_name(name: object) -> None:
 
 
 def check_signal_name(name: object) -> None:
-    """Refuse what cannot be the name of a column or stand in an equation."""
+    """Raise if a signal name cannot be a column name or occur in an equation."""
     if not isinstance(name, str) or len(name) > _NAME_LENGTH or not _SIGNAL_NAME.fullmatch(name):
         raise DataError(
             f"{name!r} cannot name a signal; begin with a letter or _ and use letters, digits, _ . [ ] "

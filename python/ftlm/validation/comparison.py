@@ -13,13 +13,21 @@ from numpy.typing import ArrayLike
 
 from ftlm import _core
 from ftlm.data.run import Run, Runs, as_runs
-from ftlm.data.sampling import read
+from ftlm.data.sampling import drop_missing
 from ftlm.errors import DataError
-from ftlm.model.model import Solved, check_solved
-from ftlm.simulation.discretization import Record, check_m, compared_times, default_m, equation_tuple, records, whole
-from ftlm.simulation.output_samples import Sampled, initial_exponents, looked_like_rest, measured_samples
-from ftlm.simulation.simulate import compared, respond
-from ftlm.simulation.step_refinement import refined
+from ftlm.model.model import ModelData, check_model
+from ftlm.simulation.discretization import (
+    Record,
+    check_m,
+    check_no_missing,
+    compared_times,
+    default_m,
+    equation_tuple,
+    records,
+)
+from ftlm.simulation.output_samples import OutputSamples, initial_exponents, measured_samples, runs_in_motion
+from ftlm.simulation.simulate import comparison_records, respond
+from ftlm.simulation.step_refinement import simulate_refined
 from ftlm.structure.structure import Structure, offset_exponents
 from ftlm.svg.html_page import Table
 from ftlm.utils.files import to_frame
@@ -59,7 +67,7 @@ class Metrics:
 
 
 #: Metrics of an unknown error.
-UNKNOWN = Metrics(math.nan, math.nan, math.nan, math.nan)
+UNKNOWN_METRICS = Metrics(math.nan, math.nan, math.nan, math.nan)
 
 
 def metrics(measured: ArrayLike, predicted: ArrayLike) -> Metrics:
@@ -88,7 +96,7 @@ def metrics(measured: ArrayLike, predicted: ArrayLike) -> Metrics:
     return Metrics(*_core.metrics(y, y - prediction))
 
 
-def pooled(measured: list[Floats], residuals: list[Floats]) -> Metrics:
+def pooled_metrics(measured: list[Floats], residuals: list[Floats]) -> Metrics:
     """Return metrics over several runs without missing samples; the fit uses each run's own mean."""
     known = [~np.isnan(y) for y in measured]
     if not all(k.all() for k in known):
@@ -100,19 +108,19 @@ def pooled(measured: list[Floats], residuals: list[Floats]) -> Metrics:
 
 
 #: Orders of an output's own terms closer to alpha than this make I^(alpha - nu) nearly the identity on smooth signals.
-NEAR_IDENTITY = 0.25
+NEAR_IDENTITY_ORDER_GAP = 0.25
 #: Ratio of output error to equation error (NR) above which the equation error is misleading.
-FLATTERED = 5.0
+MAX_ERROR_RATIO = 5.0
 #: Drop of the fit from estimation to validation data, in percentage points, that indicates overfitting.
-LOST = 20.0
+MAX_FIT_DROP_POINTS = 20.0
 #: Normalized residual (NR) of a simulation above which the model explains little of the output.
-USELESS = 0.5
+MAX_NORMALIZED_RESIDUAL = 0.5
 #: Change of a simulation on halving the step, relative to its largest value, at which refinement terminates.
-STILL = 1e-6
+REFINEMENT_TOLERANCE = 1e-6
 #: Maximum number of pulses of a refined simulation (at least four per sampling interval), and the change on halving the
 #: step above which a warning reports that it has not converged.
-LARGEST_M = 1 << 20
-VISIBLE = 1e-3
+MAX_PULSES = 1 << 20
+VISIBLE_STEP_CHANGE = 1e-3
 
 
 @dataclass(frozen=True)
@@ -160,9 +168,9 @@ class Comparison:
     initial: list[dict[str, dict[float, float]]]
     warnings: tuple[str, ...] = field(default=())
     times: list[Floats] = field(default_factory=list)
-    sampled: bool = True
+    output_samples: bool = True
     offsets: tuple[dict[str, dict[str, float]], ...] = field(default=())
-    unequated: Mapping[str, str] = field(default_factory=dict)
+    without_equation_error: Mapping[str, str] = field(default_factory=dict)
 
     @property
     def fit_percent(self) -> dict[str, float]:
@@ -202,20 +210,22 @@ class Comparison:
         lines = [f"{'output':<{max(width, 8)}}{'':<16}{'error':>12}{'RMSE':>12}{'NR':>10}{'fit %':>12}"]
         for name in self.output_error:
             both = (("equation error", self.equation_error[name]), ("output error", self.output_error[name]))
-            for label, f in both[1 if name in self.unequated else 0 :]:
+            for label, f in both[1 if name in self.without_equation_error else 0 :]:
                 lines.append(
                     f"{name:<{max(width, 8)}}{label:<16}{f.error:>12.5g}{f.rmse:>12.5g}{f.nr:>10.4g}{f.fit:>12.4g}"
                 )
-        if self.sampled:
-            count = max(sum(read(y).size for y in parts) for parts in self.measured.values())
+        if self.output_samples:
+            count = max(sum(drop_missing(y).size for y in parts) for parts in self.measured.values())
             known = (
-                f", equation error over {self.m} block pulses a run" if set(self.measured) - set(self.unequated) else ""
+                f", equation error over {self.m} block pulses a run"
+                if set(self.measured) - set(self.without_equation_error)
+                else ""
             )
             lines.append(f"output error over {count} samples{known}")
         else:
             lines.append(f"over {self.m} block pulses a run")
-        lines += without_equation_error(self.unequated)
-        lines += offsets_in_words(self)
+        lines += describe_missing_equation_errors(self.without_equation_error)
+        lines += describe_offsets(self)
         lines += [f"warning: {w}" for w in self.warnings]
         return "\n".join(lines)
 
@@ -224,13 +234,13 @@ class Comparison:
 
 
 #: Reasons for a missing equation error.
-RUBBED = "friction acts on it, and the sign of a measured velocity is that of its noise, most of all at rest"
-UNREAD = "not every sample of it was read, and the straight lines between the others are no measurement"
+FRICTION_REASON = "friction acts on it, and the sign of a measured velocity is that of its noise, most of all at rest"
+MISSING_SAMPLES_REASON = "not every sample of it was read, and the straight lines between the others are no measurement"
 #: Note on an offset that the initial history makes unidentifiable.
-HIDDEN = "not told apart from what the run did before its start; begin the run at rest to learn it"
+HIDDEN_OFFSET_NOTE = "not told apart from what the run did before its start; begin the run at rest to learn it"
 
 
-def compare(model: Solved, runs: Run | Sequence[Run], *, m: int | None = None) -> Comparison:
+def compare(model: ModelData, runs: Run | Sequence[Run], *, m: int | None = None) -> Comparison:
     """Return equation error and output error of a model on measured runs.
 
     The output error compares each sample y[k] with the simulation (free run: only inputs and initial conditions are
@@ -259,32 +269,35 @@ def compare(model: Solved, runs: Run | Sequence[Run], *, m: int | None = None) -
     ModelError
         An m that the runs do not carry.
     """
-    several, m = _checked(model, runs, m)
-    return compared_samples(model, several, free_runs(model, several), m=m)
+    several, m = _check_arguments(model, runs, m)
+    return compare_samples(model, several, simulate_runs(model, several), m=m)
 
 
-def free_runs(model: Solved, runs: Sequence[Run]) -> list[Sampled]:
+def simulate_runs(model: ModelData, runs: Sequence[Run]) -> list[OutputSamples]:
     """Simulate each run, with initial terms fitted to it, on a grid refined until converged."""
-    return [refined(model, run, None, tolerance=STILL, largest_m=max(LARGEST_M, 4 * run.length)) for run in runs]
+    return [
+        simulate_refined(model, run, None, tolerance=REFINEMENT_TOLERANCE, largest_m=max(MAX_PULSES, 4 * run.length))
+        for run in runs
+    ]
 
 
-def compared_samples(model: Solved, runs: Runs, free: Sequence[Sampled], *, m: int) -> Comparison:
+def compare_samples(model: ModelData, runs: Runs, free: Sequence[OutputSamples], *, m: int) -> Comparison:
     """Compare simulations sample by sample, and the equation error on m pulses, with these runs."""
     full = records(runs, model.structure, m)
     parts = []
     for run, sampled, rec in zip(runs, free, full, strict=True):
         measured = dict(zip(model.outputs, measured_samples(model, run, sampled.refinement), strict=True))
         simulated = dict(zip(model.outputs, sampled.outputs, strict=True))
-        parts.append(_beside(model, rec, simulated, measured, sampled.initial, gaps=run.missing))
+        parts.append(_run_errors(model, rec, simulated, measured, sampled.initial, gaps=run.missing_samples))
     times = [compared_times(run, model.structure) for run in runs]
-    found = _comparison(model, runs, parts, m, times, sampled=True)
+    found = _pooled_comparison(model, runs, parts, m, times, sampled=True)
     warnings = list(found.warnings)
-    if restless := [run.name for run, sampled in zip(runs, free, strict=True) if _moves(sampled)]:
+    if restless := [run.name for run, sampled in zip(runs, free, strict=True) if _is_unconverged(sampled)]:
         warnings.append(
             f"the free run on {', '.join(restless)} still moves with the step at the finest grid: the model is stiffer "
             "than these samples can show, and its output error is provisional"
         )
-    if moving := looked_like_rest(model, runs):
+    if moving := runs_in_motion(model, runs):
         warnings.append(
             f"{', '.join(moving)} starts at zero and is simulated from rest, but what that leaves over dies away like "
             "motion from before the start; give the model's structure initial='history' to have that estimated"
@@ -292,30 +305,30 @@ def compared_samples(model: Solved, runs: Runs, free: Sequence[Sampled], *, m: i
     return replace(found, warnings=tuple(warnings))
 
 
-def _moves(sampled: Sampled) -> bool:
+def _is_unconverged(sampled: OutputSamples) -> bool:
     """Whether halving the step still changes a finite simulation visibly."""
-    return bool(np.all(np.isfinite(sampled.outputs)) and np.any(sampled.change > VISIBLE))
+    return bool(np.all(np.isfinite(sampled.outputs)) and np.any(sampled.change > VISIBLE_STEP_CHANGE))
 
 
-def compare_means(model: Solved, runs: Run | Sequence[Run], *, m: int | None = None) -> Comparison:
+def compare_means(model: ModelData, runs: Run | Sequence[Run], *, m: int | None = None) -> Comparison:
     """Return both errors on the pulse means of m block pulses, as in the paper's tables.
 
     Means average neighboring samples. They understate noise, and overstate errors if a period has few pulses.
     """
-    several, m = _checked(model, runs, m)
-    whole(several, "figures of pulse means")
-    pairs = zip(compared(several, model, m), records(several, model.structure, m), strict=True)
+    several, m = _check_arguments(model, runs, m)
+    check_no_missing(several, "figures of pulse means")
+    pairs = zip(comparison_records(several, model, m), records(several, model.structure, m), strict=True)
     parts = []
     for free, full in pairs:
         responses, initial = respond(model, free)
-        parts.append(_beside(model, full, responses, {o: free.of(o) for o in model.outputs}, initial))
+        parts.append(_run_errors(model, full, responses, {o: free.of(o) for o in model.outputs}, initial))
     middles = [np.asarray((np.arange(m) + 0.5) * p.step, dtype=np.float64) for p in parts]
-    return _comparison(model, several, parts, m, middles, sampled=False)
+    return _pooled_comparison(model, several, parts, m, middles, sampled=False)
 
 
-def _checked(model: Solved, runs: Run | Sequence[Run], m: int | None) -> tuple[Runs, int]:
+def _check_arguments(model: ModelData, runs: Run | Sequence[Run], m: int | None) -> tuple[Runs, int]:
     """Return runs that have all signals of the model, and the number of pulses."""
-    check_solved(model)
+    check_model(model)
     several = as_runs(runs)
     carried = min(run.length for run in several) - 1
     chosen = min(model.m or default_m(several, power_of_two=False), carried) if m is None else m
@@ -325,12 +338,12 @@ def _checked(model: Solved, runs: Run | Sequence[Run], m: int | None) -> tuple[R
     return several, m
 
 
-def without_equation_error(why: Mapping[str, str]) -> list[str]:
+def describe_missing_equation_errors(why: Mapping[str, str]) -> list[str]:
     """Describe which outputs have no equation error, and why."""
     return [f"{name} has no equation error: {reason}" for name, reason in why.items()]
 
 
-def offsets_of(model: Solved, initial: Mapping[str, Mapping[float, float]]) -> dict[str, dict[str, float]]:
+def offset_values(model: ModelData, initial: Mapping[str, Mapping[float, float]]) -> dict[str, dict[str, float]]:
     """Return offsets of the equations from the powers of t that they integrate to: c t^alpha / Gamma(alpha + 1).
 
     Empty for an equation whose run has an initial history: its powers of t make a constant unidentifiable.
@@ -350,13 +363,13 @@ def offsets_of(model: Solved, initial: Mapping[str, Mapping[float, float]]) -> d
     return out
 
 
-def offsets_in_words(comparison: Comparison) -> list[str]:
+def describe_offsets(comparison: Comparison) -> list[str]:
     """Describe the offsets of every run that has some, one line per output."""
     lines = []
     for (run, _, _), offsets in zip(comparison.per_run, comparison.offsets, strict=False):
         for output, values in offsets.items():
             if not values:
-                lines.append(f"offset in the equation of {output} in {run}: {HIDDEN}")
+                lines.append(f"offset in the equation of {output} in {run}: {HIDDEN_OFFSET_NOTE}")
                 continue
             ramp = f" and {values['ramp']:.6g} t" if "ramp" in values else ""
             lines.append(
@@ -367,26 +380,26 @@ def offsets_in_words(comparison: Comparison) -> list[str]:
 
 
 @dataclass(frozen=True)
-class _Beside:
+class _RunErrors:
     """Errors of a model on one run, by output: simulation, measurement, equation signal and equation error."""
 
     step: float
     initial: dict[str, dict[float, float]]
     simulated: dict[str, Floats]
     measured: dict[str, Floats]
-    equated: dict[str, Floats]
-    missed: dict[str, Floats]
+    equation_signals: dict[str, Floats]
+    equation_errors: dict[str, Floats]
 
 
-def _beside(
-    model: Solved,
+def _run_errors(
+    model: ModelData,
     full: Record,
     simulated: dict[str, Floats],
     measured: dict[str, Floats],
     initial: dict[str, dict[float, float]],
     *,
     gaps: Container[str] = (),
-) -> _Beside:
+) -> _RunErrors:
     """Return the errors of one run, with all signals filtered by the sensor filter.
 
     An output with missing samples has no equation error: it would be that of the interpolated samples.
@@ -398,48 +411,55 @@ def _beside(
         # Nor has one with friction: the sign of a measured velocity is that of its noise, most of all at rest.
         if e.output not in gaps and e.friction is None
     }
-    return _Beside(full.step, initial, simulated, measured, {o: full.of(o) for o in model.outputs}, missed)
+    return _RunErrors(full.step, initial, simulated, measured, {o: full.of(o) for o in model.outputs}, missed)
 
 
-def _comparison(
-    model: Solved, runs: Sequence[Run], parts: Sequence[_Beside], m: int, times: list[Floats], *, sampled: bool
+def _pooled_comparison(
+    model: ModelData, runs: Sequence[Run], parts: Sequence[_RunErrors], m: int, times: list[Floats], *, sampled: bool
 ) -> Comparison:
     """Pool the errors of all runs into a comparison."""
-    equation_error, output_error = _figures(parts)
+    equation_error, output_error = _pooled_errors(parts)
     # The runs' own figures may be known where those of all of them are not.
     rubbed = {e.output for e in model.equations if e.friction is not None}
-    unequated = {o: RUBBED if o in rubbed else UNREAD for o, f in equation_error.items() if f is UNKNOWN}
+    unequated = {
+        o: FRICTION_REASON if o in rubbed else MISSING_SAMPLES_REASON
+        for o, f in equation_error.items()
+        if f is UNKNOWN_METRICS
+    }
     return Comparison(
         output_error,
         equation_error,
-        [(run.name, *_figures([p])) for run, p in zip(runs, parts, strict=True)],
+        [(run.name, *_pooled_errors([p])) for run, p in zip(runs, parts, strict=True)],
         {o: [p.simulated[o] for p in parts] for o in model.outputs},
         {o: [p.measured[o] for p in parts] for o in model.outputs},
         [p.step for p in parts],
         m,
         [p.initial for p in parts],
-        tuple(near_identity(model.structure, equation_error, output_error)),
+        tuple(near_identity_warnings(model.structure, equation_error, output_error)),
         times,
         sampled,
-        tuple(offsets_of(model, p.initial) for p in parts) if model.structure.offset != "none" else (),
+        tuple(offset_values(model, p.initial) for p in parts) if model.structure.offset != "none" else (),
         unequated,
     )
 
 
-def _figures(parts: Sequence[_Beside]) -> tuple[dict[str, Metrics], dict[str, Metrics]]:
+def _pooled_errors(parts: Sequence[_RunErrors]) -> tuple[dict[str, Metrics], dict[str, Metrics]]:
     """Return metrics of the equation error and of the simulation, pooled over these runs."""
     outputs = parts[0].measured
     equation = {
-        o: pooled([p.equated[o] for p in parts], [p.missed[o] for p in parts])
-        if all(o in p.missed for p in parts)
-        else UNKNOWN
+        o: pooled_metrics([p.equation_signals[o] for p in parts], [p.equation_errors[o] for p in parts])
+        if all(o in p.equation_errors for p in parts)
+        else UNKNOWN_METRICS
         for o in outputs
     }
-    free = {o: pooled([p.measured[o] for p in parts], [p.measured[o] - p.simulated[o] for p in parts]) for o in outputs}
+    free = {
+        o: pooled_metrics([p.measured[o] for p in parts], [p.measured[o] - p.simulated[o] for p in parts])
+        for o in outputs
+    }
     return equation, free
 
 
-def near_identity(
+def near_identity_warnings(
     structure: Structure, equation_error: Mapping[str, Metrics], output_error: Mapping[str, Metrics]
 ) -> list[str]:
     """Warn where the equation error is misleading.
@@ -451,11 +471,15 @@ def near_identity(
     for item in structure.equations:
         name, alpha = item.output, item.order.constant
         equation, output = equation_error[name], output_error[name]
-        close = [t.order.constant for t in item.terms if t.signal == name and alpha - t.order.constant < NEAR_IDENTITY]
+        close = [
+            t.order.constant
+            for t in item.terms
+            if t.signal == name and alpha - t.order.constant < NEAR_IDENTITY_ORDER_GAP
+        ]
         # Negated so that a figure that is not a number counts as bad; an equation error that is not known says nothing.
         unknown = math.isnan(equation.nr) and math.isfinite(output.nr)
-        worse = not output.nr <= FLATTERED * equation.nr and not unknown
-        useless = not output.nr <= USELESS
+        worse = not output.nr <= MAX_ERROR_RATIO * equation.nr and not unknown
+        useless = not output.nr <= MAX_NORMALIZED_RESIDUAL
         if close and worse:
             listed = ", ".join(f"{order:g}" for order in close)
             listed = f"orders {listed} are" if len(close) > 1 else f"order {listed} is"
@@ -484,16 +508,16 @@ def validation_warnings(own: Comparison, validation: Comparison) -> list[str]:
                     f"{other}: its outputs are those of {name}, which the model was identified from; "
                     "it validates nothing"
                 )
-    return warnings + lost_fits({n: f.fit for n, f in own.output_error.items()}, validation)
+    return warnings + validation_fit_warnings({n: f.fit for n, f in own.output_error.items()}, validation)
 
 
-def lost_fits(before: Mapping[str, float], validation: Comparison) -> list[str]:
+def validation_fit_warnings(before: Mapping[str, float], validation: Comparison) -> list[str]:
     """Warn of outputs whose fit on validation runs is far below that on the estimation data."""
     warnings = []
     for other, _, figures in validation.per_run:
         for output, f in figures.items():
             # Negated so that a fit that is not a number counts as lost.
-            if np.isfinite(before.get(output, np.nan)) and not f.fit >= before[output] - LOST:
+            if np.isfinite(before.get(output, np.nan)) and not f.fit >= before[output] - MAX_FIT_DROP_POINTS:
                 warnings.append(
                     f"{other}: the fit of {output} falls from {before[output]:.3g} % on the estimation data to "
                     f"{f.fit:.3g} %; the model describes the data it was identified from better than the machine"
@@ -501,7 +525,7 @@ def lost_fits(before: Mapping[str, float], validation: Comparison) -> list[str]:
     return warnings
 
 
-_FIGURES = ("error (45)", "RMSE", "NR", "fit %")
+_METRIC_LABELS = ("error (45)", "RMSE", "NR", "fit %")
 
 
 def errors_table(
@@ -530,32 +554,37 @@ def errors_table(
         for name in output:
             unit = (units or {}).get(name, "")
             label = symbol_html(name) + (Markup(" [{}]").format(unit) if unit else Markup(""))
-            known = equation[name] is not UNKNOWN
+            known = equation[name] is not UNKNOWN_METRICS
             rows.append(
-                [label, *(astuple(equation[name]) if known else [None] * len(_FIGURES)), *astuple(output[name])]
+                [label, *(astuple(equation[name]) if known else [None] * len(_METRIC_LABELS)), *astuple(output[name])]
             )
 
     for label, comparison in compared:
-        runs, without = comparison.per_run, comparison.unequated
+        runs, without = comparison.per_run, comparison.without_equation_error
         unequated |= without
         if len(runs) > 1:
             add(f"{label}: {len(runs)} runs together", comparison.equation_error, comparison.output_error, without)
         for name, equation, output in runs:
             add(f"{label}: {name}", equation, output, without)
-    reasons = [f"{words}." for words in without_equation_error(unequated)]
-    own = 1 + len(_FIGURES)
+    reasons = [f"{words}." for words in describe_missing_equation_errors(unequated)]
+    own = 1 + len(_METRIC_LABELS)
     if unequated and all(cell is None for row in rows for cell in row[1:own]):
         # Four columns of nothing would push what is known off a narrow screen.
         kept: list[list[Cell]] = [[row[0], *row[own:]] for row in rows]
         single = (("", 1), ("output error (free run)", 4))
-        return Table(title, ("output", *_FIGURES), kept, groups=single, headings=headings, note=" ".join(reasons))
+        return Table(title, ("output", *_METRIC_LABELS), kept, groups=single, headings=headings, note=" ".join(reasons))
     note = (
         "The equation error uses the measured output on the right-hand side and flatters a model whose orders are "
         "close to one another; only the free run shows what the model knows."
     )
     groups = (("", 1), ("equation error", 4), ("output error (free run)", 4))
     return Table(
-        title, ("output", *_FIGURES, *_FIGURES), rows, groups=groups, headings=headings, note=" ".join([note, *reasons])
+        title,
+        ("output", *_METRIC_LABELS, *_METRIC_LABELS),
+        rows,
+        groups=groups,
+        headings=headings,
+        note=" ".join([note, *reasons]),
     )
 
 
@@ -589,7 +618,7 @@ def initial_terms_table(comparison: Comparison, *, title: str = "Initial terms o
     return Table(title, ("run", "output", "exponent of t", "coefficient"), rows, note=note)
 
 
-def warned(warnings: Sequence[str]) -> Markup:
+def warnings_html(warnings: Sequence[str]) -> Markup:
     """Return warnings as an HTML list, or empty markup."""
     if not warnings:
         return Markup("")
@@ -599,4 +628,4 @@ def warned(warnings: Sequence[str]) -> Markup:
 
 def comparison_html(comparison: Comparison) -> str:
     """Return both errors of every run, warnings first."""
-    return str(warned(comparison.warnings) + errors_table([("compared", comparison)]).to_html())
+    return str(warnings_html(comparison.warnings) + errors_table([("compared", comparison)]).to_html())

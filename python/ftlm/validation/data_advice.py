@@ -1,4 +1,4 @@
-"""What to do about a run before anything is identified from it: faults and poor excitation, in sentences."""
+"""Data advice: checks of a run for faults and poor excitation before estimation, and signal statistics."""
 
 from __future__ import annotations
 
@@ -14,60 +14,60 @@ import numpy as np
 from numpy.typing import NDArray
 
 from ftlm import _core
-from ftlm.data.run import Measured
-from ftlm.data.sampling import read
+from ftlm.data.run import RunData
+from ftlm.data.sampling import drop_missing
 from ftlm.structure.structure import Structure
-from ftlm.utils.linalg import orthonormal, solved
-from ftlm.utils.statistics import is_rest, noise_of
+from ftlm.utils.linalg import minimum_norm_solution, orthonormal
+from ftlm.utils.statistics import estimate_noise, is_rest
 from ftlm.utils.validation import Floats
 
-#: What tells rows of a past apart, as a share of all that they do.
-ALIKE = 3e-7
-#: A spectral line below this share of the largest one is not counted as excitation.
-LINE = 0.01
-#: Bins that one line fills through the Blackman-Harris window, whose side lobes are 92 dB down.
+#: Relative rank tolerance of the lag matrix in the linear prediction of a signal from its past.
+RANK_TOLERANCE = 3e-7
+#: Spectral lines below this share of the largest one do not count as excitation.
+SPECTRAL_LINE_THRESHOLD = 0.01
+#: Width of one spectral line in bins under the Blackman-Harris window (side lobes at -92 dB).
 LINE_BINS = 8
 BLACKMAN_HARRIS = (0.35875, -0.48829, 0.14128, -0.01168)
-#: A mean above this share of the deviation is a level, and not what is left of waves that the record cuts.
+#: A mean above this share of the standard deviation counts as a constant level; below it, as truncated periods.
 LEVEL_SHARE = 0.3
-#: Two inputs more correlated than this move together.
-TOGETHER = 0.999
-#: Rows below which no fit means much.
-FEW_ROWS = 100
-#: An output that stands still for longer than this share of the run while an input moves is dead for that time.
+#: Two inputs with a larger absolute correlation are reported as collinear.
+MAX_INPUT_CORRELATION = 0.999
+#: Fewer samples than this are reported as too short for an estimate.
+MIN_USEFUL_SAMPLES = 100
+#: An output that is constant for longer than this share of the run while an input moves is a dead channel.
 DEAD_SHARE = 0.005
-DEAD_ROWS = 50
-#: Samples in a row at an extreme that are clipped and not a turning point; share of the run from which it is said.
-CLIPPED_ROWS = 3
+MIN_DEAD_SAMPLES = 50
+#: Consecutive samples at an extreme that count as clipped, and the share of the run from which it is reported.
+MIN_CLIPPED_SAMPLES = 3
 CLIPPED_SHARE = 0.002
-#: A spike stands out of its neighbours on both sides by this many noise deviations and this share of the range.
+#: A spike exceeds both neighbors by this many noise standard deviations and by this share of the range.
 SPIKE_SIGMAS = 12.0
 SPIKE_SHARE = 0.03
-MOST_SPIKES = 0.01
-#: A wrap jumps by more than this share of the range against the slope on both sides.
+MAX_SPIKE_SHARE = 0.01
+#: An encoder wrap is a jump of more than this share of the range against the slope on both sides.
 WRAP_SHARE = 0.6
 WRAP_SLOPE = 5
-#: A trend that the inputs do not explain: share of the output's deviation, and significance over blocks.
+#: Thresholds of an unexplained trend: share of the output's standard deviation, and its significance over blocks.
 DRIFT_SHARE = 0.15
 DRIFT_SIGMAS = 6.0
 DRIFT_BLOCKS = 16
-DRIFT_M = 1024
+DRIFT_PULSES = 1024
 DRIFT_LAGS = 12
-#: Least share of a trend that the inputs' responses must leave for it to be told from them.
-TREND_LEFT = 1e-3
-#: Orders of the autoregressions that whiten input and output, rows used, lags looked at, quarters that must agree.
+#: Smallest share of the trend regressor that must be orthogonal to the input responses for a drift test.
+MIN_TREND_RESIDUAL_SHARE = 1e-3
+#: Feedback test: order of the prewhitening autoregressions, samples, lags, segments that must agree in sign.
 FEEDBACK_ORDER = 20
-FEEDBACK_ROWS = 8_000
+MAX_FEEDBACK_SAMPLES = 8_000
 FEEDBACK_LAGS = 10
-FEEDBACK_PARTS = 4
+FEEDBACK_SEGMENTS = 4
 FEEDBACK_LEVEL = 1e-6
-#: An input that its own past predicts to within this share is a signal made beforehand, not a controller's.
-PREDICTED = 1e-4
+#: An input with a smaller relative one-step prediction error is a precomputed signal, not a controller output.
+MIN_INNOVATION_RATIO = 1e-4
 
 
 @dataclass(frozen=True)
 class Finding:
-    """One thing to know about a run.
+    """One finding about the data of a run.
 
     Parameters
     ----------
@@ -75,9 +75,9 @@ class Finding:
         ``excitation``, ``constant``, ``dead``, ``offset``, ``drift``, ``saturation``, ``spikes``, ``wrap``,
         ``feedback``, ``short`` or ``twin``.
     signal
-        The signal concerned; empty where it is the whole run.
+        Name of the signal; empty if the finding concerns the whole run.
     sentence
-        What was found, with numbers, and what to do.
+        Finding with numbers, and recommended action, as one sentence.
     """
 
     kind: str
@@ -87,14 +87,14 @@ class Finding:
 
 @dataclass(frozen=True)
 class Advice:
-    """Everything to know about a run before a model is identified from it; empty where nothing stands out.
+    """Findings about the data of a run before estimation; empty if the checks find nothing.
 
     Parameters
     ----------
     run
         Name of the run.
     findings
-        What was found, gravest kinds first.
+        Findings, most severe kinds first.
     """
 
     run: str
@@ -102,7 +102,7 @@ class Advice:
 
     @property
     def kinds(self) -> tuple[str, ...]:
-        """Kinds of what was found, each once."""
+        """Distinct kinds of the findings."""
         return tuple(dict.fromkeys(f.kind for f in self.findings))
 
     def __iter__(self) -> Iterator[Finding]:
@@ -125,44 +125,44 @@ class Advice:
         return f"<p>Advice on {html.escape(self.run)}:</p><ul>{items or '<li>nothing stands out</li>'}</ul>"
 
 
-def advise(run: Measured, structure: Structure | None = None) -> Advice:
-    """Look for faults and poor excitation in a run; see :meth:`ftlm.Run.advice`."""
+def advise(run: RunData, structure: Structure | None = None) -> Advice:
+    """Check a run for faults and poor excitation; see :meth:`ftlm.Run.advice`."""
     return Advice(run.name, tuple(_findings(run, structure)))
 
 
-def _findings(run: Measured, structure: Structure | None) -> Iterator[Finding]:
-    run = run.bridged()
+def _findings(run: RunData, structure: Structure | None) -> Iterator[Finding]:
+    run = run.with_interpolated_gaps()
     moving = [n for n in run.signals if np.ptp(run[n]) > 0]
     for name in run.signals:
         if name not in moving:
             yield _constant(run, name)
-    yield from _twins(run, moving)
+    yield from _duplicate_channels(run, moving)
     inputs = [n for n in run.inputs if n in moving]
     outputs = [n for n in run.outputs if n in moving]
     for name in outputs:
-        yield from dead(run, name)
+        yield from find_dead_channel(run, name)
     usual = []
     for name in outputs:
         wraps = list(_wraps(run, name))
         yield from wraps
-        # What jumps from one end to the other has no turning points, trend or spikes worth the name.
+        # A signal that wraps jumps across its range: tests for saturation, spikes and drift would be meaningless.
         if not wraps:
             usual.append(name)
             yield from _saturation(run, name)
             yield from _spikes(run, name)
     for name in inputs:
         yield from _saturation(run, name)
-    yield from _short(run, outputs)
+    yield from _insufficient_duration(run, outputs)
     yield from _excitation(run, inputs)
     if structure is not None:
-        yield from excitation_for(run, structure)
+        yield from check_excitation(run, structure)
     yield from _feedback(run, inputs, usual)
     yield from _drift(run, inputs, usual)
     for name in outputs:
         yield from _offset(run, name)
 
 
-def _with_unit(run: Measured, name: str, value: float) -> str:
+def _with_unit(run: RunData, name: str, value: float) -> str:
     unit = run.units.get(name, "")
     return f"{value:.4g} {unit}".strip() if unit not in ("", "1") else f"{value:.4g}"
 
@@ -171,14 +171,14 @@ def _times(count: int) -> str:
     return f"{count} time{'' if count == 1 else 's'}"
 
 
-def _stretches(flags: NDArray[np.bool_]) -> tuple[NDArray[np.intp], NDArray[np.intp]]:
-    """Starts and lengths of the stretches of true values."""
+def _true_intervals(flags: NDArray[np.bool_]) -> tuple[NDArray[np.intp], NDArray[np.intp]]:
+    """Start indices and lengths of the intervals of consecutive true values."""
     edges = np.diff(np.concatenate([[False], flags, [False]]).astype(np.int8))
     starts = np.flatnonzero(edges == 1)
     return starts, np.flatnonzero(edges == -1) - starts
 
 
-def _twins(run: Measured, names: list[str]) -> Iterator[Finding]:
+def _duplicate_channels(run: RunData, names: list[str]) -> Iterator[Finding]:
     for one, other in itertools.combinations(names, 2):
         if np.array_equal(run[one], run[other]):
             yield Finding(
@@ -186,7 +186,7 @@ def _twins(run: Measured, names: list[str]) -> Iterator[Finding]:
             )
 
 
-def _constant(run: Measured, name: str) -> Finding:
+def _constant(run: RunData, name: str) -> Finding:
     level = _with_unit(run, name, float(run[name][0]))
     if name in run.inputs:
         return Finding(
@@ -202,21 +202,21 @@ def _constant(run: Measured, name: str) -> Finding:
     )
 
 
-def dead(run: Measured, name: str) -> Iterator[Finding]:
-    """Say where an output without gaps stands still although it changes from row to row elsewhere."""
+def find_dead_channel(run: RunData, name: str) -> Iterator[Finding]:
+    """Report the longest interval over which an output is exactly constant although it varies elsewhere."""
     y = run[name]
     still = np.diff(y) == 0
-    starts, lengths = _stretches(still)
+    starts, lengths = _true_intervals(still)
     if not lengths.size:
         return
-    # Coarse steps or a machine that sticks stand still all the time; a dead channel does so only once or twice.
+    # Coarse quantization or stiction gives many constant intervals; a dead channel only one or two.
     if float(np.mean(still)) > 0.3 and np.median(lengths) > 1:
         return
     at = int(np.argmax(lengths))
     first, rows = int(starts[at]), int(lengths[at]) + 1
-    if rows < max(DEAD_ROWS, DEAD_SHARE * run.length):
+    if rows < max(MIN_DEAD_SAMPLES, DEAD_SHARE * run.length):
         return
-    # At an extreme it is clipped, which is said elsewhere; before the first input acts, a machine may well rest.
+    # Clipping at an extreme is reported as saturation; rest before the first input is legitimate.
     if _entered_steeply(y, first, rows):
         return
     resting = y[first] == 0 and first == 0
@@ -224,7 +224,7 @@ def dead(run: Measured, name: str) -> Iterator[Finding]:
     if resting and not inputs_moved:
         return
     begin, end = first * run.step, (first + rows) * run.step
-    after = f"use slice({end:.4g}, None)" if first < run.length // 20 else "check the sensor, or slice it away"
+    after = f"use window({end:.4g}, None)" if first < run.length // 20 else "check the sensor, or slice it away"
     yield Finding(
         "dead",
         name,
@@ -244,10 +244,10 @@ def _quantum(y: Floats) -> float:
 
 
 def _entered_steeply(y: Floats, first: int, rows: int) -> bool:
-    """Whether a stretch of equal values is cut off a moving signal: it moved fast just before and just after."""
+    """Whether an interval of equal values clips a moving signal: the signal is steep just before and after it."""
     moving = np.abs(np.diff(y))
     typical = float(np.median(moving[moving > 0])) if np.any(moving > 0) else 0.0
-    # A slow turn that an input's step ends is steep on one side only.
+    # A slow turning point that ends with an input step is steep on one side only.
     before = abs(y[first - 1] - y[first - 2]) if first >= 2 else math.inf
     end = first + rows
     after = abs(y[end + 1] - y[end]) if end + 1 < y.size else math.inf
@@ -255,26 +255,26 @@ def _entered_steeply(y: Floats, first: int, rows: int) -> bool:
     return bool(at_extreme and rows < y.size and min(before, after) > max(4 * _quantum(y), 0.2 * typical))
 
 
-def _saturation(run: Measured, name: str) -> Iterator[Finding]:
+def _saturation(run: RunData, name: str) -> Iterator[Finding]:
     y = run[name]
     levels = np.unique(y)
     if name in run.inputs and _few_levels(y):
         return  # a signal of a few levels sits at its extremes by design
-    noise, quantum = noise_of(y), _quantum(y)
+    noise, quantum = estimate_noise(y), _quantum(y)
     if name in run.inputs:
         role, remedy = "input", "harmless if this is what the machine received, else record the measured input"
     else:
         role, remedy = "output", "the true value is not known there: lower the amplitude or widen the range"
     for extreme, word in ((levels[0], "lowest"), (levels[-1], "highest")):
-        starts, lengths = _stretches(y == extreme)
-        long = lengths >= CLIPPED_ROWS
+        starts, lengths = _true_intervals(y == extreme)
+        long = lengths >= MIN_CLIPPED_SAMPLES
         if noise < 2 * quantum:
-            # Without noise, or with steps coarser than it, only a stretch that is entered at speed is clipped.
+            # If quantization exceeds the noise, only an interval that is entered at speed counts as clipped.
             steep = [_entered_steeply(y, int(s), int(n)) for s, n in zip(starts[long], lengths[long], strict=True)]
             clipped = int(np.sum(lengths[long][np.array(steep, dtype=bool)]))
         else:
             clipped = int(np.sum(lengths[long]))
-        if clipped >= max(CLIPPED_ROWS, CLIPPED_SHARE * y.size):
+        if clipped >= max(MIN_CLIPPED_SAMPLES, CLIPPED_SHARE * y.size):
             yield Finding(
                 "saturation",
                 name,
@@ -283,25 +283,25 @@ def _saturation(run: Measured, name: str) -> Iterator[Finding]:
             )
 
 
-def _spikes(run: Measured, name: str) -> Iterator[Finding]:
+def _spikes(run: RunData, name: str) -> Iterator[Finding]:
     y = run[name]
     if y.size < 5:
         return
     up, down = np.diff(y)[:-1], np.diff(y)[1:]
     reach = float(np.quantile(y, 0.995) - np.quantile(y, 0.005))
     height = np.minimum(np.abs(up), np.abs(down))
-    limit = max(SPIKE_SIGMAS * noise_of(y), SPIKE_SHARE * reach)
+    limit = max(SPIKE_SIGMAS * estimate_noise(y), SPIKE_SHARE * reach)
     out = (up * down < 0) & (height > limit)
-    # A signal may turn that fast everywhere; a spike stands alone between quiet neighbours.
+    # A fast signal may turn that sharply everywhere; a spike is isolated between quiet neighbors.
     near = np.abs(y[2:] - y[:-2])
     out &= near < 0.5 * height
     for n in run.inputs:
         jump = np.abs(np.diff(run[n]))
-        # An input that jumps there and back may take a fast output with it.
+        # A pulse of one sample in an input may cause a pulse in a fast output.
         pulsed = (jump > 0.2 * np.ptp(run[n])) & (np.ptp(run[n]) > 0)
         out &= ~(pulsed[:-1] & pulsed[1:])
     rows = np.flatnonzero(out) + 1
-    if not rows.size or rows.size > MOST_SPIKES * y.size:
+    if not rows.size or rows.size > MAX_SPIKE_SHARE * y.size:
         return
     worst = rows[int(np.argmax(height[rows - 1]))]
     yield Finding(
@@ -313,7 +313,7 @@ def _spikes(run: Measured, name: str) -> Iterator[Finding]:
     )
 
 
-def _wraps(run: Measured, name: str) -> Iterator[Finding]:
+def _wraps(run: RunData, name: str) -> Iterator[Finding]:
     y = run[name]
     steps = np.diff(y)
     reach, typical = float(np.ptp(y)), float(np.median(np.abs(steps)))
@@ -324,7 +324,7 @@ def _wraps(run: Measured, name: str) -> Iterator[Finding]:
             continue
         before = float(y[at] - y[at - WRAP_SLOPE])
         after = float(y[at + 1 + WRAP_SLOPE] - y[at + 1])
-        # Both slopes run against the jump: the quantity went on, its number began again.
+        # Both slopes oppose the jump: the quantity continued while its counter restarted.
         stays = max(abs(before), abs(after)) < 0.5 * abs(steps[at])
         if stays and before * steps[at] < 0 and after * steps[at] < 0:
             rows.append(at + 1)
@@ -341,19 +341,19 @@ def _wraps(run: Measured, name: str) -> Iterator[Finding]:
 
 
 def spectral_lines(u: Floats) -> tuple[int, int]:
-    """Number of spectral lines that an input has, and the bin of the largest."""
+    """Number of spectral lines of an input, and the bin of the largest one."""
     x = u - np.mean(u)
     phase = 2 * np.pi * np.arange(x.size) / x.size
     window = sum(a * np.cos(k * phase) for k, a in enumerate(BLACKMAN_HARRIS))
     size = np.abs(np.fft.rfft(x * window))
     size[:2] = 0  # the mean's, through the window
-    strong = size > LINE * size.max()
+    strong = size > SPECTRAL_LINE_THRESHOLD * size.max()
     # A single line fills LINE_BINS bins; a broad stretch holds as many lines as fit into it.
-    _, lengths = _stretches(strong)
+    _, lengths = _true_intervals(strong)
     return int(np.sum(np.maximum(1, np.rint(lengths / LINE_BINS)))), int(np.argmax(size))
 
 
-def _excitation(run: Measured, inputs: list[str]) -> Iterator[Finding]:
+def _excitation(run: RunData, inputs: list[str]) -> Iterator[Finding]:
     for name in inputs:
         lines, at = spectral_lines(run[name])
         if lines < 2 and at > 2:
@@ -368,7 +368,7 @@ def _excitation(run: Measured, inputs: list[str]) -> Iterator[Finding]:
     for i, name in enumerate(inputs):
         for other in inputs[:i]:
             r = float(np.corrcoef(run[name], run[other])[0, 1])
-            if abs(r) > TOGETHER:
+            if abs(r) > MAX_INPUT_CORRELATION:
                 yield Finding(
                     "excitation",
                     name,
@@ -377,18 +377,18 @@ def _excitation(run: Measured, inputs: list[str]) -> Iterator[Finding]:
                 )
 
 
-def excitation_for(run: Measured, structure: Structure) -> Iterator[Finding]:
-    """Whether the inputs have lines enough for the free numbers of each equation.
+def check_excitation(run: RunData, structure: Structure) -> Iterator[Finding]:
+    """Compare the number of spectral lines of the inputs with the free parameters of each equation.
 
-    In steady state a spectral line tells two numbers of every output that it reaches, a constant level one. What sticks
-    answers a line with others, so that lines do not count what it tells.
+    In steady state one spectral line identifies two parameters of each output it excites, and a constant level one.
+    Equations with friction are skipped: their response contains harmonics of the input lines.
     """
-    run = run.bridged()
+    run = run.with_interpolated_gaps()
     for item in structure.equations:
         if item.friction is not None:
             continue
         inputs = [s for s in item.signals if s in run.inputs]
-        # What is measured of the other outputs drives the equation, too.
+        # With measured coupling the other measured outputs are inputs of this equation.
         if structure.coupling == "measured":
             inputs += [s for s in item.signals if s != item.output and s in run.outputs]
         else:
@@ -408,12 +408,13 @@ def excitation_for(run: Measured, structure: Structure) -> Iterator[Finding]:
             )
 
 
-def _short(run: Measured, outputs: list[str]) -> Iterator[Finding]:
-    if run.length < FEW_ROWS:
+def _insufficient_duration(run: RunData, outputs: list[str]) -> Iterator[Finding]:
+    if run.length < MIN_USEFUL_SAMPLES:
         yield Finding(
             "short",
             "",
-            f"the run has {run.length} rows: too few for orders and coefficients; record at least {FEW_ROWS}, "
+            f"the run has {run.length} rows: too few for orders and coefficients; record at least "
+            f"{MIN_USEFUL_SAMPLES}, "
             "better thousands",
         )
         return
@@ -434,7 +435,7 @@ def _short(run: Measured, outputs: list[str]) -> Iterator[Finding]:
             )
 
 
-def _offset(run: Measured, name: str) -> Iterator[Finding]:
+def _offset(run: RunData, name: str) -> Iterator[Finding]:
     if not is_rest(run[name]):
         yield Finding(
             "offset",
@@ -444,9 +445,9 @@ def _offset(run: Measured, name: str) -> Iterator[Finding]:
         )
 
 
-def _drift(run: Measured, inputs: list[str], outputs: list[str]) -> Iterator[Finding]:
-    """A trend beside what first-order lags of the inputs, from fast to integrating, explain."""
-    m = min(DRIFT_M, run.length - 1)
+def _drift(run: RunData, inputs: list[str], outputs: list[str]) -> Iterator[Finding]:
+    """Test each output for a linear trend that first-order lags and integrals of the inputs do not explain."""
+    m = min(DRIFT_PULSES, run.length - 1)
     if m < 4 * DRIFT_BLOCKS:
         return
     step = run.duration / m
@@ -464,10 +465,10 @@ def _drift(run: Measured, inputs: list[str], outputs: list[str]) -> Iterator[Fin
         basis = np.stack([np.ones(m), *columns, *free])
         scale = np.linalg.norm(basis, axis=1)
         basis = basis[scale > 0] / scale[scale > 0][:, None]
-        # What the lags cannot tell from a trend is not called one: both sides are rid of them.
+        # Project trend and output on the complement of the lags: what these can explain is not counted as drift.
         q = orthonormal(basis.T, 1e-8)
         y_left, t_left = y - q @ (q.T @ y), t - q @ (q.T @ t)
-        if float(t_left @ t_left) < TREND_LEFT * float(t @ t):
+        if float(t_left @ t_left) < MIN_TREND_RESIDUAL_SHARE * float(t @ t):
             continue
         slope = float(t_left @ y_left) / float(t_left @ t_left)
         left = y_left - slope * t_left
@@ -484,14 +485,14 @@ def _drift(run: Measured, inputs: list[str], outputs: list[str]) -> Iterator[Fin
             )
 
 
-def _lagged(x: Floats, order: int) -> Floats:
-    """Rows x(t−1) … x(t−order) for t = order … N−1."""
+def _lag_matrix(x: Floats, order: int) -> Floats:
+    """Matrix of lagged values x(t−1) … x(t−order) for t = order … N−1, shape (order, N − order)."""
     return np.stack([x[order - k : x.size - k] for k in range(1, order + 1)])
 
 
-def _feedback(run: Measured, inputs: list[str], outputs: list[str]) -> Iterable[Finding]:
-    """Whether what is new in an output comes back in what is new in an input."""
-    rows = min(run.length, FEEDBACK_ROWS)
+def _feedback(run: RunData, inputs: list[str], outputs: list[str]) -> Iterable[Finding]:
+    """Test for feedback: correlation of output innovations with later input innovations."""
+    rows = min(run.length, MAX_FEEDBACK_SAMPLES)
     if rows < 20 * FEEDBACK_ORDER:
         return []
     pairs: list[tuple[float, Finding]] = []
@@ -499,18 +500,18 @@ def _feedback(run: Measured, inputs: list[str], outputs: list[str]) -> Iterable[
     fed: list[tuple[str, Floats, Floats]] = []
     for name in inputs:
         u = run[name][:rows] - np.mean(run[name])
-        past_u = _lagged(u, order)
+        past_u = _lag_matrix(u, order)
         new_u = np.zeros(0) if _few_levels(u) else _innovation(u[order:], past_u)
-        # Switched between levels, or predictable from itself: made beforehand.
-        if new_u.size and np.median(np.abs(new_u)) > PREDICTED * np.std(u):
+        # A switched or predictable input was computed before the run and cannot be a controller output.
+        if new_u.size and np.median(np.abs(new_u)) > MIN_INNOVATION_RATIO * np.std(u):
             fed.append((name, past_u, new_u))
     for (u_name, past_u, new_u), y_name in itertools.product(fed, outputs):
         y = run[y_name][:rows] - np.mean(run[y_name])
-        new_y = _innovation(y[order:], np.concatenate([past_u, _lagged(y, order)]))
+        new_y = _innovation(y[order:], np.concatenate([past_u, _lag_matrix(y, order)]))
         if np.median(np.abs(new_y)) < 0.1 * np.std(new_y):
             continue  # hardly any noise: what is new are switches of the input
-        # Winsorised, so that a few switches do not decide.
-        a, b = (np.clip(x / _robust(x), -3, 3) for x in (new_y, new_u))
+        # Winsorize, so that single switching instants do not dominate the correlation.
+        a, b = (np.clip(x / _robust_scale(x), -3, 3) for x in (new_y, new_u))
         a, b = a - np.mean(a), b - np.mean(b)
         lags = range(1, FEEDBACK_LAGS + 1)
         r = np.array([float(np.sum(a[:-k] * b[k:])) for k in lags]) / (np.linalg.norm(a) * np.linalg.norm(b))
@@ -518,7 +519,7 @@ def _feedback(run: Measured, inputs: list[str], outputs: list[str]) -> Iterable[
         k = int(np.argmax(np.abs(r))) + 1
         if abs(r[k - 1]) * math.sqrt(a.size) < limit:
             continue
-        parts = [np.sum(p) for p in np.array_split(a[:-k] * b[k:], FEEDBACK_PARTS)]
+        parts = [np.sum(p) for p in np.array_split(a[:-k] * b[k:], FEEDBACK_SEGMENTS)]
         if len({np.sign(p) for p in parts}) > 1:
             continue
         finding = Finding(
@@ -529,7 +530,7 @@ def _feedback(run: Measured, inputs: list[str], outputs: list[str]) -> Iterable[
             "output error, and if you can a reference that moves the machine well",
         )
         pairs.append((abs(r[k - 1]), finding))
-    # One loop is one fact; the strongest pair tells it.
+    # Report one finding per input: the pair with the strongest correlation.
     strongest: dict[str, Finding] = {}
     for _, finding in sorted(pairs, key=lambda pair: -pair[0]):
         strongest.setdefault(finding.signal, finding)
@@ -537,30 +538,30 @@ def _feedback(run: Measured, inputs: list[str], outputs: list[str]) -> Iterable[
 
 
 def _innovation(x: Floats, past: Floats) -> Floats:
-    """What a linear prediction from the past leaves, as far as rows of it differ by more than a correlation shows."""
+    """Residual of the least-squares prediction from lagged values, truncated to the numerical rank of these."""
     scale = np.linalg.norm(past, axis=1)
     scaled = past / np.where(scale > 0, scale, 1.0)[:, None]
-    return np.asarray(x - scaled.T @ solved(scaled.T, x, ALIKE))
+    return np.asarray(x - scaled.T @ minimum_norm_solution(scaled.T, x, RANK_TOLERANCE))
 
 
-def _robust(x: Floats) -> float:
+def _robust_scale(x: Floats) -> float:
     return max(float(np.median(np.abs(x))) / 0.6745, 1e-300)
 
 
 @dataclass(frozen=True)
 class SignalFigures:
-    """Figures of one signal, in its SI unit.
+    """Statistics of one signal, in its SI unit.
 
     Parameters
     ----------
     name, role, unit
-        Which signal.
+        Name, ``"input"`` or ``"output"``, and SI unit of the signal.
     first, low, high, mean, deviation
         First value, extremes, mean and standard deviation.
     noise
-        Standard deviation of the part that changes from sample to sample, from second differences.
+        Standard deviation of the measurement noise, estimated from second differences.
     quantum
-        Smallest change between two samples.
+        Smallest nonzero change between two samples (quantization step).
     at_extremes
         Share of samples at the lowest or highest value: saturation or a two-level signal.
     constant
@@ -586,18 +587,18 @@ class SignalFigures:
 
 @dataclass(frozen=True)
 class Inspection:
-    """A run in figures.
+    """Statistics of all signals of a run, with warnings.
 
     Parameters
     ----------
     run
-        Its name.
+        Name of the run.
     rows, step, duration
-        Its size, sampling step [s] and duration [s].
+        Number of samples, step [s] and duration [s].
     signals
-        Figures by signal, inputs first.
+        Statistics of each signal, inputs first.
     warnings
-        What to look at, in words.
+        Warnings about the data, as sentences.
     """
 
     run: str
@@ -625,8 +626,8 @@ class Inspection:
         return "\n".join(lines + [f"warning: {w}" for w in self.warnings])
 
 
-def inspect_run(run: Measured) -> Inspection:
-    """Ranges, noise, quantisation and rest of every signal of a run.
+def inspect_run(run: RunData) -> Inspection:
+    """Compute ranges, noise, quantization and rest of every signal of a run.
 
     Parameters
     ----------
@@ -648,10 +649,10 @@ def inspect_run(run: Measured) -> Inspection:
     return Inspection(run.name, run.length, run.step, run.duration, signals, list(dict.fromkeys(warnings)))
 
 
-def _figures(run: Measured, name: str) -> SignalFigures:
+def _figures(run: RunData, name: str) -> SignalFigures:
     all_rows = run[name]
-    x = read(all_rows)
-    low, high, noise = float(x.min()), float(x.max()), noise_of(all_rows)
+    x = drop_missing(all_rows)
+    low, high, noise = float(x.min()), float(x.max()), estimate_noise(all_rows)
     changes = np.abs(np.diff(x))
     changes = changes[changes > 0]
     deviation = float(x.std())

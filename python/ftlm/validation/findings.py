@@ -6,13 +6,13 @@ from collections.abc import Iterable, Sequence
 from dataclasses import dataclass
 
 #: Maximum number of warning groups in a summary.
-SHOWN = 3
+MAX_SUMMARY_WARNINGS = 3
 #: Severity levels: the model must not be used, must be used with care, or has a note.
-BAD, CARE, FACT = "do not use", "with care", "fact"
+LEVEL_DO_NOT_USE, LEVEL_WITH_CARE, LEVEL_FACT = "do not use", "with care", "fact"
 
 
 @dataclass(frozen=True)
-class Kind:
+class WarningKind:
     """Kind of warning.
 
     Parameters
@@ -37,10 +37,10 @@ class Kind:
 
 
 #: Kinds, most serious first. A warning has the first kind of which it contains a mark.
-KINDS = (
-    Kind(
+WARNING_KINDS = (
+    WarningKind(
         "unstable",
-        BAD,
+        LEVEL_DO_NOT_USE,
         "the free run grows without bound",
         "leave out the term that pushes, bound its coefficient, or, in a closed loop, name what drives it with "
         "reference=",
@@ -51,79 +51,79 @@ KINDS = (
             "coefficients is unstable",
         ),
     ),
-    Kind(
+    WarningKind(
         "range",
-        BAD,
+        LEVEL_DO_NOT_USE,
         "the free run leaves the range of numbers",
         "take other orders, or fewer terms",
         ("leaves the range of numbers",),
     ),
-    Kind(
+    WarningKind(
         "unseen",
-        BAD,
+        LEVEL_DO_NOT_USE,
         "the runs do not tell some numbers apart",
         "leave a term out, fix one of them, or record a richer input",
         ("moved together they change nothing", "standard errors are not finite", "covariance is not finite"),
     ),
-    Kind(
+    WarningKind(
         "identity",
-        BAD,
+        LEVEL_DO_NOT_USE,
         "its equation nearly says that an output equals itself",
         "keep own orders well below the highest one",
         ("Do not use these orders",),
     ),
-    Kind(
+    WarningKind(
         "useless",
-        BAD,
+        LEVEL_DO_NOT_USE,
         "the free run explains little of an output",
         "add what drives it, a delay or a term; or use method='output-error'",
         ("the free run explains little", "the equation error flatters this model"),
     ),
-    Kind(
+    WarningKind(
         "lost",
-        CARE,
+        LEVEL_WITH_CARE,
         "it predicts other runs worse than its own",
         "fewer free numbers, or more runs in one fit",
         ("describes the data it was identified from",),
     ),
-    Kind(
+    WarningKind(
         "loop",
-        CARE,
+        LEVEL_WITH_CARE,
         "the runs were made in a closed loop",
         "name what drives the loop with reference=, or open it",
         ("a closed loop",),
     ),
-    Kind(
+    WarningKind(
         "instrument",
-        CARE,
+        LEVEL_WITH_CARE,
         "what drives the loop tells little of its input",
         "record a stronger reference",
         ("says little of",),
     ),
-    Kind(
+    WarningKind(
         "untold",
-        CARE,
+        LEVEL_WITH_CARE,
         "the runs do not tell a number at all",
         "fix it, leave it out, or record a richer input",
         ("its standard error exceeds its bounds", "nothing tells fs and vs", "do not tell its damping"),
     ),
-    Kind(
+    WarningKind(
         "residuals",
-        CARE,
+        LEVEL_WITH_CARE,
         "the model leaves something out",
         "add a term, a delay or a free order; ftlm select compares",
         ("residuals are not white", "are not white: the model", "residuals still follow"),
     ),
-    Kind(
+    WarningKind(
         "provisional",
-        CARE,
+        LEVEL_WITH_CARE,
         "the fit is provisional",
         "start=… another result, or fewer free numbers",
         ("ended before it stood still", "it has not found the optimum", "there may be others"),
     ),
-    Kind(
+    WarningKind(
         "vague",
-        CARE,
+        LEVEL_WITH_CARE,
         "the runs hardly tell some numbers",
         "fix a number, leave a term out, or record a richer input",
         (
@@ -135,16 +135,16 @@ KINDS = (
             "too few for orders",
         ),
     ),
-    Kind(
+    WarningKind(
         "rough",
-        CARE,
+        LEVEL_WITH_CARE,
         "some intervals are rough",
         "intervals='profile' finds them",
         ("intervals are rough",),
     ),
-    Kind(
+    WarningKind(
         "step",
-        CARE,
+        LEVEL_WITH_CARE,
         "the sampling is coarse for this model",
         "sample faster, raise m, or trust its fast poles less",
         (
@@ -154,38 +154,44 @@ KINDS = (
             "the step alone moves",
         ),
     ),
-    Kind(
+    WarningKind(
         "prior",
-        CARE,
+        LEVEL_WITH_CARE,
         "the prior pulls its coefficients",
         "raise prior_covariance, or use method='least-squares'",
         ("the prior (K0",),
     ),
-    Kind("law", CARE, "it breaks the law of its coefficients", "use method='output-error'", ("coefficient law:",)),
-    Kind(
+    WarningKind(
+        "law",
+        LEVEL_WITH_CARE,
+        "it breaks the law of its coefficients",
+        "use method='output-error'",
+        ("coefficient law:",),
+    ),
+    WarningKind(
         "edge",
-        CARE,
+        LEVEL_WITH_CARE,
         "an order or a number is on its bound",
         "widen the bound",
         ("on the edge of its interval", "is on its bound"),
     ),
-    Kind(
+    WarningKind(
         "offset",
-        CARE,
+        LEVEL_WITH_CARE,
         "a constant is missing, or hidden",
         "offset='constant' or offset='auto'",
         ("explains as much with", "an unknown constant"),
     ),
-    Kind(
+    WarningKind(
         "history",
-        CARE,
+        LEVEL_WITH_CARE,
         "what the run did before its start counts",
         "begin the run at rest",
         ("ask for what was before",),
     ),
-    Kind(
+    WarningKind(
         "samples",
-        CARE,
+        LEVEL_WITH_CARE,
         "the samples harm the figures",
         "see the warning",
         (
@@ -198,24 +204,24 @@ KINDS = (
             "the rig stopped",
         ),
     ),
-    Kind(
+    WarningKind(
         "same",
-        FACT,
+        LEVEL_FACT,
         "a validation run is one of its own",
         "give another run",
         ("it validates nothing", "has the name of a run"),
     ),
 )
-OTHER = Kind("other", FACT, "to know", "see the warning")
+OTHER_KIND = WarningKind("other", LEVEL_FACT, "to know", "see the warning")
 
 
-def kind_of(warning: str) -> Kind:
+def warning_kind(warning: str) -> WarningKind:
     """Return the kind of a warning by the phrases in it."""
-    return next((kind for kind in KINDS if any(mark in warning for mark in kind.marks)), OTHER)
+    return next((kind for kind in WARNING_KINDS if any(mark in warning for mark in kind.marks)), OTHER_KIND)
 
 
 @dataclass(frozen=True)
-class Concern:
+class WarningGroup:
     """Warnings of one kind.
 
     Parameters
@@ -226,7 +232,7 @@ class Concern:
         Full texts.
     """
 
-    kind: Kind
+    kind: WarningKind
     warnings: tuple[str, ...]
 
     @property
@@ -238,19 +244,19 @@ class Concern:
     @property
     def remedy(self) -> str:
         """Remedy; empty if the warning itself states it."""
-        return "" if self.kind.remedy == OTHER.remedy else self.kind.remedy
+        return "" if self.kind.remedy == OTHER_KIND.remedy else self.kind.remedy
 
 
-def concerns(warnings: Iterable[str]) -> tuple[Concern, ...]:
+def group_warnings(warnings: Iterable[str]) -> tuple[WarningGroup, ...]:
     """Group warnings by kind, most serious first; a warning of no kind is a group of its own."""
     by: dict[str, list[str]] = {}
     for warning in dict.fromkeys(warnings):
-        by.setdefault(kind_of(warning).name, []).append(warning)
-    known = [Concern(kind, tuple(by[kind.name])) for kind in KINDS if kind.name in by]
-    return (*known, *(Concern(OTHER, (warning,)) for warning in by.get(OTHER.name, ())))
+        by.setdefault(warning_kind(warning).name, []).append(warning)
+    known = [WarningGroup(kind, tuple(by[kind.name])) for kind in WARNING_KINDS if kind.name in by]
+    return (*known, *(WarningGroup(OTHER_KIND, (warning,)) for warning in by.get(OTHER_KIND.name, ())))
 
 
-def left_over(found: Sequence[Concern]) -> str:
+def hidden_warnings_text(found: Sequence[WarningGroup]) -> str:
     """Text on the number of warnings that a summary omits; empty if it omits none."""
-    count = sum(len(c.warnings) for c in found) - len(found[:SHOWN])
+    count = sum(len(c.warnings) for c in found) - len(found[:MAX_SUMMARY_WARNINGS])
     return f"{count} more warning{'' if count == 1 else 's'}" if count else ""

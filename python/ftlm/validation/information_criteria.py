@@ -5,7 +5,7 @@ from __future__ import annotations
 import math
 from dataclasses import dataclass
 
-from ftlm.data.sampling import read
+from ftlm.data.sampling import drop_missing
 from ftlm.errors import ModelError
 from ftlm.svg.html_page import Table
 from ftlm.utils.formatting import Cell, Exact
@@ -77,7 +77,7 @@ def information_criteria(tests: Residuals, parameters: int) -> InformationCriter
     given = whole_number(parameters)
     if given is None or given < 0:
         raise ModelError(f"parameters = {parameters!r} is no number of parameters; give a whole number, at least 0")
-    counts = {name: sum(read(r).size for r in output.residuals) for name, output in tests.outputs.items()}
+    counts = {name: sum(drop_missing(r).size for r in output.residuals) for name, output in tests.outputs.items()}
     samples = sum(counts.values())
     k = given + tests.initial_terms + len(tests.outputs)
     likelihood = 0.0

@@ -14,39 +14,39 @@ from numpy.typing import NDArray
 
 from ftlm import _core
 from ftlm.data.run import Run, Runs, as_runs
-from ftlm.data.sampling import bridged
+from ftlm.data.sampling import interpolate_gaps
 from ftlm.errors import DataError, ModelError
-from ftlm.model.model import Solved, check_solved
+from ftlm.model.model import ModelData, check_model
 from ftlm.simulation.discretization import compared_values
-from ftlm.simulation.output_samples import Sampled, measured_samples
+from ftlm.simulation.output_samples import OutputSamples, measured_samples
 from ftlm.svg.html_page import Table
 from ftlm.utils.formatting import Cell, symbol_html
-from ftlm.utils.linalg import dot, orthonormal, projections, triangle, turned_rows
+from ftlm.utils.linalg import blockwise_triangular_factor, dot, orthonormal, projections, triangular_factor
 from ftlm.utils.statistics import (
-    LEVEL,
     NORMAL_99,
+    SIGNIFICANCE_LEVEL,
     autocorrelations,
     autoregression,
     chi_squared,
     chi_squared_99,
     is_constant,
     ljung_box,
-    whitened,
+    whiten_series,
 )
 from ftlm.utils.validation import Floats, whole_number
-from ftlm.validation.comparison import finite, free_runs
+from ftlm.validation.comparison import finite, simulate_runs
 
 #: Horizons of future input samples. Fast feedback is diluted in a long horizon, so both are tested.
-AHEAD = (5, 25)
+FUTURE_HORIZONS_SAMPLES = (5, 25)
 #: Significance level: probability that a test reports feedback in an open loop.
-LEVEL_FEEDBACK = 0.01
+FEEDBACK_TEST_LEVEL = 0.01
 #: Number of single past samples among the regressors. Older samples are averaged over blocks that grow by this factor.
-DENSE = 25
-WIDER = 1.5
+DENSE_PAST_SAMPLES = 25
+BLOCK_GROWTH_FACTOR = 1.5
 #: Maximum number of samples in the regression.
-MOST_ROWS = 50_000
+MAX_REGRESSION_SAMPLES = 50_000
 #: Relative norm of the residual of a column on the columns before it, below which it is collinear.
-SPANNED = 1e-6
+COLLINEARITY_TOLERANCE = 1e-6
 
 
 @dataclass(frozen=True)
@@ -67,20 +67,22 @@ class FeedbackTest:
     statistic: float
     limit: float
     instant: bool
-    decided: bool = True
+    conclusive: bool = True
 
     @property
-    def found(self) -> bool:
+    def has_feedback(self) -> bool:
         """Whether the input depends on the output."""
-        return self.decided and self.statistic > self.limit
+        return self.conclusive and self.statistic > self.limit
 
     def to_dict(self) -> dict[str, Any]:
         """For JSON."""
         shown = {"statistic": finite(self.statistic), "limit": finite(self.limit)}
-        return {**shown, "found": self.found, "instant": self.instant, "decided": self.decided}
+        return {**shown, "found": self.has_feedback, "instant": self.instant, "decided": self.conclusive}
 
 
-def past_columns(signal: Floats, first: int, reach: int, *, dense: int = DENSE, wider: float = WIDER) -> list[Floats]:
+def past_regressors(
+    signal: Floats, first: int, reach: int, *, dense: int = DENSE_PAST_SAMPLES, wider: float = BLOCK_GROWTH_FACTOR
+) -> list[Floats]:
     """Return samples of a signal ``first`` to ``dense`` samples back, then means of growing blocks up to ``reach``.
 
     Samples before the first one are taken as equal to it, so ``reach`` may be at most the length of the signal.
@@ -118,10 +120,10 @@ def feedback_test(
     direct
         Whether the model has direct feedthrough from this input, so that its value of the same sample is no feedback.
     """
-    table = Regressors.of(white, signal, others)
+    table = FeedbackRegression.of(white, signal, others)
     at_once = None if table is None else table.statistic(1 if direct else 0)
     if table is None or at_once is None:
-        return FeedbackTest(0.0, np.inf, instant=False, decided=False)
+        return FeedbackTest(0.0, np.inf, instant=False, conclusive=False)
     later = at_once if direct else table.statistic(1)
     if later is not None and later[0] > later[1]:
         return FeedbackTest(*later, instant=False)
@@ -129,7 +131,7 @@ def feedback_test(
 
 
 @dataclass(frozen=True)
-class Regressors:
+class FeedbackRegression:
     """Residuals and their regressors after an orthogonal transformation to as many rows as columns.
 
     The transformation preserves inner products, and with them every least-squares fit.
@@ -157,29 +159,32 @@ class Regressors:
     @classmethod
     def of(
         cls, white: Sequence[Floats], signal: Sequence[Floats], others: Sequence[Sequence[Floats]]
-    ) -> Regressors | None:
+    ) -> FeedbackRegression | None:
         """Build from residuals and inputs, one array per run; None if every run is too short."""
         parts, rows, width = [], 0, 0
-        sizes = [e.size for e in white if e.size > DENSE + AHEAD[-1]]
+        sizes = [e.size for e in white if e.size > DENSE_PAST_SAMPLES + FUTURE_HORIZONS_SAMPLES[-1]]
         reach = min(sizes, default=0) // 2
         for run, (every, driving) in enumerate(zip(white, signal, strict=True)):
-            e, u = every[: MOST_ROWS - rows], driving[: MOST_ROWS - rows]
-            inner = slice(DENSE, e.size - AHEAD[-1])
-            if e.size <= max(DENSE + AHEAD[-1], reach):
+            e, u = every[: MAX_REGRESSION_SAMPLES - rows], driving[: MAX_REGRESSION_SAMPLES - rows]
+            inner = slice(DENSE_PAST_SAMPLES, e.size - FUTURE_HORIZONS_SAMPLES[-1])
+            if e.size <= max(DENSE_PAST_SAMPLES + FUTURE_HORIZONS_SAMPLES[-1], reach):
                 continue
-            now, *columns = past_columns(u, 0, reach)
+            now, *columns = past_regressors(u, 0, reach)
             for other in others:
-                columns += past_columns(other[run][: e.size], 1, reach, dense=10, wider=2.0)
+                columns += past_regressors(other[run][: e.size], 1, reach, dense=10, wider=2.0)
             columns += [np.ones(e.size), now]
             width = len(columns) - 1
-            later = [u[DENSE + k : e.size - AHEAD[-1] + k] for k in range(AHEAD[-1] + 1)]
+            later = [
+                u[DENSE_PAST_SAMPLES + k : e.size - FUTURE_HORIZONS_SAMPLES[-1] + k]
+                for k in range(FUTURE_HORIZONS_SAMPLES[-1] + 1)
+            ]
             parts.append([*(c[inner] for c in columns), *later, e[inner]])
             rows += e.size
-            if rows >= MOST_ROWS:
+            if rows >= MAX_REGRESSION_SAMPLES:
                 break
         if not parts:
             return None
-        turned = triangle(np.concatenate([turned_rows(part) for part in parts]))
+        turned = triangular_factor(np.concatenate([blockwise_triangular_factor(part) for part in parts]))
         count = sum(part[-1].size for part in parts)
         return cls(turned[:, :width], turned[:, width], turned[:, width + 1 : -1], turned[:, -1], count)
 
@@ -189,32 +194,32 @@ class Regressors:
         future = self.future[:, first:]
         if self.rows < 2 * (past.shape[1] + future.shape[1]):
             return None
-        basis = orthonormal(past, SPANNED)
+        basis = orthonormal(past, COLLINEARITY_TOLERANCE)
         left = self.residuals - basis @ projections(basis, self.residuals)
         own = np.linalg.norm(future, axis=0)
         future = future - basis @ (basis.T @ future)
         future = future - basis @ (basis.T @ future)
-        new = np.linalg.norm(future, axis=0) > SPANNED * np.where(own > 0, own, 1.0)
+        new = np.linalg.norm(future, axis=0) > COLLINEARITY_TOLERANCE * np.where(own > 0, own, 1.0)
         worst: tuple[float, float] | None = None
-        for horizon in AHEAD:
+        for horizon in FUTURE_HORIZONS_SAMPLES:
             kept = future[:, : horizon + 1 - first][:, new[: horizon + 1 - first]]
             if not kept.size:
                 continue
-            seen = orthonormal(kept, SPANNED)
+            seen = orthonormal(kept, COLLINEARITY_TOLERANCE)
             explained, total = float(np.sum((seen.T @ left) ** 2)), dot(left, left)
             rest = (total - explained) / (self.rows - basis.shape[1] - seen.shape[1])
             if not rest > 0:
                 continue
-            found = explained / rest, chi_squared(seen.shape[1], LEVEL_FEEDBACK / len(AHEAD))
+            found = explained / rest, chi_squared(seen.shape[1], FEEDBACK_TEST_LEVEL / len(FUTURE_HORIZONS_SAMPLES))
             if worst is None or found[0] / found[1] > worst[0] / worst[1]:
                 worst = found
         return worst
 
 
 #: Difference below which two orders count as equal.
-GRAIN = 1e-9
+ORDER_TOLERANCE = 1e-9
 #: Ratio of residual RMS to the output's standard deviation below which discretization or quantization explains it.
-NEGLIGIBLE = 1e-3
+NEGLIGIBLE_RESIDUAL_RATIO = 1e-3
 
 
 @dataclass(frozen=True)
@@ -247,18 +252,18 @@ class CorrelationTest:
     statistic: float
     limit: float
     passed: bool
-    decided: bool = True
+    conclusive: bool = True
     first: int = 0
 
     @property
     def failed(self) -> bool:
         """Whether the test is conclusive and not passed."""
-        return self.decided and not self.passed
+        return self.conclusive and not self.passed
 
     @property
     def verdict(self) -> str:
         """Result as text: ``"passed"``, ``"failed"`` or ``"undecided"``."""
-        return "undecided" if not self.decided else "passed" if self.passed else "failed"
+        return "undecided" if not self.conclusive else "passed" if self.passed else "failed"
 
     @property
     def outside(self) -> int:
@@ -279,7 +284,7 @@ class CorrelationTest:
             "values": list(map(finite, self.values.tolist())),
             **{n: finite(getattr(self, n)) for n in ("band", "statistic", "limit")},
             "passed": self.passed,
-            "decided": self.decided,
+            "decided": self.conclusive,
         }
 
 
@@ -310,17 +315,17 @@ class OutputResiduals:
     nr: float
     whiteness: CorrelationTest
     inputs: dict[str, CorrelationTest]
-    loops: dict[str, FeedbackTest] = field(default_factory=dict)
+    feedback_tests: dict[str, FeedbackTest] = field(default_factory=dict)
 
     @property
     def feedback(self) -> tuple[str, ...]:
         """Inputs with feedback from this output: the runs were recorded in a closed loop."""
-        return tuple(name for name, test in self.loops.items() if test.found)
+        return tuple(name for name, test in self.feedback_tests.items() if test.has_feedback)
 
     @property
-    def judged(self) -> dict[str, CorrelationTest]:
+    def informative_tests(self) -> dict[str, CorrelationTest]:
         """Tests of the inputs that vary, or of all inputs if none does."""
-        return {n: t for n, t in self.inputs.items() if t.decided or not math.isnan(t.limit)} or self.inputs
+        return {n: t for n, t in self.inputs.items() if t.conclusive or not math.isnan(t.limit)} or self.inputs
 
     def to_dict(self) -> dict[str, Any]:
         """For JSON."""
@@ -330,7 +335,7 @@ class OutputResiduals:
             "whiteness": self.whiteness.to_dict(),
             "inputs": {n: t.to_dict() for n, t in self.inputs.items()},
             "feedback": list(self.feedback),
-            "loops": {n: t.to_dict() for n, t in self.loops.items()},
+            "loops": {n: t.to_dict() for n, t in self.feedback_tests.items()},
         }
 
 
@@ -366,7 +371,7 @@ class Residuals:
     @property
     def independent(self) -> dict[str, bool]:
         """Whether the residuals of each output are independent of all earlier inputs; False if inconclusive."""
-        return {name: all(t.passed for t in output.judged.values()) for name, output in self.outputs.items()}
+        return {name: all(t.passed for t in output.informative_tests.values()) for name, output in self.outputs.items()}
 
     @property
     def tests(self) -> list[tuple[str, str, CorrelationTest]]:
@@ -386,29 +391,31 @@ class Residuals:
         }
 
     @property
-    def _judged(self) -> list[CorrelationTest]:
-        return [t for output in self.outputs.values() for t in (output.whiteness, *output.judged.values())]
+    def _informative_tests(self) -> list[CorrelationTest]:
+        return [t for output in self.outputs.values() for t in (output.whiteness, *output.informative_tests.values())]
 
     @property
     def passed(self) -> bool:
         """Whether all residuals pass both tests; False if one is inconclusive, constant inputs excepted."""
-        return all(test.passed for test in self._judged)
+        return all(test.passed for test in self._informative_tests)
 
     @property
-    def decided(self) -> bool:
+    def conclusive(self) -> bool:
         """Whether every test is conclusive, constant inputs excepted, or one has failed."""
-        return any(test.failed for test in self._judged) or all(test.decided for test in self._judged)
+        return any(test.failed for test in self._informative_tests) or all(
+            test.conclusive for test in self._informative_tests
+        )
 
     @property
     def verdict(self) -> str:
         """Result as text: ``"passed"``, ``"FAILED"`` if one test has failed, or ``"undecided"``."""
-        return "passed" if self.passed else "FAILED" if self.decided else "undecided"
+        return "passed" if self.passed else "FAILED" if self.conclusive else "undecided"
 
     def to_dict(self) -> dict[str, Any]:
         """For JSON."""
         return {
             "passed": self.passed,
-            "decided": self.decided,
+            "decided": self.conclusive,
             "runs": list(self.runs),
             "refinement": self.refinement,
             "outputs": {name: output.to_dict() for name, output in self.outputs.items()},
@@ -427,7 +434,7 @@ class Residuals:
                 f"{label:<{width}}{value:>10.3g}{lag:>8}{test.band:>10.3g}{test.statistic:>12.4g}{test.limit:>10.4g}"
                 f"   {test.verdict}"
             )
-        lines += residual_sentences(self)
+        lines += describe_failed_tests(self)
         return "\n".join(lines)
 
     def _repr_html_(self) -> str:
@@ -435,10 +442,10 @@ class Residuals:
 
 
 #: Number of lags of the residual tests of every identification; the usual convention.
-LAGS = 25
+DEFAULT_LAGS = 25
 
 
-def resid(model: Solved, runs: Run | Sequence[Run], *, lags: int = LAGS) -> Residuals:
+def resid(model: ModelData, runs: Run | Sequence[Run], *, lags: int = DEFAULT_LAGS) -> Residuals:
     """Test whether the residuals of a simulation are white, and independent of the inputs.
 
     Residuals are measured minus simulated samples, with initial terms and offsets fitted to each run, on a grid refined
@@ -480,18 +487,18 @@ def resid(model: Solved, runs: Run | Sequence[Run], *, lags: int = LAGS) -> Resi
     judged. A test with a limit above 1, or with a constant input, is inconclusive. Both tests use the
     simulation: white equation errors prove nothing.
     """
-    check_solved(model)
+    check_model(model)
     several = as_runs(runs)
     count = whole_number(lags)
     if count is None or count < 1:
         raise ModelError(f"lags = {lags!r} is no number of lags; give a whole number, at least 1")
-    check_length(several, count)
+    check_run_lengths(several, count)
     for run in several:
         run.require_outputs([o for o in model.outputs if o in run])
-    return tested_residuals(model, several, free_runs(model, several), lags=count)
+    return run_residual_tests(model, several, simulate_runs(model, several), lags=count)
 
 
-def check_length(runs: Runs, lags: int) -> None:
+def check_run_lengths(runs: Runs, lags: int) -> None:
     """Raise DataError if a run is too short for these lags."""
     for run in runs:
         if run.length < 2 * lags + 3:
@@ -501,9 +508,9 @@ def check_length(runs: Runs, lags: int) -> None:
             )
 
 
-def tested_residuals(model: Solved, runs: Runs, free: Sequence[Sampled], *, lags: int) -> Residuals:
+def run_residual_tests(model: ModelData, runs: Runs, free: Sequence[OutputSamples], *, lags: int) -> Residuals:
     """Run both tests on the residuals of simulations at the inner samples of these runs."""
-    check_length(runs, lags)
+    check_run_lengths(runs, lags)
     residuals: dict[str, list[Floats]] = {o: [] for o in model.outputs}
     for run, sampled in zip(runs, free, strict=True):
         with np.errstate(invalid="ignore"):
@@ -513,7 +520,7 @@ def tested_residuals(model: Solved, runs: Runs, free: Sequence[Sampled], *, lags
     read = [s for s in model.structure.signals if s not in model.outputs and s in runs[0]]
     inputs = list(dict.fromkeys([*runs[0].inputs, *read]))
     signals = {
-        n: [np.ascontiguousarray(bridged(compared_values(run, model.structure, n))[1:-1]) for run in runs]
+        n: [np.ascontiguousarray(interpolate_gaps(compared_values(run, model.structure, n))[1:-1]) for run in runs]
         for n in inputs
     }
     outputs = {}
@@ -522,14 +529,14 @@ def tested_residuals(model: Solved, runs: Runs, free: Sequence[Sampled], *, lags
         measured = [compared_values(run, model.structure, name) for run in runs]
         deviation = math.sqrt(float(np.mean([np.nanvar(y) for y in measured])))
         gaps = [np.isnan(y[1:-1]) for y in measured]
-        direct = {t.signal for t in item.terms if t.order.constant >= item.order.constant - GRAIN}
+        direct = {t.signal for t in item.terms if t.order.constant >= item.order.constant - ORDER_TOLERANCE}
         commands = {s: s in direct for s in item.signals if s in runs[0].inputs}
-        outputs[name] = _tested(residuals[name], gaps, signals, lags, deviation, commands)
+        outputs[name] = _test_output(residuals[name], gaps, signals, lags, deviation, commands)
     steps, terms = tuple(run.step for run in runs), sum(len(t) for s in free for t in s.initial.values())
     return Residuals(outputs, tuple(run.name for run in runs), steps, max(s.refinement for s in free), terms)
 
 
-def _tested(
+def _test_output(
     series: list[Floats],
     gaps: list[NDArray[np.bool_]],
     signals: Mapping[str, list[Floats]],
@@ -546,14 +553,14 @@ def _tested(
         rms = float(np.sqrt(np.mean(everything**2)))
     nr = rms / deviation if deviation > 0 else math.inf
     if not math.isfinite(rms):
-        lost, across = _lost(np.arange(lags + 1)), _lost(np.arange(-lags, lags + 1))
+        lost, across = _failed_test(np.arange(lags + 1)), _failed_test(np.arange(-lags, lags + 1))
         return OutputResiduals(series, math.inf, math.inf, lost, dict.fromkeys(signals, across))
     series = [np.where(gone, np.nan, e) for e, gone in zip(series, gaps, strict=True)]
     white_test = _whiteness(series, everything.size, lags)
     # Through this filter the residuals are white, and the inputs lose what they share with them by chance alone.
     colour = autoregression(series, lags)
-    white = whitened(series, colour)
-    through = {n: whitened(v, colour) for n, v in signals.items() if not is_constant(v)}
+    white = whiten_series(series, colour)
+    through = {n: whiten_series(v, colour) for n, v in signals.items() if not is_constant(v)}
     loops = {
         name: feedback_test(white, through[name], [v for n, v in through.items() if n != name], direct=direct)
         for name, direct in commands.items()
@@ -562,12 +569,12 @@ def _tested(
     inputs = {}
     for name, values in signals.items():
         # What answers within the sample is no sign of what the model lacks.
-        at_once = name in loops and loops[name].found and not commands[name]
+        at_once = name in loops and loops[name].has_feedback and not commands[name]
         inputs[name] = _independence(white, values, colour, lags, first=int(at_once))
     return OutputResiduals(series, rms, nr, white_test, inputs, loops)
 
 
-def _lost(lags: NDArray[np.int64]) -> CorrelationTest:
+def _failed_test(lags: NDArray[np.int64]) -> CorrelationTest:
     """Return a failed test without correlations, for residuals that are not finite."""
     return CorrelationTest(lags, np.full(lags.size, math.nan), math.nan, math.inf, math.nan, passed=False)
 
@@ -587,16 +594,16 @@ def _independence(
     """Largest correlation at lags from ``first`` on, against a simultaneous band for all of them."""
     around = np.arange(-lags, lags + 1)
     if is_constant(signal):
-        return CorrelationTest(around, np.zeros(around.size), math.nan, 0.0, math.nan, passed=False, decided=False)
-    cross, variance, _ = _core.correlation(white, whitened(signal, colour), lags)
+        return CorrelationTest(around, np.zeros(around.size), math.nan, 0.0, math.nan, passed=False, conclusive=False)
+    cross, variance, _ = _core.correlation(white, whiten_series(signal, colour), lags)
     spread, largest = math.sqrt(variance), float(np.max(np.abs(cross[lags + first :])))
-    limit = NormalDist().inv_cdf(1 - (1 - (1 - LEVEL) ** (1 / (lags + 1 - first))) / 2) * spread
+    limit = NormalDist().inv_cdf(1 - (1 - (1 - SIGNIFICANCE_LEVEL) ** (1 / (lags + 1 - first))) / 2) * spread
     decided = limit < 1.0
     passed = decided and largest <= limit
     return CorrelationTest(around, cross, NORMAL_99 * spread, largest, limit, passed, decided, first)
 
 
-def residual_sentences(tests: Residuals) -> list[str]:
+def describe_failed_tests(tests: Residuals) -> list[str]:
     """Describe every failed test, and detected feedback."""
     words = []
     for name, output in tests.outputs.items():
@@ -609,9 +616,9 @@ def residual_sentences(tests: Residuals) -> list[str]:
                 f"{name}: residuals are not white (Ljung-Box {white.statistic:.3g} over {white.lags[-1]} lags, 99 % "
                 f"limit {white.limit:.3g}): the model leaves something out"
             )
-        for signal, test in output.judged.items():
+        for signal, test in output.informative_tests.items():
             lag, value = test.largest
-            if not test.decided:
+            if not test.conclusive:
                 why = f"its limit is {test.limit:.3g}: too few samples for residuals of this colour; give a longer run"
                 if math.isnan(test.limit):
                     why = f"{signal} does not move; give a run in which it does"
@@ -621,13 +628,13 @@ def residual_sentences(tests: Residuals) -> list[str]:
                     f"{name}: residuals still follow {signal} (correlation {value:.2g} at lag {lag}, 99 % limit "
                     f"{test.limit:.2g}): not all of what {signal} does is in the model"
                 )
-        words += [loop_sentence(name, signal, output) for signal in output.feedback]
+        words += [describe_feedback(name, signal, output) for signal in output.feedback]
     return words
 
 
-def loop_sentence(name: str, signal: str, output: OutputResiduals) -> str:
+def describe_feedback(name: str, signal: str, output: OutputResiduals) -> str:
     """Describe feedback found in residuals and its consequence for the estimates."""
-    test = output.loops[signal]
+    test = output.feedback_tests[signal]
     how = f"{signal} answers what {name} did before" if not test.instant else f"{signal} answers {name} within a sample"
     or_else = "" if not test.instant else f" (or {signal} feeds through to {name} directly: then add that term)"
     found = f"{name}: {how} (statistic {test.statistic:.3g}, 99 % limit {test.limit:.3g}): a closed loop{or_else}"
@@ -639,14 +646,16 @@ def loop_sentence(name: str, signal: str, output: OutputResiduals) -> str:
     )
 
 
-def residual_warnings(tests: Residuals, *, floor: float = NEGLIGIBLE) -> list[str]:
+def residual_warnings(tests: Residuals, *, floor: float = NEGLIGIBLE_RESIDUAL_RATIO) -> list[str]:
     """Describe failed residual tests, except for outputs with a normalized residual of at most ``floor``.
 
     Feedback is reported only if residuals are not white: only then does it bias the output-error estimate.
     """
     kept = {name: output for name, output in tests.outputs.items() if not output.nr <= floor}
-    harmless = {n: replace(output, loops={}) if output.whiteness.passed else output for n, output in kept.items()}
-    return residual_sentences(replace(tests, outputs=harmless))
+    harmless = {
+        n: replace(output, feedback_tests={}) if output.whiteness.passed else output for n, output in kept.items()
+    }
+    return describe_failed_tests(replace(tests, outputs=harmless))
 
 
 def residual_table(tests: Residuals, *, title: str = "Residual tests") -> Table:
