@@ -54,7 +54,7 @@ def main() -> None:
     for name, run in runs.items():
         before: tuple[int, float] | None = None
         for step in arguments.steps:
-            lattice = ftlm.order_grid(step=step, alpha=tuple(arguments.alpha))
+            lattice = ftlm.order_grid(increment=step, alpha=tuple(arguments.alpha))
             wall, cpu = time.perf_counter(), time.process_time()
             found = ftlm.search_orders(run, equation, lattice, **options)
             wall, cpu = time.perf_counter() - wall, time.process_time() - cpu
@@ -76,7 +76,7 @@ def main() -> None:
             print(lines[-1], flush=True)
             if arguments.against_brute_force:
                 cpu = time.process_time()
-                brute = ftlm.search_orders(run, equation, lattice, early_stopping=False, **options)
+                brute = ftlm.search_orders(run, equation, lattice, pruning=False, **options)
                 cpu = time.process_time() - cpu
                 # Every candidate was run: what is not kept was beaten, or has no score.
                 followed = len(brute.table) + sum(brute.exclusion_counts[k] for k in ("beaten", "singular", "diverged"))

@@ -37,7 +37,12 @@ def main() -> None:
         for within in arguments.within:
             wall, cpu = time.perf_counter(), time.process_time()
             proved = ftlm.certify_orders(
-                run, equation, ftlm.order_grid(alpha=tuple(arguments.alpha)), within=within, apart=arguments.apart, m=M
+                run,
+                equation,
+                ftlm.order_grid(alpha=tuple(arguments.alpha)),
+                tolerance=within,
+                min_separation=arguments.apart,
+                m=M,
             )
             wall, cpu = time.perf_counter() - wall, time.process_time() - cpu
             best = ", ".join(f"{n} {v:.5g}" for n, v in proved.orders.items())

@@ -65,8 +65,8 @@ def searches(quick: bool) -> None:
     equation = replace(ftlm.flexible_link(form="published", stage=1).equation("theta12"), initial="rest")
     lattice = ftlm.order_grid(alpha=(1.05, 2.0))
     options = {"coefficients": "least-squares", "m": M}
-    clean, coarse = plant_a_run(), ftlm.order_grid(step=0.1, alpha=(1.1, 2.0))
-    brute, _, cpu = clocked(lambda: ftlm.search_orders(clean, equation, coarse, early_stopping=False, **options))
+    clean, coarse = plant_a_run(), ftlm.order_grid(increment=0.1, alpha=(1.1, 2.0))
+    brute, _, cpu = clocked(lambda: ftlm.search_orders(clean, equation, coarse, pruning=False, **options))
     brute_each = cpu / brute.candidates
     for hub, deflection in ((1e-3, 1e-4), (1e-4, 1e-4), (1e-3, 1e-3)):
         run = plant_a_run(hub, deflection)
@@ -95,7 +95,7 @@ def searches(quick: bool) -> None:
                 lambda: ftlm.search_orders(
                     run,
                     equation,
-                    ftlm.order_grid(step=step, alpha=(1.05, 2.0)),
+                    ftlm.order_grid(increment=step, alpha=(1.05, 2.0)),
                     criterion="equation-error",
                     norm="l2",
                     m=M,
@@ -130,7 +130,7 @@ def refined(quick: bool) -> None:
             lambda run=run: ftlm.search_orders(
                 run,
                 equation,
-                ftlm.order_grid(step=step, alpha=(1.05, 2.0)),
+                ftlm.order_grid(increment=step, alpha=(1.05, 2.0)),
                 coefficients="instrumental-variables",
                 m=M,
             )
@@ -187,14 +187,14 @@ def stage(quick: bool) -> None:
     # Both equations of a tuple, each fitted and run to its end.
     one = replace(structure.equation("theta12"), initial="rest")
     brute, _, cpu = clocked(
-        lambda: ftlm.search_orders(
-            run, one, ftlm.order_grid(step=0.2, alpha=(1.2, 2.0)), early_stopping=False, **options
-        )
+        lambda: ftlm.search_orders(run, one, ftlm.order_grid(increment=0.2, alpha=(1.2, 2.0)), pruning=False, **options)
     )
     each = 2 * cpu / brute.candidates
     step = 0.1 if quick else 0.05
     low = {"alpha1": (1.5, 2.0, step), "alpha2": (1.5, 2.0, step)}
-    found, wall, cpu = clocked(lambda: ftlm.search_orders(run, structure, ftlm.order_grid(step=step, **low), **options))
+    found, wall, cpu = clocked(
+        lambda: ftlm.search_orders(run, structure, ftlm.order_grid(increment=step, **low), **options)
+    )
     judge(
         "stage",
         "joined tables over evaluating every tuple, processor time",

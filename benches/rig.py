@@ -44,7 +44,7 @@ def real_time(rate: float, seconds: float) -> None:
     )
     columns = [rig.rig.COLUMNS.index(name) for name in stream.signals]
     late = []
-    board = VirtualBoard(arm, paced=True, horizon=seconds + 1.0)
+    board = VirtualBoard(arm, real_time=True, horizon=seconds + 1.0)
     with Rig(board, rate=rate, limit=seconds + 1.0, watchdog=1.0, limits=PATIENT) as link:
         for start in range(0, len(commands), 32):
             link.run(commands[start : start + 32])

@@ -90,10 +90,10 @@ def main() -> None:
     brute = ftlm.search_orders(
         run,
         equation,
-        ftlm.order_grid(step=BRUTE_STEP, alpha=(1.2, 2.0)),
+        ftlm.order_grid(increment=BRUTE_STEP, alpha=(1.2, 2.0)),
         coefficients="least-squares",
         m=M,
-        early_stopping=False,
+        pruning=False,
     )
     cost = (time.perf_counter() - start) * threads / brute.candidates
     ours = per_candidate["least-squares"]
@@ -103,11 +103,11 @@ def main() -> None:
     table = ftlm.search_orders(
         run,
         equation,
-        ftlm.order_grid(step=BRUTE_STEP, alpha=(1.2, 2.0)),
+        ftlm.order_grid(increment=BRUTE_STEP, alpha=(1.2, 2.0)),
         innovation_length=7,
-        keep=100_000,
+        top=100_000,
         m=M,
-        early_stopping=False,
+        pruning=False,
     ).table
     rec = record(run, equation, M)
     y, hub, current = (rec.of(n) for n in ("theta12", "theta11", "I1"))

@@ -61,8 +61,8 @@ def search(path, progress=None):
     return ftlm.search_orders(
         run(),
         ftlm.equation(EQUATION, initial="rest"),
-        ftlm.order_grid(step=0.1),
-        early_stopping=False,
+        ftlm.order_grid(increment=0.1),
+        pruning=False,
         m=2048,
         coefficients="least-squares",
         store=path,
@@ -80,12 +80,12 @@ def stage(path, progress=None):
     noise = np.random.default_rng(1)
     noisy = {n: clean[n] + 1e-4 * noise.standard_normal(rows) for n in outputs}
     given = ftlm.Run.from_arrays(step=0.004, inputs={"I1": current}, outputs=noisy, name="stage")
-    lattice = ftlm.order_grid(step=0.025, alpha=(1.8, 2.0), gamma1=(0.8, 1.1), beta2=(0.0, 0.5), mu2=(0.7, 1.0))
+    lattice = ftlm.order_grid(increment=0.025, alpha=(1.8, 2.0), gamma1=(0.8, 1.1), beta2=(0.0, 0.5), mu2=(0.7, 1.0))
     return ftlm.search_orders(
         given,
         ftlm.flexible_link(form="published"),
         lattice,
-        early_stopping=False,
+        pruning=False,
         m=1024,
         coefficients="least-squares",
         store=path,

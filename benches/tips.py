@@ -104,7 +104,7 @@ def judged(controller, reference, ends, **options):
 def of_seed(seed):
     """Everything of a seed: the move's noise is another's than the run's."""
     run = moves.own_run(seed)
-    path = control.point_to_point(ANGLE, SECONDS, RATE, before=BEFORE, after=AFTER)
+    path = control.point_to_point(ANGLE, SECONDS, RATE, dwell_before=BEFORE, dwell_after=AFTER)
     ends = round((BEFORE + SECONDS) * RATE)
     found = {"seed": seed}
     for kind, structure in structures().items():
@@ -115,13 +115,13 @@ def of_seed(seed):
             refused = None
             try:
                 design, controller = designed(name, model, SAMPLES)
-                planned = control.inverse_dynamics(design, path, of=TIP, samples=0)
+                planned = control.inverse_dynamics(design, path, output=TIP, samples=0)
             except ftlm.ModelError as error:
                 # Its own intervals refuse it; what it would have done is told all the same.
                 refused = str(error)
                 try:
                     design, controller = designed(name, model, 0)
-                    planned = control.inverse_dynamics(design, path, of=TIP, samples=0)
+                    planned = control.inverse_dynamics(design, path, output=TIP, samples=0)
                 except ftlm.ModelError as worse:
                     told[name] = {"refused": str(worse), "plain": None, "inverse": None, "none": True}
                     continue
@@ -195,7 +195,7 @@ def still(seed=0):
     """How still each design leaves the tip on other plants, moved on the arm as it is; moves to be seen."""
     model, loops = contenders(seed)
     pid, lqg, calm = (loops[n] for n in ("fractional PID, 40 rad/s", "LQG", "LQG, ten times the deviations"))
-    path = control.point_to_point(ANGLE, SECONDS, RATE, before=BEFORE, after=AFTER)
+    path = control.point_to_point(ANGLE, SECONDS, RATE, dwell_before=BEFORE, dwell_after=AFTER)
     ends = round((BEFORE + SECONDS) * RATE)
     shaper = control.input_shaper(model, "zvd", coupling="measured")
     runs = {
@@ -207,12 +207,12 @@ def still(seed=0):
         ),
         "LQG, inverse": (
             lambda: both(lqg.controlled(0.93)),
-            control.inverse_dynamics(lqg, path, of=TIP, samples=0).reference,
+            control.inverse_dynamics(lqg, path, output=TIP, samples=0).reference,
             ends,
         ),
         "LQG, ten times the deviations, inverse": (
             lambda: both(calm.controlled(0.93)),
-            control.inverse_dynamics(calm, path, of=TIP, samples=0).reference,
+            control.inverse_dynamics(calm, path, output=TIP, samples=0).reference,
             ends,
         ),
     }

@@ -260,7 +260,7 @@ def files(table, folder, counts):
     r = random.Random(1)
     equation = ftlm.equation("D^alpha y = c y + b u", initial="rest")
     store = folder / "whole.ftlm"
-    found = ftlm.search_orders(run, equation, ftlm.order_grid(step=0.1), store=store, m=32)
+    found = ftlm.search_orders(run, equation, ftlm.order_grid(increment=0.1), store=store, m=32)
     run.to_csv(folder / "whole.csv")
     found.model.save(folder / "whole.json")
     kinds = {

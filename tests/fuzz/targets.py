@@ -274,7 +274,7 @@ def _seeds(target, folder):
         return (b"0.5:1.5:0.05", b"1", b"0.1:0.2")
     structure = ftlm.equation("D^alpha y = a D^beta y + b u")
     ftlm.search_orders(
-        run, structure, ftlm.order_grid(step=0.25), m=16, store=folder / "a.ftlm", early_stopping=False, threads=1
+        run, structure, ftlm.order_grid(increment=0.25), m=16, store=folder / "a.ftlm", pruning=False, threads=1
     )
     whole = (folder / "a.ftlm").read_bytes()
     halves = unsealed(whole)
@@ -285,6 +285,6 @@ def _seeds(target, folder):
     payloads = [msgspec.msgpack.encode(frame) for frame in (request, half)]
     half_done = b"".join(struct.pack("<I", len(p)) + p for p in payloads)
     law = ftlm.equation("D^alpha y = a D^beta y + b D^(alpha-beta) u")
-    ftlm.search_orders(run, law, ftlm.order_grid(step=0.25), m=16, store=folder / "b.ftlm", keep=3, threads=1)
+    ftlm.search_orders(run, law, ftlm.order_grid(increment=0.25), m=16, store=folder / "b.ftlm", top=3, threads=1)
     of_law = (folder / "b.ftlm").read_bytes()
     return (halves, half_done, unsealed(of_law)) if target == "sealed" else (whole, of_law)

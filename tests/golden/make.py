@@ -39,10 +39,10 @@ def main():
     found = ftlm.identify(given, ftlm.equation("D^1.4 y = a D^0.4 y + c y + b u"), m=64, threads=1)
     found.model.save(folder / "model.json")
     structure = ftlm.equation("D^alpha y = a D^beta y + c D^mu y + b u", initial="rest")
-    lattice = ftlm.order_grid(step=0.05, beta=(0.0, 1.0), mu=(0.0, 1.0))
+    lattice = ftlm.order_grid(increment=0.05, beta=(0.0, 1.0), mu=(0.0, 1.0))
     options = {"m": 32, "early_stopping": False, "threads": 1, "keep": 5}
     whole = ftlm.search_orders(given, structure, lattice, store=folder / "search.ftlm", **options)
-    settings = Settings.check("output-error", "l1", "multi-innovation", 7, 1.0, "haar", 5, 1, early_stopping=False)
+    settings = Settings.check("output-error", "l1", "multi-innovation", 7, 1.0, "haar", 5, 1, pruning=False)
     job = make_job(given, structure, lattice, settings, m=32)
     with Store(folder / "half.ftlm", [job.request("y")]) as store:
         work = job.equation_problem()
@@ -65,7 +65,7 @@ def under_a_law(folder, given):
     """A finished store of a search under an order law, and its table."""
     structure = ftlm.equation("D^alpha y = a D^beta y + b D^(alpha-beta) u", initial="rest")
     options = {"m": 32, "threads": 1, "keep": 5, "store": folder / "law.ftlm"}
-    found = ftlm.search_orders(given, structure, ftlm.order_grid(step=0.05), **options)
+    found = ftlm.search_orders(given, structure, ftlm.order_grid(increment=0.05), **options)
     (folder / "law.json").write_text(json.dumps(found.to_dict(), indent=1) + "\n", encoding="utf-8")
 
 

@@ -239,13 +239,13 @@ def test_the_arms_record_of_2011():
     assert "theta22 is exactly 0 rad from 0 s to 0.204 s" in text
     assert [f.signal for f in advice if f.kind == "feedback"]
     assert set(advice.kinds) <= {"dead", "feedback", "offset"}
-    later = ftlm.load(DATA / "two_link_psf" / "psf.csv", slice=(1.1, 19.5), **ARM).advice()
+    later = ftlm.load(DATA / "two_link_psf" / "psf.csv", window=(1.1, 19.5), **ARM).advice()
     assert set(later.kinds) == {"feedback", "offset"}
 
 
 @needs_data
 def test_the_arm_under_lqr():
-    advice = ftlm.load(DATA / "two_link_lqr" / "lqr.csv", slice=(0.1, 19.9), **ARM).advice()
+    advice = ftlm.load(DATA / "two_link_lqr" / "lqr.csv", window=(0.1, 19.9), **ARM).advice()
     assert {f.signal for f in advice if f.kind == "feedback"} == {"I1", "I2"}
     assert set(advice.kinds) == {"feedback", "offset"}
 

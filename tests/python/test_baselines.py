@@ -14,7 +14,7 @@ from ftlm.validation.comparison import compare_means
 
 EQUATION = "D^alpha y = a D^nu y + c y + b u"
 BOUNDS = {"a": (-10.0, 0.0), "c": (-20.0, 0.0), "b": (0.0, 10.0)}
-LATTICE = ftlm.order_grid(step=0.1, alpha=(1.3, 1.9))
+LATTICE = ftlm.order_grid(increment=0.1, alpha=(1.3, 1.9))
 
 
 @pytest.fixture(scope="module")
@@ -23,7 +23,7 @@ def found(small_run):
         small_run,
         ftlm.equation(EQUATION),
         method="genetic",
-        lattice=LATTICE,
+        order_grid=LATTICE,
         genetic=Genetic(seeds=(0, 1), evaluations=12000, population=100, bounds=BOUNDS),
     )
 
@@ -84,7 +84,7 @@ def test_leaving_hopeless_candidates_early_changes_nothing(small_run, monkeypatc
 
 
 def test_as_many_evaluations_as_the_lattice_has_candidates(small_run):
-    lattice = ftlm.order_grid(step=0.25, alpha=(1.25, 2.0))
+    lattice = ftlm.order_grid(increment=0.25, alpha=(1.25, 2.0))
     candidates = ftlm.search_orders(
         small_run, ftlm.equation(EQUATION), lattice, coefficients="least-squares"
     ).candidates
@@ -109,7 +109,7 @@ def test_all_equations_of_a_stage_under_their_order_law(clean_a):
         structure,
         method="genetic",
         m=256,
-        lattice=ftlm.order_grid(alpha=(2.0, 2.0)),
+        order_grid=ftlm.order_grid(alpha=(2.0, 2.0)),
         genetic=Genetic(seeds=(0,), evaluations=400, population=40),
     )
     assert set(found.orders) == set(structure.order_names)

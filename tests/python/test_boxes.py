@@ -14,7 +14,7 @@ BOXED = 1 << 25
 
 def search(run, *, alpha=(1.05, 2.0), threads=2, **options):
     equation = ftlm.equation(EQUATION, initial="rest")
-    lattice = ftlm.order_grid(step=0.015, alpha=alpha)
+    lattice = ftlm.order_grid(increment=0.015, alpha=alpha)
     return ftlm.search_orders(run, equation, lattice, coefficients="least-squares", m=64, threads=threads, **options)
 
 
@@ -91,7 +91,7 @@ def unruly():
 
 
 def closely(run, path=None, highest=2.0, **options):
-    equation, lattice = ftlm.equation(EQUATION, initial="rest"), ftlm.order_grid(step=0.05, alpha=(1.15, highest))
+    equation, lattice = ftlm.equation(EQUATION, initial="rest"), ftlm.order_grid(increment=0.05, alpha=(1.15, highest))
     return ftlm.search_orders(run, equation, lattice, coefficients="least-squares", m=32, store=path, **options)
 
 

@@ -12,7 +12,7 @@ from ftlm.cli.main import app
 from ftlm.errors import ModelError
 
 WORDS = "D^alpha y = a D^beta y + c y + b u"
-LATTICE = ftlm.order_grid(step=0.1, alpha=(1.3, 1.8), beta=(0.5, 0.9))
+LATTICE = ftlm.order_grid(increment=0.1, alpha=(1.3, 1.8), beta=(0.5, 0.9))
 
 
 @pytest.fixture(scope="module")
@@ -31,7 +31,7 @@ def equation():
 
 @pytest.fixture(scope="module")
 def proved(run, equation):
-    return ftlm.certify_orders(run, equation, LATTICE, within=0.05, m=128)
+    return ftlm.certify_orders(run, equation, LATTICE, tolerance=0.05, m=128)
 
 
 def rmse(run, equation, alpha, beta):
@@ -70,8 +70,8 @@ def test_no_search_between_the_values_of_the_lattice_does_better(run, equation, 
 
 def test_the_best_may_stand_on_an_edge(run, equation):
     """Where no middle of a box is."""
-    edge = ftlm.order_grid(step=0.1, alpha=(1.3, 1.5), beta=(0.85, 0.9))
-    found = ftlm.certify_orders(run, equation, edge, within=0.05, m=128)
+    edge = ftlm.order_grid(increment=0.1, alpha=(1.3, 1.5), beta=(0.85, 0.9))
+    found = ftlm.certify_orders(run, equation, edge, tolerance=0.05, m=128)
     assert found.orders["alpha"] in (1.3, 1.5) or found.orders["beta"] in (0.85, 0.9)
     lattice = ftlm.search_orders(
         run, equation, edge, criterion="equation-error", norm="l2", coefficients="least-squares", m=128
@@ -84,9 +84,9 @@ def test_the_best_may_stand_on_an_edge(run, equation):
 
 
 def test_several_runs_of_their_own_steps_and_threads(run, equation, proved):
-    again = ftlm.certify_orders(run, equation, LATTICE, within=0.05, m=128, threads=1)
+    again = ftlm.certify_orders(run, equation, LATTICE, tolerance=0.05, m=128, threads=1)
     assert again == proved
-    twice = ftlm.certify_orders([run, run.slice(1.0, 5.0)], equation, LATTICE, within=0.2, m=128)
+    twice = ftlm.certify_orders([run, run.slice(1.0, 5.0)], equation, LATTICE, tolerance=0.2, m=128)
     assert 0 < twice.lower_bound <= twice.best
 
 
@@ -96,7 +96,7 @@ def test_it_says_in_words_what_is_proved_and_what_is_not(run, equation, proved):
     assert "on a lattice or between" in text
     assert f"{proved.cells} boxes" in text
     assert "asked" not in text
-    cut = ftlm.certify_orders(run, equation, LATTICE, within=0.05, m=128, cells=proved.cells - 1)
+    cut = ftlm.certify_orders(run, equation, LATTICE, tolerance=0.05, m=128, max_cells=proved.cells - 1)
     assert cut.open_cells > 0
     assert "was asked for" in str(cut) or "nothing is proved" in str(cut)
     nothing = replace(proved, at_least=0.0, open=7)
@@ -105,7 +105,7 @@ def test_it_says_in_words_what_is_proved_and_what_is_not(run, equation, proved):
     document = json.loads(json.dumps(proved.to_dict()))
     assert document["at_least"] == proved.at_least
     assert document["orders"] == proved.orders
-    searched = ftlm.search_orders(run, equation, ftlm.order_grid(step=0.3), m=32)
+    searched = ftlm.search_orders(run, equation, ftlm.order_grid(increment=0.3), m=32)
     whole = replace(searched, certificate=proved)
     assert str(whole).endswith(text)
     assert "certificate" not in searched._repr_html_()
@@ -136,7 +136,7 @@ def test_it_says_in_words_what_is_proved_and_what_is_not(run, equation, proved):
 def test_what_cannot_be_had_is_said(run, words, options, said):
     given = {"lattice": LATTICE, "m": 128} | options
     if "3 u" in words and "lattice" not in options:
-        given["lattice"] = ftlm.order_grid(step=0.1)
+        given["lattice"] = ftlm.order_grid(increment=0.1)
     with pytest.raises(ModelError, match=said):
         ftlm.certify_orders(run, ftlm.equation(words, initial="rest"), **given)
 

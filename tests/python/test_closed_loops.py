@@ -169,7 +169,7 @@ def test_instrumental_variables_count_the_error_of_their_orders():
     near = ftlm.order_grid(alpha=(1.5, 1.9))
     for seed in range(3):
         run = loops.open_run(seed, noise=0.05)
-        found = ftlm.identify(run, STRUCTURE, method="instrumental-variables", lattice=near)
+        found = ftlm.identify(run, STRUCTURE, method="instrumental-variables", order_grid=near)
         truth = {**loops.TRUTH, "alpha": 1.73}
         held += [found.intervals[n][0] <= v <= found.intervals[n][1] for n, v in truth.items()]
         assert found.standard_errors["alpha"] >= 0.5 * abs(found.orders["alpha"] - 1.73)

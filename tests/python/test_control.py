@@ -82,7 +82,7 @@ def test_what_a_shaper_says_is_left_is_what_is_simulated(kind):
 def test_two_modes_are_shaped_together():
     model = ftlm.Model(ftlm.equation("D^4 y = -3.7 D^3 y - 1000 D^2 y - 1500 D y - 200000 y + 200000 u"))
     modes = sorted((m for m in model.modes() if m.oscillatory), key=lambda m: m.damping)
-    shaper = control.input_shaper(model, modes_shaped=2)
+    shaper = control.input_shaper(model, modes=2)
     for mode in modes:
         assert float(shaper.residual(mode.frequency, mode.damping)) < 1e-12
     assert sum(shaper.amplitudes) == pytest.approx(1.0)
@@ -145,13 +145,13 @@ def test_intervals_too_wide_for_a_shaper_are_refused_in_words():
 
 REFUSED = [
     (lambda: control.input_shaper(POLE, "zvv"), "kind = 'zvv' is not known"),
-    (lambda: control.input_shaper(POLE, modes_shaped=0), "modes_shaped = 0"),
-    (lambda: control.input_shaper(POLE, modes_shaped="1"), "modes_shaped = '1'"),
+    (lambda: control.input_shaper(POLE, modes=0), "modes_shaped = 0"),
+    (lambda: control.input_shaper(POLE, modes="1"), "modes_shaped = '1'"),
     (lambda: control.input_shaper(POLE, {"zv": 1}), "kind = {'zv': 1} is not known"),
     (lambda: control.input_shaper(POLE, np.array(["zv", "zvd"])), "kind = array.* is not known"),
     (lambda: control.input_shaper(POLE, "x" * 10**6), "kind = 'x{59}… is not known"),
-    (lambda: control.input_shaper(POLE, modes_shaped=10**5000), "an integer of 16610 bits are to be shaped"),
-    (lambda: control.input_shaper(POLE, modes_shaped=np.complex64(1)), "modes_shaped = np.complex64"),
+    (lambda: control.input_shaper(POLE, modes=10**5000), "an integer of 16610 bits are to be shaped"),
+    (lambda: control.input_shaper(POLE, modes=np.complex64(1)), "modes_shaped = np.complex64"),
     (lambda: control.input_shaper(complex(-1e308, 1e308)), "does not swing"),
     (lambda: control.input_shaper(10**400), "pole = an integer of 1329 bits does not swing"),
     (lambda: control.input_shaper(None), "model is NoneType, not a Model"),

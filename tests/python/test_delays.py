@@ -152,7 +152,7 @@ def test_other_methods_refuse_a_free_delay(method):
     with pytest.raises(ftlm.ModelError, match=r"the delay of u is free: only method='output-error'.*give its value"):
         ftlm.identify(plants.noisy_run("3T", 40, 5), fixed, method=method)
     with pytest.raises(ftlm.ModelError, match="the delay of u is free"):
-        ftlm.search_orders(plants.noisy_run("3T", 40, 5), structure(), ftlm.order_grid(step=0.2))
+        ftlm.search_orders(plants.noisy_run("3T", 40, 5), structure(), ftlm.order_grid(increment=0.2))
 
 
 @pytest.mark.parametrize(

@@ -12,12 +12,12 @@ def test_the_demo_is_one_screen_and_its_page_leads_with_the_verdicts(tmp_path, m
     told, named = [], []
     demo = run_demo(
         tmp_path,
-        step=0.35,
+        increment=0.35,
         noise=1e-4,
         seed=1,
         threads=None,
         force=False,
-        say=named.append,
+        log=named.append,
         progress=lambda *done: told.append(done),
     )
     lines = demo_text(demo).splitlines()

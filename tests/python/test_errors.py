@@ -35,7 +35,7 @@ def identify(runs=None, words="D^1.5 y = a y + b u", **options):
 
 
 def search(runs=None, words=WORDS, lattice=None, **options):
-    chosen = ftlm.order_grid(step=0.5) if lattice is None else lattice
+    chosen = ftlm.order_grid(increment=0.5) if lattice is None else lattice
     return ftlm.search_orders(run() if runs is None else runs, ftlm.equation(words), chosen, **{"m": 64} | options)
 
 
@@ -90,9 +90,9 @@ BAD = {
     "lattice of 10^9": (
         MODEL,
         "more than the limit of",
-        lambda: search(words="D^alpha y = a D^b y + c D^e y + d D^f y + u", lattice=ftlm.order_grid(step=0.001)),
+        lambda: search(words="D^alpha y = a D^b y + c D^e y + d D^f y + u", lattice=ftlm.order_grid(increment=0.001)),
     ),
-    "lattice with a step of 0": (MODEL, "order alpha: step 0 is not positive", lambda: ftlm.order_grid(step=0)),
+    "lattice with a step of 0": (MODEL, "order alpha: step 0 is not positive", lambda: ftlm.order_grid(increment=0)),
     "lattice of an unknown order": (
         MODEL,
         "lattice order 'betta' is no free order; free are alpha, beta",
@@ -103,7 +103,7 @@ BAD = {
         "order beta: interval 1:0 is empty",
         lambda: search(lattice=ftlm.order_grid(beta=(1, 0))),
     ),
-    "lattice of a million steps": (MODEL, "order alpha: 1.05:2:1e-09", lambda: ftlm.order_grid(step=1e-9)),
+    "lattice of a million steps": (MODEL, "order alpha: 1.05:2:1e-09", lambda: ftlm.order_grid(increment=1e-9)),
     "nothing to search": (MODEL, "every order is a number", lambda: search(words="D^1.5 y = a y + b u")),
     # Pulses
     "m above what the data carry": (

@@ -28,7 +28,7 @@ def run(small_run, with_noise):
 def search(run, executor=None, *, lattice=None, **options):
     options = {"m": 32, "early_stopping": False, **options}
     equation = ftlm.equation(EQUATION, initial="rest")
-    return ftlm.search_orders(run, equation, lattice or ftlm.order_grid(step=0.1), executor=executor, **options)
+    return ftlm.search_orders(run, equation, lattice or ftlm.order_grid(increment=0.1), executor=executor, **options)
 
 
 def bytes_of(found):
@@ -90,7 +90,7 @@ def test_threads_give_the_same_bytes(run, expected):
         {"early_stopping": True},
         {"early_stopping": True, "criterion": "equation-error", "norm": "l2", "rows": "time"},
         {"coefficients": "least-squares", "norm": "l2", "keep": 3},
-        {"early_stopping": True, "coefficients": "instrumental-variables", "lattice": ftlm.order_grid(step=0.2)},
+        {"early_stopping": True, "coefficients": "instrumental-variables", "lattice": ftlm.order_grid(increment=0.2)},
     ],
 )
 def test_every_kind_of_search_gives_the_same_bytes(run, options):
@@ -295,7 +295,7 @@ def test_a_cluster_gives_the_same_bytes_of_a_stage(stage_run, stage_expected, tm
 
 @pytest.mark.slow
 def test_ten_million_candidates_on_a_cluster_that_loses_a_worker(run, tmp_path):
-    options = {"lattice": ftlm.order_grid(step=0.0205), "m": 256, "early_stopping": True}
+    options = {"lattice": ftlm.order_grid(increment=0.0205), "m": 256, "early_stopping": True}
     began = time.monotonic()
     whole = search(run, **options, threads=2)
     alone = time.monotonic() - began

@@ -117,7 +117,7 @@ def test_a_file_of_many_blocks_is_read_whole(tmp_path, monkeypatch):
 
 def test_times_units_and_slices(tmp_path):
     path = write(tmp_path, "t,u,y\n" + rows(100))
-    run = load(path, **HEADED, units={"y": "deg"}, slice=(0.2, 0.5), intersample={"u": "foh"}, name="part")
+    run = load(path, **HEADED, units={"y": "deg"}, window=(0.2, 0.5), intersample={"u": "foh"}, name="part")
     assert (run.start, run.length, run.name, run.units["y"], run.intersample["u"]) == (0.2, 30, "part", "rad", "foh")
     assert load(path, **HEADED, step=2.0).step == 2.0
     assert load(path, **HEADED, time_unit="ms").step == 1e-5
@@ -144,7 +144,7 @@ def test_header_of_ftlm_tells_what_is_not_told(tmp_path):
     assert renamed.units["theta"] == "rad"
     assert renamed["theta"].tobytes() == run["y"].tobytes()
     assert load(path, units={"y": "rad", "z": "deg"})["z"][1] == pytest.approx(np.pi / 180)
-    assert load(path, slice=(0.05, None)).start == 0.05
+    assert load(path, window=(0.05, None)).start == 0.05
     messages(["'deg'", "'y'", "'rad'", "leave the unit out"], lambda: load(path, units={"y": "deg"}))
     messages(["whole run"], lambda: load([path, write(tmp_path, rows())]))
     # Rows may be cut off by hand; the step stays.
@@ -687,7 +687,7 @@ def test_measured_record_whose_time_starts_late():
         inputs={"I1": "Im1_cmd_A"},
         outputs={"theta11": "th11_deg"},
         units={"theta11": "deg"},
-        slice=(1.1, None),
+        window=(1.1, None),
     )
     assert (run.step, run.start, run.length) == (0.002, 83.274, 9450)
 

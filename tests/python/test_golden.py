@@ -104,10 +104,10 @@ def test_a_store_is_written_as_it_was_then(folder, tmp_path, monkeypatch, name):
     path = tmp_path / "now.ftlm"
     if name == "law":
         structure = ftlm.equation("D^alpha y = a D^beta y + b D^(alpha-beta) u", initial="rest")
-        ftlm.search_orders(run, structure, ftlm.order_grid(step=0.05), m=32, threads=1, keep=5, store=path)
+        ftlm.search_orders(run, structure, ftlm.order_grid(increment=0.05), m=32, threads=1, top=5, store=path)
     else:
         structure = ftlm.equation("D^alpha y = a D^beta y + c D^mu y + b u", initial="rest")
-        lattice = ftlm.order_grid(step=0.05, beta=(0.0, 1.0), mu=(0.0, 1.0))
+        lattice = ftlm.order_grid(increment=0.05, beta=(0.0, 1.0), mu=(0.0, 1.0))
         options = {"m": 32, "early_stopping": False, "threads": 1, "keep": 5, "store": path}
         ftlm.search_orders(run, structure, lattice, **options)
     now, then = payloads(path), payloads(folder / f"{name}.ftlm")

@@ -88,7 +88,7 @@ def test_a_run_that_rounding_swamps_is_refused() -> None:
     u = np.repeat(np.random.default_rng(1).standard_normal(40), 50)
     run = ftlm.Run.from_arrays(inputs={"u": u}, outputs={"y": 0 * u}, step=STEP)
     with pytest.raises(ftlm.ConvergenceError, match="still moves by more than"):
-        ftlm.Model(written(modes)).simulate(run, largest_m=1 << 18)
+        ftlm.Model(written(modes)).simulate(run, max_m=1 << 18)
 
 
 def two_modes(seed: int) -> ftlm.Run:

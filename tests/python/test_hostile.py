@@ -239,7 +239,11 @@ class Empty(Executor):
 def test_an_executor_that_returns_nothing_ends(small_run, result):
     with pytest.raises(ftlm.ConvergenceError, match="lost its work"):
         ftlm.search_orders(
-            small_run, ftlm.equation("D^a y = c D^b y + d u"), ftlm.order_grid(step=0.2), m=32, executor=Empty(result)
+            small_run,
+            ftlm.equation("D^a y = c D^b y + d u"),
+            ftlm.order_grid(increment=0.2),
+            m=32,
+            executor=Empty(result),
         )
 
 
@@ -248,7 +252,7 @@ def test_what_is_no_executor_is_refused(small_run):
         ftlm.search_orders(
             small_run,
             ftlm.equation("D^a y = c D^b y + d u"),
-            ftlm.order_grid(step=0.2),
+            ftlm.order_grid(increment=0.2),
             m=32,
             executor=SimpleNamespace(),
         )

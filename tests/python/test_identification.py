@@ -74,7 +74,7 @@ def test_multi_innovation_is_the_oracles(small_run, structure, p, k0):
 
 
 def test_multi_innovation_in_the_order_of_time_takes_any_number_of_pulses(small_run, structure):
-    found = ftlm.identify(small_run, structure, method="multi-innovation", rows="time", m=300)
+    found = ftlm.identify(small_run, structure, method="multi-innovation", row_basis="time", m=300)
     y, u = (oracles.pulse_means(small_run[n], 300, how) for n, how in (("y", "foh"), ("u", "zoh")))
     q = oracles.regressors([y, y, u], [0.6, 0.0, 0.0], 1.6, small_run.duration, haar=False)
     expected = oracles.multi_innovation_closed_form(q, y, 7, 1.0)
@@ -155,8 +155,8 @@ def test_known_coefficients_stay_what_they_are(small_run):
 
 def test_orders_of_one_equation_are_searched(small_run):
     words = ftlm.equation("D^alpha y = a D^nu y + c y + b u")
-    lattice = ftlm.order_grid(step=0.2, alpha=(1.2, 2.0))
-    found = ftlm.identify(small_run, words, method="least-squares", lattice=lattice, m=512)
+    lattice = ftlm.order_grid(increment=0.2, alpha=(1.2, 2.0))
+    found = ftlm.identify(small_run, words, method="least-squares", order_grid=lattice, m=512)
     assert found.orders == {"alpha": 1.6, "nu": 0.6}
     assert found.coefficients == {n: pytest.approx(v, rel=2e-3) for n, v in TRUTH.items()}
     (search,) = found.searches.values()
@@ -173,7 +173,7 @@ def test_orders_of_one_equation_are_searched(small_run):
 def test_search_settings_are_handed_on(small_run, criterion, norm):
     words = ftlm.equation("D^alpha y = a D^nu y + c y + b u")
     options = {"criterion": criterion, "norm": norm, "keep": 3, "threads": 1, "m": 128}
-    lattice = ftlm.order_grid(step=0.2, alpha=(1.2, 2.0))
+    lattice = ftlm.order_grid(increment=0.2, alpha=(1.2, 2.0))
     told = []
     found = ftlm.identify(
         small_run,
@@ -181,7 +181,7 @@ def test_search_settings_are_handed_on(small_run, criterion, norm):
         method="multi-innovation",
         innovation_length=3,
         prior_covariance=50.0,
-        lattice=lattice,
+        order_grid=lattice,
         progress=lambda done, total: told.append((done, total)),
         **options,
     )
@@ -213,7 +213,7 @@ def test_equations_without_a_law_are_searched_one_by_one(clean_a):
             "mu2": [0.1],
         }
     )
-    found = ftlm.identify(clean_a, structure, method="least-squares", lattice=lattice)
+    found = ftlm.identify(clean_a, structure, method="least-squares", order_grid=lattice)
     assert list(found.searches) == ["theta11", "theta12"]
     assert [s.candidates for s in found.searches.values()] == [4, 4]
     assert found.orders == {
@@ -233,7 +233,7 @@ def test_equations_without_a_law_are_searched_one_by_one(clean_a):
             clean_a,
             half,
             method="least-squares",
-            lattice=replace(lattice, orders={n: v for n, v in lattice.orders.items() if n.endswith("2")}),
+            order_grid=replace(lattice, orders={n: v for n, v in lattice.orders.items() if n.endswith("2")}),
         ).searches
     ) == ["theta12"]
 
@@ -249,7 +249,7 @@ def test_law_search_recovers_the_five_free_orders_of_plant_a(clean_a, plants):
             "mu2": (0.75, 0.95),
         },
     )
-    found = ftlm.identify(clean_a, ftlm.flexible_link(form="published"), method="least-squares", lattice=lattice)
+    found = ftlm.identify(clean_a, ftlm.flexible_link(form="published"), method="least-squares", order_grid=lattice)
     assert found.orders == plants["A"]["free_orders"]
     assert list(found.searches) == ["stage"]
     assert found.searches["stage"].candidates > 300
@@ -270,8 +270,8 @@ def test_law_search_recovers_the_five_free_orders_of_plant_a(clean_a, plants):
 def test_printed_figures_are_those_of_compare(small_run, second, with_noise, method, initial, tmp_path):
     runs = [with_noise(small_run, 0.01, 1), with_noise(second, 0.02, 2).slice(1.0, None)]
     words = ftlm.equation("D^alpha y = a D^nu y + c y + b u", initial=initial)
-    lattice = ftlm.order_grid(step=0.2, alpha=(1.4, 1.8))
-    found = ftlm.identify(runs, words, method=method, lattice=lattice, m=128)
+    lattice = ftlm.order_grid(increment=0.2, alpha=(1.4, 1.8))
+    found = ftlm.identify(runs, words, method=method, order_grid=lattice, m=128)
     saved = ftlm.load_model(found.model.save(tmp_path / "model.json"))
     for again in (found.model.compare(runs), ftlm.compare(found.model, runs), saved.compare(runs)):
         assert again.m == 128
@@ -283,7 +283,7 @@ def test_printed_figures_are_those_of_compare(small_run, second, with_noise, met
     if initial == "caputo":
         return  # each run's free run then fits its own initial terms, which a search does not
     if len(found.comparison.initial[0]["y"]) == 0:
-        alone = ftlm.identify(runs[0], words, method=method, lattice=lattice, m=128)
+        alone = ftlm.identify(runs[0], words, method=method, order_grid=lattice, m=128)
         # Searches rank by pulse means, as the paper's (45).
         means = compare_means(alone.model, runs[0], m=128)
         assert means.output_error["y"].error == pytest.approx(alone.searches["y"].score, rel=1e-9)
@@ -355,7 +355,7 @@ def test_near_identities_are_named(clean_a, with_noise):
         method="least-squares",
         criterion="equation-error",
         norm="l2",
-        lattice=ftlm.order_grid(alpha=(2.0, 2.0), gamma2=0.65),
+        order_grid=ftlm.order_grid(alpha=(2.0, 2.0), gamma2=0.65),
         m=1024,
     )
     assert any("so the equation nearly says that theta12 equals itself" in w for w in found.warnings)
@@ -365,7 +365,7 @@ def test_orders_on_the_edge_and_facts_about_the_run_are_repeated(small_run):
     words = ftlm.equation("D^alpha y = a D^0.6 y + c y + b u")
     resampled = small_run.resample(0.04)
     found = ftlm.identify(
-        resampled, words, method="least-squares", lattice=ftlm.order_grid(step=0.1, alpha=(1.2, 1.5)), m=256
+        resampled, words, method="least-squares", order_grid=ftlm.order_grid(increment=0.1, alpha=(1.2, 1.5)), m=256
     )
     assert "order alpha = 1.5 is on the edge of its interval; widen it" in found.warnings
     assert any(w.startswith(f"run {resampled.name}: resampled from 0.02 s to 0.04 s") for w in found.warnings)
@@ -539,11 +539,11 @@ def test_regressors_that_cannot_be_told_apart_are_refused(small_run):
 def test_arguments_are_never_changed(small_run, structure):
     before = {n: small_run[n].copy() for n in small_run.signals}
     words = str(structure)
-    lattice = ftlm.order_grid(step=0.4, alpha=(1.2, 2.0))
-    ftlm.identify(small_run, ftlm.equation("D^alpha y = a y + b u"), method="least-squares", lattice=lattice, m=64)
+    lattice = ftlm.order_grid(increment=0.4, alpha=(1.2, 2.0))
+    ftlm.identify(small_run, ftlm.equation("D^alpha y = a y + b u"), method="least-squares", order_grid=lattice, m=64)
     assert all(np.array_equal(small_run[n], before[n]) for n in before)
     assert str(structure) == words
-    assert lattice == ftlm.order_grid(step=0.4, alpha=(1.2, 2.0))
+    assert lattice == ftlm.order_grid(increment=0.4, alpha=(1.2, 2.0))
 
 
 def test_the_record_that_is_estimated_on_is_that_of_the_core(small_run, structure):

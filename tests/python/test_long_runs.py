@@ -107,13 +107,13 @@ def test_the_same_run_as_on_whole_grids(case, moving, monkeypatch):
     words, kind, more = EVERY[case]
     model = ftlm.Model(ftlm.equation(words, **{"initial": "auto", **more}))
     run = noisy(1200, kind, moving=moving)
-    whole = simulate_refined(model, run, None, tolerance=1e-6, largest_m=1 << 16)
+    whole = simulate_refined(model, run, None, tolerance=1e-6, max_m=1 << 16)
     monkeypatch.setattr(long, "LONG_RECORD_INTERVALS", 1000)
     assert (
-        long.simulate_long(with_initial_conditions(model, run), run, None, tolerance=1.0, largest_m=1 << 16) is not None
+        long.simulate_long(with_initial_conditions(model, run), run, None, tolerance=1.0, max_m=1 << 16) is not None
         or case in NONE
     )
-    pieces = simulate_refined(model, run, None, tolerance=1e-6, largest_m=1 << 16)
+    pieces = simulate_refined(model, run, None, tolerance=1e-6, max_m=1 << 16)
     assert pieces.refinement < whole.refinement or moving
     size = np.max(np.abs(whole.outputs), axis=1)
     apart = np.max(np.abs(pieces.outputs - whole.outputs), axis=1) / size
@@ -126,16 +126,16 @@ def test_what_is_left_is_told(words, monkeypatch):
     """With few pulses the change that is told is no less than a small part of the error."""
     monkeypatch.setattr(long, "LONG_RECORD_INTERVALS", 1000)
     model, run = ftlm.Model(ftlm.equation(words)), record(2001, u=switched(2001, every=7))
-    fine = simulate_refined(model, run, None, tolerance=1e-9, largest_m=1 << 18)
+    fine = simulate_refined(model, run, None, tolerance=1e-9, max_m=1 << 18)
     for largest_m in (1 << 13, 1 << 14, 1 << 15):
-        found = simulate_refined(model, run, None, tolerance=1e-9, largest_m=largest_m)
+        found = simulate_refined(model, run, None, tolerance=1e-9, max_m=largest_m)
         assert error(found.outputs, fine.outputs) <= 2.5 * (float(found.change[0]) + float(fine.change[0])) + 1e-12
 
 
 def test_too_few_pulses_are_an_error_and_what_grows_is_one_too():
     model, run = ftlm.Model(ftlm.equation("D^1.4 y = -4 y + 2 u")), record(20_001)
     with pytest.raises(ftlm.errors.ConvergenceError, match="still moves by more than"):
-        model.simulate(run, largest_m=30_000)
+        model.simulate(run, max_m=30_000)
     with pytest.raises(ftlm.errors.ConvergenceError, match="leaves the range of numbers"):
         ftlm.Model(ftlm.equation("D^1.4 y = 4 y + 2 u")).simulate(run)
 

@@ -486,7 +486,7 @@ def test_one_coefficient_follows_x_p_over_p_plus_c():
 def equation_error_search(run, structure, alpha):
     lattice = ftlm.order_grid(alpha=alpha)
     return ftlm.search_orders(
-        run, structure, lattice, criterion="equation-error", coefficients="least-squares", norm="l2", keep=3
+        run, structure, lattice, criterion="equation-error", coefficients="least-squares", norm="l2", top=3
     )
 
 

@@ -118,9 +118,11 @@ CASES = {
 
 def search(structure, runs, **options):
     lattice = (
-        ftlm.order_grid(step=0.1) if structure is ONE else ftlm.OrderGrid(increment=0.1, orders={"alpha": (1.9, 2.0)})
+        ftlm.order_grid(increment=0.1)
+        if structure is ONE
+        else ftlm.OrderGrid(increment=0.1, orders={"alpha": (1.9, 2.0)})
     )
-    return ftlm.search_orders(runs, structure, lattice, m=64, keep=5, **options)
+    return ftlm.search_orders(runs, structure, lattice, m=64, top=5, **options)
 
 
 def needed(monkeypatch, structure, runs, **options):

@@ -86,7 +86,7 @@ def by_differences(answer, made: ftlm.DesignedInput, delta: float) -> np.ndarray
 def test_of_whole_orders_it_is_what_scipy_differenced_says() -> None:
     start = {"a1": -0.8, "a0": -4.0, "b0": 3.0}
     known = fitted("D^2 y = -0.8 D y - 4 y + 3 u", "D^2 y = a1 D y + a0 y + b0 u", start)
-    made = ftlm.design_input(known, duration=4.0, step=STEP, peak=1.0, noise={"y": NOISE}, names=["a1", "a0"])
+    made = ftlm.design_input(known, duration=4.0, step=STEP, peak=1.0, noise={"y": NOISE}, parameters=["a1", "a0"])
 
     def answer(v: dict[str, float], u: np.ndarray) -> np.ndarray:
         system = np.array([[0.0, 1.0], [v["a0"], v["a1"]]]), np.array([[0.0], [v["b0"]]])
@@ -98,7 +98,7 @@ def test_of_whole_orders_it_is_what_scipy_differenced_says() -> None:
 
 
 def test_of_fractional_orders_it_is_what_the_laplace_transform_differenced_says(found: ftlm.Identification) -> None:
-    made = ftlm.design_input(found.model, duration=4.0, step=STEP, peak=1.0, noise={"y": NOISE}, names=["alpha"])
+    made = ftlm.design_input(found.model, duration=4.0, step=STEP, peak=1.0, noise={"y": NOISE}, parameters=["alpha"])
 
     def answer(v: dict[str, float], u: np.ndarray) -> np.ndarray:
         def transfer(s: np.ndarray) -> np.ndarray:
@@ -497,7 +497,7 @@ def test_what_is_not_linear_or_says_nothing_is_refused(found: ftlm.Identificatio
         ftlm.design_input(found.model, peak=1)
     other = ftlm.Run.from_arrays(step=STEP, inputs={"w": np.ones(50)}, outputs={"y": np.zeros(50)})
     with pytest.raises(ftlm.DataError, match="has no input 'u'"):
-        ftlm.design_input(found, like=other)
+        ftlm.design_input(found, reference_run=other)
 
 
 # ----------------------------------------------------------------------------------------- words, files, pictures

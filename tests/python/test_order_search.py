@@ -176,16 +176,14 @@ def exactly(found):
 @pytest.mark.parametrize("coefficients", ["least-squares", "multi-innovation"])
 def test_threads_and_early_stopping_change_no_bit_of_the_table(run, second, criterion, coefficients):
     structure = ftlm.equation(EQUATION)
-    lattice = ftlm.order_grid(step=0.1, alpha=(1.3, 1.9), nu=(0, 0.3))
+    lattice = ftlm.order_grid(increment=0.1, alpha=(1.3, 1.9), nu=(0, 0.3))
     options = {"criterion": criterion, "coefficients": coefficients, "m": 128, "keep": 7}
-    brute = ftlm.search_orders([run, second], structure, lattice, threads=1, early_stopping=False, **options)
+    brute = ftlm.search_orders([run, second], structure, lattice, threads=1, pruning=False, **options)
     assert brute.candidates == sum(n * (n - 1) // 2 * 4 for n in range(13, 20))
     assert brute.exclusion_counts["stopped early"] == 0
     counts = set()
     for threads, stopping in itertools.product((1, 2, 3, 8), (True, False)):
-        found = ftlm.search_orders(
-            [run, second], structure, lattice, threads=threads, early_stopping=stopping, **options
-        )
+        found = ftlm.search_orders([run, second], structure, lattice, threads=threads, pruning=stopping, **options)
         assert exactly(found) == exactly(brute), (threads, stopping)
         assert sum(found.exclusion_counts.values()) + len(found.table) == found.candidates
         if stopping:
@@ -294,7 +292,7 @@ def test_failures_under_a_law_are_listed_with_their_reason(run):
     # The same current twice: where the law gives both terms one order they cannot be told apart.
     twice = ftlm.Run.from_arrays(step=run.step, inputs={"u": run["u"], "v": run["u"]}, outputs={"y": run["y"]})
     structure = ftlm.equation("D^alpha y = a D^(alpha-1) y + b u + c D^(alpha-1.5) v", initial="rest")
-    lattice = ftlm.order_grid(step=0.1, alpha=(1.3, 1.7))
+    lattice = ftlm.order_grid(increment=0.1, alpha=(1.3, 1.7))
     for threads in (1, 2):
         found = ftlm.search_orders(twice, structure, lattice, m=M, coefficients="least-squares", threads=threads)
         assert found.failures == [({"alpha": 1.5}, "singular")]
@@ -337,7 +335,7 @@ def test_one_equation_under_a_law_is_searched_too(run):
     # D^(alpha - 1) in place of a free order: the same scores as the free search at those orders.
     structure = ftlm.equation("D^alpha y = a D^(alpha-1) y + c y + b u", initial="rest")
     found = ftlm.search_orders(
-        run, structure, ftlm.order_grid(step=0.2, alpha=(1.2, 2.0)), m=M, coefficients="least-squares"
+        run, structure, ftlm.order_grid(increment=0.2, alpha=(1.2, 2.0)), m=M, coefficients="least-squares"
     )
     assert found.candidates == 5
     for row in found.table:
@@ -377,23 +375,23 @@ def test_default_lattice_is_the_papers():
     ],
 )
 def test_axes_of_a_lattice(spec, expected):
-    assert values(ftlm.order_grid(step=0.2, beta=spec))["beta"] == expected
+    assert values(ftlm.order_grid(increment=0.2, beta=spec))["beta"] == expected
 
 
 def test_values_of_the_structure_come_before_the_defaults_and_those_of_the_lattice_before_both():
     options = {"orders": {"alpha": "1:2:0.5", "beta": [0.1, 0.2]}}
-    found = values(ftlm.order_grid(step=0.5), **options)
+    found = values(ftlm.order_grid(increment=0.5), **options)
     assert found["alpha"] == (1.0, 1.5, 2.0)
     assert found["beta"] == (0.1, 0.2)
     assert found["mu"] == (0.0, 0.5, 1.0, 1.5, 2.0)
-    found = values(ftlm.order_grid(step=0.5, beta=0.7), **options)
+    found = values(ftlm.order_grid(increment=0.5, beta=0.7), **options)
     assert found["beta"] == (0.7,)
     assert values(ftlm.OrderGrid(0.5, orders={"alpha": "1:1.5:0.25"}))["alpha"] == (1.0, 1.25, 1.5)
 
 
 def test_other_orders_end_at_the_largest_alpha():
-    assert values(ftlm.order_grid(step=0.1, alpha=(0.3, 0.6)))["beta"] == (0.0, 0.1, 0.2, 0.3, 0.4, 0.5, 0.6)
-    assert values(ftlm.order_grid(step=0.5), "D^1.2 y = a D^beta y + b u")["beta"] == (0.0, 0.5, 1.0)
+    assert values(ftlm.order_grid(increment=0.1, alpha=(0.3, 0.6)))["beta"] == (0.0, 0.1, 0.2, 0.3, 0.4, 0.5, 0.6)
+    assert values(ftlm.order_grid(increment=0.5), "D^1.2 y = a D^beta y + b u")["beta"] == (0.0, 0.5, 1.0)
 
 
 def test_candidates_obey_the_ranges_and_are_counted_once(run):
@@ -401,7 +399,7 @@ def test_candidates_obey_the_ranges_and_are_counted_once(run):
     lattice = ftlm.OrderGrid(
         orders={"alpha": [0.5, 1.0], "beta": [0.0, 0.4, 0.5, 0.9, 1.5], "mu": [0.0, 0.4], "nu": [0.7, -0.2, 1.0]}
     )
-    found = ftlm.search_orders(run, structure, lattice, m=M, coefficients="least-squares", keep=1000)
+    found = ftlm.search_orders(run, structure, lattice, m=M, coefficients="least-squares", top=1000)
     expected = set()
     for alpha in (0.5, 1.0):
         for beta, mu, nu in itertools.product((0.0, 0.4, 0.5, 0.9, 1.5), (0.0, 0.4), (0.7, -0.2, 1.0)):
@@ -437,7 +435,7 @@ def test_orders_on_the_edge_of_their_interval_are_named(run):
     structure = ftlm.equation("D^alpha y = a D^beta y + c y + b u", initial="rest")
 
     def edges(**orders):
-        lattice = ftlm.order_grid(step=0.1, **orders)
+        lattice = ftlm.order_grid(increment=0.1, **orders)
         found = ftlm.search_orders(run, structure, lattice, m=256, coefficients="least-squares")
         return found.at_grid_edge, str(found)
 
@@ -454,7 +452,7 @@ def test_alpha_of_two_is_no_edge(clean_a):
     found = ftlm.search_orders(
         clean_a,
         ftlm.flexible_link(form="published").equation("theta12"),
-        ftlm.order_grid(step=0.1, alpha=(1.5, 2.0), gamma2=1.05, mu2=[0.1, 0.85], beta2=[0.1, 0.85]),
+        ftlm.order_grid(increment=0.1, alpha=(1.5, 2.0), gamma2=1.05, mu2=[0.1, 0.85], beta2=[0.1, 0.85]),
         m=512,
         coefficients="least-squares",
     )
@@ -496,7 +494,7 @@ def test_diverging_candidates_are_a_reason_on_the_row():
     growing = ftlm.Run.from_arrays(step=0.1, inputs={"u": u}, outputs={"y": np.cumsum(u)})
     structure = ftlm.equation("D^alpha y = 5 y + b u", initial="rest")
     lattice = ftlm.OrderGrid(orders={"alpha": [0.8, 1.0, 3.0]})
-    brute = ftlm.search_orders(growing, structure, lattice, m=2000, coefficients="least-squares", early_stopping=False)
+    brute = ftlm.search_orders(growing, structure, lattice, m=2000, coefficients="least-squares", pruning=False)
     assert brute.exclusion_counts["diverged"] == 2
     assert brute.failures == [({"alpha": 0.8}, "diverged"), ({"alpha": 1.0}, "diverged")]
     assert [r.orders["alpha"] for r in brute.table] == [3.0]
@@ -574,7 +572,7 @@ def long_search(run, **options):
         run,
         ftlm.flexible_link(form="published").equation("theta12"),
         ftlm.order_grid(alpha=(1.05, 2.0)),
-        early_stopping=False,
+        pruning=False,
         coefficients="least-squares",
         **options,
     )
@@ -676,9 +674,9 @@ def test_settings_that_mean_nothing_are_refused(run, options, message):
 @pytest.mark.parametrize(
     ("make", "message"),
     [
-        (lambda: ftlm.order_grid(step=0), "order alpha: step 0 is not positive; the paper's is 0.05"),
-        (lambda: ftlm.order_grid(step=-0.1), "step -0.1 is not positive"),
-        (lambda: ftlm.order_grid(step="0.1"), "= '0.1' is not a number"),
+        (lambda: ftlm.order_grid(increment=0), "order alpha: step 0 is not positive; the paper's is 0.05"),
+        (lambda: ftlm.order_grid(increment=-0.1), "step -0.1 is not positive"),
+        (lambda: ftlm.order_grid(increment="0.1"), "= '0.1' is not a number"),
         (lambda: ftlm.order_grid(alpha=(0, 2)), "alpha interval 0:2 starts outside (0, 10]"),
         (lambda: ftlm.order_grid(alpha=(1, 11)), "order alpha = 11 is outside [-3, 10]"),
         (lambda: ftlm.order_grid(alpha=(2, 1)), "order alpha: interval 2:1 is empty"),
@@ -835,14 +833,14 @@ def test_a_share_of_candidates_that_diverge_are_rows_with_a_reason(tmp_path, sha
         {},
         {"norm": "l2"},
         {"criterion": "equation-error", "norm": "l2", "coefficients": "least-squares"},
-        {"coefficients": "instrumental-variables", "lattice": ftlm.order_grid(step=0.2)},
-        {"early_stopping": False, "lattice": ftlm.order_grid(step=0.2)},
+        {"coefficients": "instrumental-variables", "lattice": ftlm.order_grid(increment=0.2)},
+        {"early_stopping": False, "lattice": ftlm.order_grid(increment=0.2)},
     ],
 )
 def test_the_oldest_machine_ranks_as_the_newest(run, with_noise, options):
     """R4: the whole table and all counts, from kernels compiled for the machine at hand and for any."""
     noisy = with_noise(run, 0.003, 1)
-    options = {"lattice": ftlm.order_grid(step=0.1), "m": 256, "threads": 2, **options}
+    options = {"lattice": ftlm.order_grid(increment=0.1), "m": 256, "threads": 2, **options}
     words = ftlm.equation("D^alpha y = a D^beta y + c D^mu y + b D^nu u", initial="rest")
     tables = []
     for portable in (False, True):
@@ -876,7 +874,7 @@ def test_instruments_of_an_equation_whose_coefficients_are_all_known_estimate_no
     found, plain = (
         [
             (row.orders, row.score)
-            for row in ftlm.search_orders(run, words, ftlm.order_grid(step=0.1), coefficients=c).table
+            for row in ftlm.search_orders(run, words, ftlm.order_grid(increment=0.1), coefficients=c).table
         ]
         for c in ("instrumental-variables", "least-squares")
     )

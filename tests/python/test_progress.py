@@ -292,7 +292,7 @@ def job(step=0.1, **settings):
     u = np.sign(np.sin(2 * t))
     run = ftlm.Run.from_arrays(step=0.05, inputs={"u": u}, outputs={"y": np.cumsum(u) * 0.05})
     return make_job(
-        run, ftlm.equation("D^alpha y = a D^beta y + c D^mu y + b D^nu u"), ftlm.order_grid(step=step), **settings
+        run, ftlm.equation("D^alpha y = a D^beta y + c D^mu y + b D^nu u"), ftlm.order_grid(increment=step), **settings
     )
 
 

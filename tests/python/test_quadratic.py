@@ -93,7 +93,7 @@ def test_too_few_poles_are_refused_with_what_they_are_off():
 
 def test_the_observer_is_where_the_recursion_of_the_filter_ends():
     """Kalman's recursion from a wide start, sample by sample, until it stands still."""
-    seen = control.observer(model(WHOLE), noise=QUIET, drift=0.3)
+    seen = control.observer(model(WHOLE), noise=QUIET, process_noise=0.3)
     a, b, c = seen.matrices
     inside = np.zeros_like(a)
     inside[:-1, :-1] = 0.3**2 * b[:-1] @ b[:-1].T
@@ -122,7 +122,7 @@ def driven(text, seconds=4.0, noise=0.0, seed=0):
 def test_a_bend_that_nothing_measures_is_observed_from_the_hub():
     """The run is the exact one of fractional orders."""
     clean, noisy = driven(BROKEN, noise=1e-4)
-    seen = control.observer(model(BROKEN), measured=["hub"], noise={"hub": 1e-4}, drift=0.05)
+    seen = control.observer(model(BROKEN), measured=["hub"], noise={"hub": 1e-4}, process_noise=0.05)
     found = seen.over(noisy)
     assert np.std(found["bend"] - clean["bend"]) < 0.03 * np.std(clean["bend"])
     assert "observer from hub" in str(seen)
@@ -130,7 +130,7 @@ def test_a_bend_that_nothing_measures_is_observed_from_the_hub():
 
 def test_an_observer_along_a_run_is_the_recursion_and_takes_noise_away():
     clean, noisy = driven(BROKEN, noise=2e-3)
-    seen = control.observer(model(BROKEN), noise={"hub": 2e-3, "bend": 2e-3}, drift=0.05)
+    seen = control.observer(model(BROKEN), noise={"hub": 2e-3, "bend": 2e-3}, process_noise=0.05)
     found = seen.over(noisy)
     a, b, c = seen.matrices
     y = np.array([noisy["hub"], noisy["bend"]])
@@ -235,13 +235,13 @@ def test_a_tip_comes_to_rest_on_the_virtual_arm_without_any_shaper():
     design = control.lqg(
         arm,
         input="I1",
-        allowed={"theta11": 0.02, "theta12": 0.02},
-        effort=1.0,
-        drift=0.5,
+        max_deviation={"theta11": 0.02, "theta12": 0.02},
+        max_input=1.0,
+        process_noise=0.5,
         noise={"theta11": 3e-4, "theta12": 2e-4},
     )
-    path = control.point_to_point(math.radians(20.0), 0.5, before=0.2, after=0.8)
-    planned = control.inverse_dynamics(design, path, of="theta11 + theta12", limit=0.93)
+    path = control.point_to_point(math.radians(20.0), 0.5, dwell_before=0.2, dwell_after=0.8)
+    planned = control.inverse_dynamics(design, path, output="theta11 + theta12", limit=0.93)
     hold = control.DiscretePid(control.FractionalPid(20.0, 50.0, 0.5, 1.0, 1.0), RATE, limit=1.19)
     left = {}
     for name, reference in (("plain", path), ("inverse", planned.reference)):
@@ -319,9 +319,9 @@ def test_what_is_no_loop_is_refused(case):
 def test_what_is_no_model_or_no_loop_is_refused_by_name():
     for wrong in (None, 3, "hub", {}, ftlm.Model):
         with pytest.raises(ftlm.ModelError, match=r"model is .*, not a Model"):
-            control.lqg(wrong, allowed=DEAR, effort=1.0)
+            control.lqg(wrong, max_deviation=DEAR, max_input=1.0)
         with pytest.raises(ftlm.ModelError, match=r"model is .*, not a Model"):
-            control.observer(wrong, drift=1.0)
+            control.observer(wrong, process_noise=1.0)
         with pytest.raises(ftlm.ModelError, match=r"design is a .*, no PidDesign or LqgDesign"):
             control.inverse_dynamics(wrong, control.point_to_point(0.3, 0.5))
 
@@ -344,14 +344,14 @@ def test_without_python_control_its_name_is_said(monkeypatch):
 
 
 def test_an_observer_reads_a_run_that_fits_it():
-    seen = control.observer(model(WHOLE), noise=QUIET, drift=0.3)
+    seen = control.observer(model(WHOLE), noise=QUIET, process_noise=0.3)
     run = driven(WHOLE, seconds=0.2)[0]
     with pytest.raises(ftlm.DataError, match="has no bend; the observer reads I, hub, bend"):
         seen.over(run.select(["I", "hub"]))
     with pytest.raises(ftlm.DataError, match="make it for rate=250"):
         seen.over(run.resample(0.004))
     with pytest.raises(ftlm.ModelError, match="drift = 0"):
-        control.observer(model(WHOLE), noise=QUIET, drift=0)
+        control.observer(model(WHOLE), noise=QUIET, process_noise=0)
 
 
 # ----------------------------------------------------------------------------------------------------------------------
@@ -361,7 +361,7 @@ def test_an_observer_reads_a_run_that_fits_it():
 def test_a_planned_command_moves_the_exact_model_along_the_path():
     """The command alone, through the free run of fractional orders."""
     path = control.point_to_point(0.3, 0.5)
-    planned = control.inverse_dynamics(designed(samples=0), path, of="hub + bend")
+    planned = control.inverse_dynamics(designed(samples=0), path, output="hub + bend")
     rest = {"hub": 0 * path, "bend": 0 * path}
     # What is answered acts a sample later.
     run = ftlm.Run.from_arrays(step=1 / RATE, inputs={"I": np.append(0.0, planned.command[:-1])}, outputs=rest)
@@ -376,7 +376,7 @@ def test_a_planned_reference_moves_the_loop_along_the_path():
     """Sample by sample: SciPy's plant under the controller."""
     design = designed(WHOLE, samples=0)
     path = control.point_to_point(0.3, 0.5)
-    planned = control.inverse_dynamics(design, path, of="hub + bend")
+    planned = control.inverse_dynamics(design, path, output="hub + bend")
     a, b, c = whole_system()
     state, acting, tip = np.zeros((4, 1)), 0.0, []
     design.controller.reset()
@@ -403,7 +403,7 @@ def test_a_fractional_pid_moves_a_hub_along_the_path():
 
 
 def test_a_move_begins_and_ends_at_rest():
-    path = control.point_to_point(-0.5, 0.4, 1000.0, before=0.1, after=0.2)
+    path = control.point_to_point(-0.5, 0.4, 1000.0, dwell_before=0.1, dwell_after=0.2)
     assert path.size == 701
     assert path[0] == 0.0
     assert path[-1] == -0.5
@@ -427,7 +427,7 @@ PATHS = [
     ({"of": None}, ftlm.ModelError, "of = None is not a sum"),
     ({"samples": 1.5}, ftlm.ModelError, "samples = 1.5"),
     ({"seed": -1}, ftlm.ModelError, "seed = -1"),
-    ({"path": control.point_to_point(0.3, 0.2, before=0.0)}, ftlm.ModelError, "rest longer before its move"),
+    ({"path": control.point_to_point(0.3, 0.2, dwell_before=0.0)}, ftlm.ModelError, "rest longer before its move"),
 ]
 
 

@@ -65,7 +65,7 @@ def identified(square):
     lattice = ftlm.order_grid(0.05, alpha1=2.0, alpha2=2.0, gamma1=(0.9, 1.0), beta2=(0.05, 0.15), mu2=(0.8, 0.9))
     # Initial terms although the run starts at rest, so that the page has them to show.
     structure = replace(ftlm.flexible_link(form="published", stage=1), initial="caputo")
-    return ftlm.identify(square, structure, method="least-squares", lattice=lattice)
+    return ftlm.identify(square, structure, method="least-squares", order_grid=lattice)
 
 
 @pytest.fixture(scope="module")
@@ -277,7 +277,7 @@ def test_the_landscape_is_the_search(small_run, with_noise):
     run = with_noise(small_run, 0.02, 1)
     lattice = ftlm.order_grid(0.1, alpha=(1.2, 2.0), nu="0.0:1.0:0.1")
     structure = ftlm.equation("D^alpha y = a D^nu y + c y + b u")
-    found = ftlm.search_orders(run, structure, lattice, keep=10_000)
+    found = ftlm.search_orders(run, structure, lattice, top=10_000)
     drawn = landscape(run, structure, found, lattice)
     assert drawn.names == ("alpha", "nu")
     assert drawn.scores.shape == (11, 9)

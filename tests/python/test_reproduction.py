@@ -79,8 +79,8 @@ def test_tables_4_and_5_follow_from_the_saved_run(saved, table, stage):
             structure,
             method="multi-innovation",
             innovation_length=p,
-            lattice=ftlm.OrderGrid(increment=0.25),
-            keep=1,
+            order_grid=ftlm.OrderGrid(increment=0.25),
+            top=1,
         )
         row = written[f"p = {p}"]
         assert found.orders == row["orders"]
@@ -437,7 +437,7 @@ def test_a_long_run_that_does_not_start_at_rest(reproduction, tmp_path, monkeypa
     monkeypatch.setattr("ftlm.reproduction.stage_models.MAX_REGRESSION_SAMPLES", 1000)
     monkeypatch.setattr("ftlm.reproduction.stage_models.JOINT_ROWS", 500)
     told = []
-    found = ftlm.reproduce(moving, other, step=0.5, progress=lambda *share: told.append(share))
+    found = ftlm.reproduce(moving, other, increment=0.5, progress=lambda *share: told.append(share))
     # One share of the whole, which never falls.
     assert told == sorted(told)
     assert told[-1] == (1000, 1000)
@@ -542,7 +542,7 @@ def test_ctrl_c_ends_both_stages(reproduction):
 
     before = threading.active_count()
     with pytest.raises(KeyboardInterrupt):
-        ftlm.reproduce(reproduction.square, reproduction.sine, say=say)
+        ftlm.reproduce(reproduction.square, reproduction.sine, log=say)
     assert threading.active_count() == before
     assert len(started) < 20
 
@@ -553,13 +553,13 @@ def test_a_stage_that_fails_ends_the_other(reproduction):
             raise DataError("enough")
 
     with pytest.raises(DataError, match="enough"):
-        ftlm.reproduce(reproduction.square, reproduction.sine, say=say)
+        ftlm.reproduce(reproduction.square, reproduction.sine, log=say)
 
 
 @pytest.mark.slow
 def test_threads_do_not_change_a_number(reproduction):
     settings = ftlm.Genetic(seeds=(0, 1), evaluations=800)
-    one = ftlm.reproduce(step=0.25, genetic=settings, arms=["whole orders"], records=1, threads=1)
+    one = ftlm.reproduce(increment=0.25, genetic=settings, arms=["whole orders"], records=1, threads=1)
     assert one.to_dict() == reproduction.to_dict()
 
 

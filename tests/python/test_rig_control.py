@@ -85,7 +85,7 @@ def test_each_sample_is_answered_at_the_next_and_recorded(bench, tmp_path):
 def test_the_loop_closes_the_same_way_on_both_rigs_and_in_real_time(tmp_path, monkeypatch):
     runs = [run_with(Bench(kind, tmp_path, monkeypatch), proportional) for kind in ("virtual", "q8")]
     borne(monkeypatch)
-    paced = rig.control(proportional, HOLD, parameters="linear", duration=0.4, paced=True, watchdog=1.0)
+    paced = rig.control(proportional, HOLD, parameters="linear", duration=0.4, real_time=True, watchdog=1.0)
     for name in ("theta11", "theta12", "I1", "I2"):
         assert np.abs(runs[0][name] - runs[1][name]).max() < 1e-12
         assert np.array_equal(runs[0][name], paced[name])
@@ -200,7 +200,7 @@ def test_answers_a_little_late_every_time_are_a_fault(tmp_path, monkeypatch):
 def test_a_controller_that_freezes_is_stopped_by_the_watchdog(tmp_path, monkeypatch):
     """In real time, against the process that watches: 0 V is out before the controller comes back."""
     bench = Bench("virtual", tmp_path, monkeypatch)
-    bench.board.paced = True
+    bench.board.real_time = True
     borne(monkeypatch)
     seen = []
 

@@ -719,7 +719,7 @@ def test_slices_by_time_agree_with_rows(n, step, start, data):
     values = np.arange(float(n))
     whole = Run.from_arrays(time=times, inputs={"u": values}, outputs={"y": values})
     limits = (first * step, last * step)
-    at_once = Run.from_arrays(time=times, inputs={"u": values}, outputs={"y": values}, slice=limits)
+    at_once = Run.from_arrays(time=times, inputs={"u": values}, outputs={"y": values}, window=limits)
     for part in (whole.window(*limits), at_once):
         np.testing.assert_array_equal(part["y"], values[first:last])
         assert part.start == pytest.approx(times[first], rel=1e-11, abs=1e-11)

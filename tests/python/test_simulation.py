@@ -230,7 +230,7 @@ def test_a_response_that_does_not_stand_still_says_so():
     with pytest.raises(
         ftlm.ConvergenceError, match=r"still moves by more than 1e-12 of its size at 2400 pulses; raise"
     ):
-        model("D^0.5 y = -3 y + u").simulate(zeros_run(), tolerance=1e-12, largest_m=3000)
+        model("D^0.5 y = -3 y + u").simulate(zeros_run(), tolerance=1e-12, max_m=3000)
 
 
 @pytest.mark.parametrize(

@@ -36,7 +36,7 @@ from ftlm.order_search.options import Settings
 from ftlm.order_search.search import make_job
 
 EQUATION = "D^alpha y = a D^beta y + c D^mu y + b D^nu u"
-COARSE = ftlm.order_grid(step=0.1)
+COARSE = ftlm.order_grid(increment=0.1)
 
 
 @pytest.fixture(scope="module")
@@ -89,7 +89,7 @@ def rows_of(contents):
         {"early_stopping": True},
         {"early_stopping": True, "criterion": "equation-error", "norm": "l2", "rows": "time"},
         {"coefficients": "least-squares", "norm": "l2", "keep": 3, "threads": 3},
-        {"early_stopping": True, "coefficients": "instrumental-variables", "lattice": ftlm.order_grid(step=0.2)},
+        {"early_stopping": True, "coefficients": "instrumental-variables", "lattice": ftlm.order_grid(increment=0.2)},
     ],
 )
 def test_a_search_with_a_store_is_the_search_without(run, tmp_path, options):
@@ -353,7 +353,7 @@ def test_damage_is_reported_with_its_offset_and_salvaged_on_demand(run, whole, e
             again()
     assert path.read_bytes() == damaged
     assert "damaged" in str(ftlm.search_status(path)["y"])
-    assert bytes_of(ftlm.resume_search(path, salvage=True)["y"]) == expected
+    assert bytes_of(ftlm.resume_search(path, recover=True)["y"]) == expected
     assert (tmp_path / "s.ftlm.damaged").read_bytes() == damaged
     assert bytes_of(ftlm.resume_search(path)["y"]) == expected
 
@@ -679,7 +679,7 @@ def test_the_command_identify_goes_on_with_its_store(tmp_path, clean_a):
 
 def another(text):
     equation = ftlm.equation(text, initial="rest")
-    return lambda run, path: ftlm.search_orders(run, equation, COARSE, m=32, early_stopping=False, store=path)
+    return lambda run, path: ftlm.search_orders(run, equation, COARSE, m=32, pruning=False, store=path)
 
 
 @pytest.mark.parametrize(
@@ -687,7 +687,7 @@ def another(text):
     [
         (lambda run, path: search(run.slice(0.0, 8.0), path), "asked is other data"),
         (lambda run, path: search(run, path, m=64), "asked is other data"),
-        (lambda run, path: search(run, path, lattice=ftlm.order_grid(step=0.2)), "asked is another lattice"),
+        (lambda run, path: search(run, path, lattice=ftlm.order_grid(increment=0.2)), "asked is another lattice"),
         (lambda run, path: search(run, path, norm="l2"), "asked is other settings: norm = l2"),
         (another("D^alpha y = a D^beta y + c D^mu y + b u"), "asked is another equation"),
         (another("D^alpha y = a D^beta y + c D^mu y + 5 D^nu u"), "asked is another equation"),
@@ -840,7 +840,7 @@ def test_a_read_only_folder_is_an_error_and_leaves_the_store_whole(run, whole, e
         path.chmod(0o666)
         path.write_bytes(damaged)
         with as_nobody(), pytest.raises(ftlm.DataError, match=r"s\.ftlm\.damaged.*Permission denied"):
-            ftlm.resume_search(path, salvage=True)
+            ftlm.resume_search(path, recover=True)
         assert path.read_bytes() == damaged
         path.write_bytes(half)
         with as_nobody():

@@ -17,7 +17,7 @@ from ftlm.reproduction.optimizer_comparison import (
     compare_optimizers,
     compare_orders,
     convergence_step,
-    rivals_lattice,
+    rivals_order_grid,
     seeds_for,
     simulated_panel,
 )
@@ -248,7 +248,7 @@ def test_rivals_have_one_budget_and_bounds_that_do_not_know_the_maker_s_values(h
     assert 400 <= made.genetic.evaluations[0] <= 600
     assert 400 <= made.evolution.evaluations[0] < 400 + 15 * 8
     # With the data alone to decide the lattice is better than both, with K0 = 1 it is worse.
-    strong, weak = (search.score for search in made.lattice.values())
+    strong, weak = (search.score for search in made.order_grid.values())
     assert weak < min(made.genetic.errors[0], made.evolution.errors[0]) < strong
 
 
@@ -296,11 +296,11 @@ def test_rivals_have_the_same_lattice_and_as_many_seeds_on_every_arm(monkeypatch
     monkeypatch.setattr("ftlm.reproduction.stage_models.compare_optimizers", like)
     monkeypatch.setattr("ftlm.reproduction.optimizer_comparison.trials_of", lambda *_: [])
     with pytest.raises(ftlm.ModelError):
-        simulated_panel(1, "whole orders", [1], 0.0, 1, lattice=rivals_lattice(step))
+        simulated_panel(1, "whole orders", [1], 0.0, 1, order_grid=rivals_order_grid(step))
     preset = Preset(ftlm.OrderGrid(increment=step), 1, 2, common_pulses=True)
     work = StageWork(1, demo_run("square"), None, preset, 1, lambda _: None, None)
     assert work.rivals(None) == {}
-    assert rivals_lattice(step, 0.01).increment == step
+    assert rivals_order_grid(step, 0.01).increment == step
     assert given[0] == given[1] == (ftlm.OrderGrid(increment=max(step, 0.1), alpha=(1.95, 2.0)), None)
 
 
@@ -330,7 +330,7 @@ def test_a_lattice_that_no_bound_prunes_is_searched_coarsely_first(monkeypatch):
     assert seen == [0.2, 0.4, *[0.2] * 10]
     for output in ("theta11", "theta12"):
         single = work.measured.equation(output)
-        every = ftlm.search_orders(work.on, single, lattice, keep=1, threads=1, **options)
+        every = ftlm.search_orders(work.on, single, lattice, top=1, threads=1, **options)
         mine = found.estimation.output_error[output].error
         assert every.score <= mine * (1 + 1e-9)
         assert mine < 1.01 * every.score
@@ -428,5 +428,5 @@ def test_arms_differ_in_what_they_are_called_for():
 def test_what_cannot_be_asked_for_is_said_first(words, message):
     said = []
     with pytest.raises(ftlm.ModelError, match=message):
-        ftlm.reproduce(say=said.append, **words)
+        ftlm.reproduce(log=said.append, **words)
     assert len(said) <= 1

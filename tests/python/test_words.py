@@ -41,7 +41,7 @@ def saved(small_run, tmp_path_factory):
 
 #: A value that each option takes where it is used, in Python and as words of the command line.
 GIVEN = {
-    "lattice": (ftlm.order_grid(step=0.2, alpha=(1.4, 1.8)), ["--lattice", "alpha=1.4:1.8:0.2"]),
+    "lattice": (ftlm.order_grid(increment=0.2, alpha=(1.4, 1.8)), ["--lattice", "alpha=1.4:1.8:0.2"]),
     "criterion": ("equation-error", ["--criterion", "equation-error"]),
     "norm": ("l2", ["--norm", "l2"]),
     "keep": (3, ["--keep", "3"]),
@@ -123,7 +123,7 @@ def test_options_of_a_search_need_a_free_order(small_run):
         ftlm.ModelError, match=r"^prior_covariance= is not used by coefficients='least-squares', nor 1 other given"
     ):
         ftlm.search_orders(
-            small_run, ftlm.equation(FREE), coefficients="least-squares", rows="time", prior_covariance=2.0
+            small_run, ftlm.equation(FREE), coefficients="least-squares", row_basis="time", prior_covariance=2.0
         )
 
 

@@ -115,9 +115,9 @@ def control(
         announce_design(design, samples)
         found = designs.lqg(
             loaded,
-            allowed=numbers("--allowed", allowed),
-            effort=effort,
-            drift=drift,
+            max_deviation=numbers("--allowed", allowed),
+            max_input=effort,
+            process_noise=drift,
             noise=numbers("--noise", noise) or None,
             measured=measured or None,
             limit=most,
@@ -131,7 +131,9 @@ def control(
         size, seconds = parse_numbers("--move", move, 2)
         path = designs.point_to_point(size, seconds, rate)
         told = found.plants[0].output if design == "pid" else running.tracked  # type: ignore[union-attr]
-        planned = designs.inverse_dynamics(found, path, of=of or told, limit=most, samples=min(samples, 40), seed=seed)
+        planned = designs.inverse_dynamics(
+            found, path, output=of or told, limit=most, samples=min(samples, 40), seed=seed
+        )
     if out is not None:
         designs.save_controller(running, out, model=f"{loaded.structure.name} ({Path(model).name})", force=force)
     if plan is not None and planned is not None:
@@ -163,7 +165,7 @@ def shape(
     """Design an input shaper from the poles of a model."""
     check_free(out, force=force, words=COMMAND_MESSAGES)
     check_ending(out, ".csv")
-    made = designs.input_shaper(load_model(model), kind, modes_shaped=modes, coupling=coupling)
+    made = designs.input_shaper(load_model(model), kind, modes=modes, coupling=coupling)
     taps = made.impulses(rate)
     if out is not None:
         rows = np.column_stack([np.arange(taps.size) / rate, taps])
@@ -232,13 +234,13 @@ def design_input(
     with Progress("designing", quiet=as_json) as progress:
         found = experiment.design_input(
             loaded,
-            like=run,
+            reference_run=run,
             duration=duration,
             step=None if like is not None else reading.sampling,
             peak=_sizes("--peak", peak),
             slew=_sizes("--slew", slew),
             limits=numbers("--limit", limits) or None,
-            names=names,
+            parameters=names,
             criterion=criterion,
             noise=numbers("--noise", noise) or None,
             period=period,

@@ -122,7 +122,7 @@ def identify(
             runs,
             wanted,
             method=method,
-            lattice=search.lattice(),
+            order_grid=search.lattice(),
             **search.settings(),
             genetic=genetic.settings(method),
             threads=threads,
@@ -209,7 +209,9 @@ def search(
                 results[name] = run_job(replace(job, progress=progress), store=kept, number=number)
             if certify is not None:
                 with Progress(f"proving what lies between of {name}", quiet=as_json) as progress:
-                    proved = certify_job(job, within=certify, apart=lattice.increment, progress=progress.so_far)
+                    proved = certify_job(
+                        job, tolerance=certify, min_separation=lattice.increment, progress=progress.so_far
+                    )
                 results[name] = replace(results[name], certificate=proved)
     show_searches(results, as_json=as_json)
 
@@ -265,7 +267,7 @@ def resume(
 ) -> None:
     """Resume the searches of a checkpoint file and print them; no other file is needed."""
     results = {}
-    with resumable(store), Store(store, salvage=salvage) as kept:
+    with resumable(store), Store(store, recover=salvage) as kept:
         show_notes(kept)
         told = Progress("", quiet=as_json)
         if not told.quiet:

@@ -174,7 +174,7 @@ class ReadingOptions:
             time_unit=self.time_unit,
             intersample=pairs("--intersample", self.between),
             layout=layout_options(self),
-            slice=None if self.sliced is None else interval(self.sliced, "--slice", "1.1:19.5"),
+            window=None if self.sliced is None else interval(self.sliced, "--slice", "1.1:19.5"),
             resample=self.resample,
             missing=self.missing,
         )
@@ -422,7 +422,7 @@ class SearchOptions:
             return None
         named: dict[str, Any] = dict(pairs("--lattice", self.values))
         alpha = named.pop("alpha", None)
-        made = order_grid(**named) if self.step is None else order_grid(step=self.step, **named)
+        made = order_grid(**named) if self.step is None else order_grid(increment=self.step, **named)
         return made if alpha is None else replace(made, orders={**made.orders, "alpha": alpha})
 
     def settings(self) -> dict[str, Any]:

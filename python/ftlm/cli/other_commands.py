@@ -58,12 +58,12 @@ def demo(
         progress.expect("the demo", estimate_duration(DEMO_SECONDS * (0.1 / step) ** 2, check_threads(threads)))
         result = run_demo(
             Path(out),
-            step=step,
+            increment=step,
             noise=noise,
             seed=seed,
             threads=threads,
             force=force,
-            say=progress.name,
+            log=progress.name,
             progress=progress,
         )
         result.files.append(demo_page(result, Path(out) / "demo.html", force=force))
@@ -109,15 +109,15 @@ def reproduce(
     with Progress("", quiet=as_json) as progress:
         result = reproduction.reproduce(
             *measured,
-            step=step,
+            increment=step,
             noise=noise,
             seed=seed,
             genetic=genetic.settings(),
-            rivals_step=rivals_step,
+            rivals_increment=rivals_step,
             arms=arms,
             records=records,
             threads=threads,
-            say=progress.say,
+            log=progress.say,
             progress=progress,
         )
         progress.say("writing the page")
@@ -145,7 +145,7 @@ def orders(
     check_free(out, force=force, words=COMMAND_MESSAGES)
     runs = reading.runs(files, apart=True)
     with Progress("", quiet=as_json) as progress:
-        found = orders_on_unseen_runs(runs, filtered=filtered, threads=threads, say=progress.say, progress=progress)
+        found = orders_on_unseen_runs(runs, filtered=filtered, threads=threads, log=progress.say, progress=progress)
         progress.say("writing the page")
         page = unseen_page(found, out, force=force)
     if as_json:

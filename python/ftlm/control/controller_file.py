@@ -243,7 +243,7 @@ def _lqg(controller: Lqg) -> LqgFile:
         [made.gain_error[o] for o in made.outputs],
         [made.phase_error[o] for o in made.outputs],
         list(observer.noise),
-        observer.drift,
+        observer.process_noise,
         [observer.deviations[o] for o in made.outputs],
     )
 

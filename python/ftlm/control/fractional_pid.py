@@ -385,8 +385,10 @@ def fractional_pid(
         An unstable model (an integrator is allowed), friction, or too much uncertainty: more than 5 % of the samples
         make the loop unstable or halve its phase margin. Requirements that no nonnegative gains meet.
 
-    Notes ----- At given orders, three conditions at the crossover (gain 1, phase, zero slope of the phase) are linear
-    in the three gains and hold exactly. Among all orders whose largest sensitivity over all samples is at most 1.5 (or
+    Notes
+    -----
+    At given orders, three conditions at the crossover (gain 1, phase, zero slope of the phase) are linear in the
+    three gains and hold exactly. Among all orders whose largest sensitivity over all samples is at most 1.5 (or
     within 5 % of the smallest), those with the largest loop gain at a tenth of the crossover are selected. Monje,
     Vinagre, Feliu and Chen (2008), doi:10.1016/j.conengprac.2007.08.006.
     """

@@ -9,7 +9,8 @@ from typing import Any, Literal
 import numpy as np
 from numpy.typing import ArrayLike
 
-from ftlm.analysis.poles import Mode, modes
+from ftlm.analysis.poles import Mode
+from ftlm.analysis.poles import modes as model_modes
 from ftlm.control.arguments import checked_rate
 from ftlm.errors import DataError, ModelError
 from ftlm.model.model import ModelData
@@ -153,7 +154,7 @@ def input_shaper(
     model: ModelData | complex,
     kind: Literal["zv", "zvd"] = "zv",
     *,
-    modes_shaped: int = 1,
+    modes: int = 1,
     coupling: Literal["simulated", "measured"] = "simulated",
 ) -> Shaper:
     """Design an input shaper for the poles of a model of any orders.
@@ -165,7 +166,7 @@ def input_shaper(
     kind
         ``"zv"`` (Smith's posicast; half a period of delay) or ``"zvd"`` (a full period; pole errors have a second-order
         effect only).
-    modes_shaped
+    modes
         Number of modes, the least damped first. Each adds its delay.
     coupling
         ``"simulated"``: poles of the coupled equations. ``"measured"``: poles of each equation alone, for a link whose
@@ -181,17 +182,19 @@ def input_shaper(
         An unstable model, friction, too few oscillatory modes, or poles so uncertain that the residual vibration may
         exceed 20 %.
 
-    Notes ----- Singer and Seering (1990), doi:10.1115/1.2894142. Besides its oscillation a fractional model has a
-    component that decays as a power of time, which no shaper cancels; it is no vibration.
+    Notes
+    -----
+    Singer and Seering (1990), doi:10.1115/1.2894142. Besides its oscillation a fractional model has a component that
+    decays as a power of time, which no shaper cancels; it is no vibration.
     """
     check_choice("kind", kind, SHAPER_REPETITIONS)
-    count = whole_number(modes_shaped)
+    count = whole_number(modes)
     if count is None or count < 1:
-        raise ModelError(f"modes_shaped = {short_repr(modes_shaped)} is no number of modes; give a whole number from 1")
+        raise ModelError(f"modes = {short_repr(modes)} is no number of modes; give a whole number from 1")
     if isinstance(model, (complex, float, int, np.number)):
         every: tuple[Mode, ...] = (_mode_of(model),)
     else:
-        every = modes(model, coupling=coupling)
+        every = model_modes(model, coupling=coupling)
     growing = [m for m in every if m.unstable or m.damping <= 0.0]
     if growing:
         raise ModelError(

@@ -95,19 +95,19 @@ class Trajectory:
 
 
 def point_to_point(
-    size: float, duration: float, rate: float = 500.0, *, before: float = 0.3, after: float = 1.2
+    distance: float, duration: float, rate: float = 500.0, *, dwell_before: float = 0.3, dwell_after: float = 1.2
 ) -> Floats:
     """Point-to-point path with zero velocity, acceleration and jerk at both ends: a polynomial of degree 7.
 
     Parameters
     ----------
-    size
+    distance
         Distance, in the unit of the output.
     duration
         Duration of the move [s].
     rate
         Sampling rate [Hz].
-    before, after
+    dwell_before, dwell_after
         Dwell times before and after the move [s].
 
     Raises
@@ -115,13 +115,13 @@ def point_to_point(
     ModelError
         Invalid numbers, or a move of fewer than ten samples.
     """
-    reach = real_number("size", size)
+    reach = real_number("size", distance)
     if not math.isfinite(reach):
-        raise ModelError(f"size = {short_repr(size)} is not a finite number")
+        raise ModelError(f"size = {short_repr(distance)} is not a finite number")
     times = positive("duration", duration), positive("rate", rate)
-    rests = [real_number(n, v) for n, v in (("before", before), ("after", after))]
+    rests = [real_number(n, v) for n, v in (("before", dwell_before), ("after", dwell_after))]
     if not all(0 <= r < math.inf for r in rests):
-        raise ModelError(f"before = {before!r} and after = {after!r} are not seconds from 0")
+        raise ModelError(f"before = {dwell_before!r} and after = {dwell_after!r} are not seconds from 0")
     if times[0] * times[1] < 10:
         raise ModelError(
             f"duration = {short_repr(duration)} s has fewer than ten samples at {times[1]:g} Hz; give it more time"
@@ -134,7 +134,13 @@ def point_to_point(
 
 
 def inverse_dynamics(
-    design: Loop, path: ArrayLike, *, of: str | None = None, limit: float = math.inf, samples: int = 40, seed: int = 0
+    design: Loop,
+    path: ArrayLike,
+    *,
+    output: str | None = None,
+    limit: float = math.inf,
+    samples: int = 40,
+    seed: int = 0,
 ) -> Trajectory:
     """Compute the reference with which a loop moves a sum of outputs, such as a tip, along a path.
 
@@ -165,8 +171,10 @@ def inverse_dynamics(
         A path that exceeds the limit, a reference that moves before the path's first row, or too much uncertainty: the
         residual vibration may exceed half of that with the path itself as reference.
 
-    Notes ----- In the frequency domain a nonminimum-phase response has a bounded inverse, which starts before the path:
-    Bayo (1987), doi:10.1002/rob.4620040406.
+    Notes
+    -----
+    In the frequency domain a nonminimum-phase response has a bounded inverse, which starts before the path: Bayo
+    (1987), doi:10.1002/rob.4620040406.
     """
     if not isinstance(design, LoopDesign):
         raise ModelError(f"design is a {type(design).__name__}, no PidDesign or LqgDesign; design a loop first")
@@ -174,7 +182,7 @@ def inverse_dynamics(
     count, start = check_samples(samples, seed)
     most = check_limit(limit)
     names = tuple(p.output for p in design.plants)
-    row = sum_row("of", names[0] if of is None and len(names) == 1 else of, names)
+    row = sum_row("of", names[0] if output is None and len(names) == 1 else output, names)
     size = 1 << math.ceil(math.log2(TRANSFORM_LENGTH_FACTOR * len(rows)))
     # On a line right of all poles and left of the zeros that a tip has there: s = jw, its real part above 0.
     fall = WEIGHT_DECAY * design.rate / size

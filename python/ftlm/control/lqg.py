@@ -36,7 +36,7 @@ class Observer:
         Measured outputs.
     noise
         Standard deviation of the noise of each measured output.
-    drift
+    process_noise
         Process noise intensity: standard deviation of the disturbance's change in a second.
     gain
         Correction gain, shape (states + 1, measured).
@@ -47,7 +47,7 @@ class Observer:
     realisation: Realisation
     measured: tuple[str, ...]
     noise: tuple[float, ...]
-    drift: float
+    process_noise: float
     gain: Floats
     deviations: dict[str, float]
 
@@ -123,7 +123,7 @@ def observer(
     input: str | None = None,
     measured: Sequence[str] | None = None,
     noise: Mapping[str, float] | None = None,
-    drift: float,
+    process_noise: float,
     rate: float = 500.0,
     band: tuple[float, float] | None = None,
     poles: int | None = None,
@@ -142,7 +142,7 @@ def observer(
         Measured outputs; default all.
     noise : mapping, optional
         Standard deviation of the noise of each measured output; default the residuals of the model's fit.
-    drift
+    process_noise
         Process noise intensity: standard deviation of the change of an input disturbance in a second, in the unit of
         the input. It covers friction, offsets and other unmodeled effects.
     rate, band, poles
@@ -164,7 +164,10 @@ def observer(
     plants = plants_of(model, input, rate, coupling, sensor=sensor)
     names = select_outputs("measured", measured, tuple(p.output for p in plants))
     return kalman_filter(
-        fit_realization(plants, band, poles), names, noise_deviations(model, names, noise), positive("drift", drift)
+        fit_realization(plants, band, poles),
+        names,
+        noise_deviations(model, names, noise),
+        positive("drift", process_noise),
     )
 
 
@@ -180,16 +183,16 @@ def plants_of(model: ModelData, driver: str | None, rate: float, coupling: str, 
 
 
 def kalman_filter(
-    realisation: Realisation, measured: tuple[str, ...], noise: tuple[float, ...], drift: float
+    realisation: Realisation, measured: tuple[str, ...], noise: tuple[float, ...], process_noise: float
 ) -> Observer:
     """Return the Kalman filter of a realization."""
-    bare = Observer(realisation, measured, noise, drift, np.zeros((0, 0)), {})
+    bare = Observer(realisation, measured, noise, process_noise, np.zeros((0, 0)), {})
     a, b, c = bare.matrices
     step = 1.0 / realisation.rate
     # Process noise of the input itself: the same deviation per sample as its random walk has in a second.
     inside = np.zeros_like(a)
-    inside[:-1, :-1] = b[:-1] @ b[:-1].T * drift**2
-    inside[-1, -1] = drift**2 * step
+    inside[:-1, :-1] = b[:-1] @ b[:-1].T * process_noise**2
+    inside[-1, -1] = process_noise**2 * step
     outside = np.diag(np.square(noise))
     with catch_numerical_errors(f"no observer from {', '.join(measured)}", "measure more, or narrow the band"):
         _, spread, _ = python_control().dlqe(a, np.eye(len(a)), c, inside, outside)
@@ -202,7 +205,9 @@ def kalman_filter(
         )
     variances = np.einsum("ij,jk,ik->i", realisation.c, left[:-1, :-1], realisation.c)
     deviations = np.sqrt(np.maximum(variances, 0.0)).tolist()
-    return Observer(realisation, measured, noise, drift, gain, dict(zip(realisation.outputs, deviations, strict=True)))
+    return Observer(
+        realisation, measured, noise, process_noise, gain, dict(zip(realisation.outputs, deviations, strict=True))
+    )
 
 
 def noise_deviations(
@@ -416,13 +421,13 @@ class LqgDesign(LoopDesign):
 def lqg(
     model: ModelData,
     *,
-    allowed: Mapping[str, float],
-    effort: float,
+    max_deviation: Mapping[str, float],
+    max_input: float,
     input: str | None = None,
     output: str | None = None,
     measured: Sequence[str] | None = None,
     noise: Mapping[str, float] | None = None,
-    drift: float | None = None,
+    process_noise: float | None = None,
     rate: float = 500.0,
     limit: float = math.inf,
     band: tuple[float, float] | None = None,
@@ -440,15 +445,15 @@ def lqg(
         Linear model that is stable except for an integrator.
     allowed : mapping
         Maximum acceptable deviations of outputs, or of sums such as ``"theta11 + theta12"`` (a tip); Bryson's rule.
-    effort
+    max_input
         Maximum acceptable input, in its unit.
     input, output : str, optional
         Manipulated input and output that follows the reference, by default the integrating output, or the first. The
         input may be omitted for a model with one input.
     measured, noise, rate, band, poles, coupling, sensor
         See :func:`observer`.
-    drift
-        Process noise intensity: change of an input disturbance in a second; default a fifth of `effort`. Larger values
+    process_noise
+        Process noise intensity: change of an input disturbance in a second; default a fifth of `max_input`. Larger values
         give a faster observer and more noise in the command.
     limit
         Largest command.
@@ -467,17 +472,19 @@ def lqg(
         As :func:`observer`; a largest sensitivity above 3 on the exact model, nominally or for more than 5 % of the
         parameter samples.
 
-    Notes ----- Solves the Riccati equations by python-control on the sampled realization, including one sample of
-    delay. LQG loops have no guaranteed margins: Doyle (1978), doi:10.1109/TAC.1978.1101812. Therefore the argument
-    principle on the exact response decides.
+    Notes
+    -----
+    Solves the Riccati equations by python-control on the sampled realization, including one sample of delay. LQG
+    loops have no guaranteed margins: Doyle (1978), doi:10.1109/TAC.1978.1101812. Therefore the argument principle
+    on the exact response decides.
     """
     count, start = check_samples(samples, seed)
-    dear = positive("effort", effort)
-    walks = 0.2 * dear if drift is None else positive("drift", drift)
+    dear = positive("effort", max_input)
+    walks = 0.2 * dear if process_noise is None else positive("drift", process_noise)
     plants = plants_of(model, input, rate, coupling, sensor=sensor)
     names = tuple(p.output for p in plants)
     read = select_outputs("measured", measured, names)
-    weights = _weights(allowed, names)
+    weights = _weights(max_deviation, names)
     tracked = _tracked_output(output, plants)
     realisation = fit_realization(plants, band, poles)
     seen = kalman_filter(realisation, read, noise_deviations(model, read, noise), walks)
@@ -528,16 +535,17 @@ def _tracked_output(output: str | None, plants: Sequence[Plant]) -> str:
     return next((p.output for p in plants if p.integral_order() > 0.5), names[0])
 
 
-def _weights(allowed: Mapping[str, float], names: tuple[str, ...]) -> list[tuple[Floats, float]]:
+def _weights(max_deviation: Mapping[str, float], names: tuple[str, ...]) -> list[tuple[Floats, float]]:
     """Return coefficients of sums of outputs, with their maximum acceptable deviations."""
-    if not isinstance(allowed, Mapping) or not allowed:
+    if not isinstance(max_deviation, Mapping) or not max_deviation:
         raise ModelError(
-            f"allowed = {short_repr(allowed)} is no mapping from outputs, or sums of them, to deviations; give such as "
+            f"max_deviation = {short_repr(max_deviation)} is no mapping from outputs, or sums of them, to deviations; "
+            "give such as "
             f"{{{names[0]!r}: 0.01}}"
         )
     return [
         (sum_row("allowed", text, names), positive(f"allowed[{short_repr(text)}]", size))
-        for text, size in allowed.items()
+        for text, size in max_deviation.items()
     ]
 
 

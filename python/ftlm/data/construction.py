@@ -202,7 +202,7 @@ class RunArguments:
                     "no value before which there is none to hold",
                     0,
                     int(gone.sum()),
-                    "begin where the input is known, with slice=",
+                    "begin where the input is known, with window=",
                 )
             out[name] = fill_input_gaps(values, behaviour[name])
             how = "its last value was held" if behaviour[name] == ZERO_ORDER_HOLD else "a straight line was drawn"
@@ -273,7 +273,7 @@ class RunArguments:
             if signal in self.inputs:
                 instead = "hold the last value before them with missing='hold'"
             check_values(
-                vector, self.label_of(signal), first, gaps=gaps, instead=f"{instead}, or avoid them with slice="
+                vector, self.label_of(signal), first, gaps=gaps, instead=f"{instead}, or avoid them with window="
             )
             with np.errstate(over="ignore"):
                 data[signal] = vector * scale if scale != 1.0 else vector

@@ -204,7 +204,7 @@ class Run(RunData):
         intersample: Mapping[str, str] | None = None,
         name: str = "run",
         resample: float | None = None,
-        slice: Sequence[float | None] | None = None,
+        window: Sequence[float | None] | None = None,
         time_unit: str = "s",
         missing: str = "refuse",
     ) -> Run:
@@ -264,7 +264,7 @@ class Run(RunData):
             intersample=intersample,
             name=name,
             resample=resample,
-            window=slice,
+            window=window,
             time_unit=time_unit,
             missing=missing,
         )
@@ -283,7 +283,7 @@ class Run(RunData):
         intersample: Mapping[str, str] | None = None,
         name: str = "run",
         resample: float | None = None,
-        slice: Sequence[float | None] | None = None,
+        window: Sequence[float | None] | None = None,
         time_unit: str | None = None,
         missing: str = "refuse",
     ) -> Run:
@@ -300,7 +300,7 @@ class Run(RunData):
             Time between rows [s], > 0.
         inputs, outputs : mapping of str to column, or list of str
             Columns by signal name; a list names columns that keep their names.
-        units, intersample, name, resample, slice, missing
+        units, intersample, name, resample, window, missing
             As in `Run.from_arrays`.
         time_unit : {"s", "ms", "us", "min", "h"}, optional
             Unit of the time column; default the unit in its name, as in ``time [ms]`` (with a warning), else s. A
@@ -327,7 +327,7 @@ class Run(RunData):
             intersample=intersample,
             name=name,
             resample=resample,
-            window=slice,
+            window=window,
             time_unit=time_unit,
             missing=missing,
         )
@@ -636,7 +636,7 @@ class Run(RunData):
                 )
             if is_constant(values):
                 thing, what = f"output {name!r} of run {self.name!r}", f"constant, every row is {float(there[0])!r}"
-                way_out = "check the sensor and the column, or load a part of the record in which it moves with slice="
+                way_out = "check the sensor and the column, or load a part of the record in which it moves with window="
                 raise bad_rows(thing, what, 0, values.size, way_out)
 
     def plot(self, *signals: str) -> Figures:

@@ -203,7 +203,7 @@ def fit_trend(values: Floats, step: float, *, linear: bool) -> tuple[Callable[[F
 
 
 def check_values(
-    values: Floats, thing: str, offset: int, *, gaps: bool = False, instead: str = "avoid them with slice="
+    values: Floats, thing: str, offset: int, *, gaps: bool = False, instead: str = "avoid them with window="
 ) -> None:
     """Raise for values that are not finite or whose squares overflow; ``offset`` is the number of the first row.
 
@@ -221,9 +221,9 @@ def check_values(
     if math.isnan(value):
         raise bad_rows(thing, "NaN", first, count, f"remove or fill these rows yourself, or {instead}")
     if math.isinf(value):
-        raise bad_rows(thing, f"infinity ({value})", first, count, "correct these rows, or avoid them with slice=")
+        raise bad_rows(thing, f"infinity ({value})", first, count, "correct these rows, or avoid them with window=")
     what = f"{value!r} is larger than {MAX_SAMPLE_VALUE:g} and its square overflows"
-    raise bad_rows(thing, what, first, count, "correct these rows, scale the signal, or avoid them with slice=")
+    raise bad_rows(thing, what, first, count, "correct these rows, scale the signal, or avoid them with window=")
 
 
 def check_increasing(clock: Floats, thing: str, offset: int) -> None:
@@ -258,7 +258,7 @@ def regular_step(
         if gaps.size:
             what = f"gap of {steps[gaps[0]]:.6g} s where {usual:.6g} s is usual"
             way_out = (
-                "load the part before or after it with slice=, let the rows be missing with missing='hold', or put "
+                "load the part before or after it with window=, let the rows be missing with missing='hold', or put "
                 "the inputs on a regular grid with resample=STEP"
             )
             raise bad_rows(thing, what, offset + int(gaps[0]) + 1, gaps.size, way_out)
@@ -307,7 +307,7 @@ def window_rows(clock: Floats, window: object, argument: str, thing: str = "time
     ends = clock[[0, -1]]
     if not np.isfinite(ends).all():
         row, count = 0 if not np.isfinite(ends[0]) else clock.size - 1, int((~np.isfinite(clock)).sum())
-        way_out = "remove these rows; slice= counts from the first time"
+        way_out = "remove these rows; window= counts from the first time"
         raise bad_rows(thing, "the first or last time is not finite", row, count, way_out)
     with np.errstate(over="ignore", invalid="ignore"):
         since = clock - clock[0]

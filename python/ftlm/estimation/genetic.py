@@ -141,12 +141,12 @@ class GeneticProblem:
         self,
         records: list[Record],
         structure: Structure,
-        lattice: OrderGrid,
+        order_grid: OrderGrid,
         settings: Genetic,
         norm: str,
         threads: int,
     ) -> None:
-        values = lattice.values(structure)
+        values = order_grid.values(structure)
         self.order_names, self.coefficient_names = structure.order_names, structure.coefficient_names
         self.names = (*self.order_names, *self.coefficient_names)
         self.law = structure.has_order_law
@@ -251,7 +251,7 @@ def default_bounds(
 def genetic_search(
     records: list[Record],
     structure: Structure,
-    lattice: OrderGrid,
+    order_grid: OrderGrid,
     settings: Genetic,
     *,
     norm: str = "l1",
@@ -283,7 +283,7 @@ def genetic_search(
             "the genetic baseline knows no initial terms and needs runs that start at rest; "
             "slice the runs, or give the structure initial='rest'"
         )
-    problem = GeneticProblem(records, structure, lattice, settings, norm, check_threads(threads))
+    problem = GeneticProblem(records, structure, order_grid, settings, norm, check_threads(threads))
     wanted = settings.evaluations or problem.size
     if settings.evaluations is None and wanted > MAX_DEFAULT_EVALUATIONS:
         raise ModelError(
@@ -424,7 +424,7 @@ MAX_LOG_ERROR = 1e3
 def differential_evolution_search(
     records: list[Record],
     structure: Structure,
-    lattice: OrderGrid,
+    order_grid: OrderGrid,
     settings: Genetic,
     *,
     norm: str = "l1",
@@ -447,7 +447,7 @@ def differential_evolution_search(
         raise ModelError("differential evolution needs SciPy; pip install 'ftlm[genetic]'") from None
     if records[0].start != (False, []) or records[0].offset != "none":
         raise ModelError("differential evolution knows no initial terms and no offset; slice the runs to start at rest")
-    problem = GeneticProblem(records, structure, lattice, settings, norm, check_threads(threads))
+    problem = GeneticProblem(records, structure, order_grid, settings, norm, check_threads(threads))
     wanted = settings.evaluations or problem.size
     bounds = [problem.bounds[n] for n in problem.names]
     generation = CANDIDATES_PER_GENE * sum(low < high for low, high in bounds)

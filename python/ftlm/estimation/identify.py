@@ -147,13 +147,13 @@ def identify(
         "output-error", "instrumental-variables", "multi-innovation", "least-squares", "genetic"
     ] = "output-error",
     criterion: Literal["output-error", "equation-error"] | None = None,
-    lattice: OrderGrid | None = None,
+    order_grid: OrderGrid | None = None,
     norm: Literal["l1", "l2"] | None = None,
     innovation_length: int | None = None,
     prior_covariance: float | None = None,
-    rows: Literal["haar", "time"] | None = None,
+    row_basis: Literal["haar", "time"] | None = None,
     m: int | None = None,
-    keep: int | None = None,
+    top: int | None = None,
     genetic: Genetic | None = None,
     threads: int | None = None,
     progress: Callable[[int, int], None] | None = None,
@@ -184,13 +184,13 @@ def identify(
         bias of noise. ``"multi-innovation"``: the paper's (44) in closed form. ``"least-squares"``: its limit for a
         weak prior. ``"genetic"``: orders and coefficients by a genetic algorithm on the free run, the paper's
         baseline, for comparison only (``pip install 'ftlm[genetic]'``).
-    criterion, lattice, norm, keep
+    criterion, order_grid, norm, top
         Of the order search, by default ``"output-error"``, every lattice of :func:`ftlm.lattice`'s own, ``"l1"`` and
         20; see :func:`ftlm.search_orders`. Refused by ``"output-error"``, whose bounds are the structure's own, and
         where every order is a number. ``"genetic"`` uses lattice (its bounds) and norm.
     threads, progress
         Threads, by default all cores, and what is called with (work done, work in all).
-    innovation_length, prior_covariance, rows
+    innovation_length, prior_covariance, row_basis
         p, K0 and the coordinates of paper (42)-(44), by default 7, 1 and ``"haar"``; of ``"multi-innovation"`` alone. p
         is a weight of the data against the prior, nothing else.
     m
@@ -257,8 +257,8 @@ def identify(
         structure = replace(structure, offset=check_offset(offset))
     if structure.has_friction:
         _check_friction(structure, method, reference)
-    check_order_grid(lattice)
-    check_order_grid_names(lattice, structure)
+    check_order_grid(order_grid)
+    check_order_grid_names(order_grid, structure)
     if not (genetic is None or isinstance(genetic, Genetic)):
         raise ModelError(f"genetic is {type(genetic).__name__}, not Genetic; use ftlm.Genetic(seeds=…)")
     words: dict[str, Any] = {
@@ -266,8 +266,8 @@ def identify(
         "norm": norm,
         "innovation_length": innovation_length,
         "prior_covariance": prior_covariance,
-        "rows": rows,
-        "keep": keep,
+        "rows": row_basis,
+        "keep": top,
     }
     words = {n: value for n, value in words.items() if value is not None}
     if loss is not None:
@@ -282,7 +282,7 @@ def identify(
     others = {
         "loss": loss,
         "intervals": intervals,
-        "lattice": lattice,
+        "lattice": order_grid,
         "genetic": genetic,
         "store": store,
         "executor": executor,
@@ -307,7 +307,7 @@ def identify(
     answers, weak = (None, []) if reference is None else instrument_runs(several, structure, reference)
 
     def estimate(asked: Structure) -> Fit:
-        task = Task(tuple(several), asked, lattice)
+        task = Task(tuple(several), asked, order_grid)
         if method == "output-error":
             return estimate_output_error(
                 task, m, settings.threads, progress, answers, loss or "squares", intervals or "auto", begin, more

@@ -75,7 +75,7 @@ def _linear(
 
 def _multi_innovation(item: Equation, records: list[Record], settings: Settings, prior: float) -> list[float]:
     """Return the coefficients by the closed form of equation (44)."""
-    haar = settings.rows == "haar"
+    haar = settings.row_basis == "haar"
     (raw, *_), _ = _core.multi_innovation(*_linear(item, records), settings.innovation_length, prior, haar, False)
     return raw
 
@@ -181,7 +181,7 @@ def multi_innovation_trace(
     *,
     innovation_length: int = 7,
     prior_covariance: float = 1.0,
-    rows: Literal["haar", "time"] = "haar",
+    row_basis: Literal["haar", "time"] = "haar",
     m: int | None = None,
     every: int = 1,
 ) -> MultiInnovationTrace:
@@ -193,7 +193,7 @@ def multi_innovation_trace(
         One run that starts at rest.
     equation
         One equation whose orders are numbers.
-    innovation_length, prior_covariance, rows, m
+    innovation_length, prior_covariance, row_basis, m
         See :func:`identify`.
     every
         Give every n-th step (and the last).
@@ -212,7 +212,9 @@ def multi_innovation_trace(
     -----
     O(m k^3) for the recursion and one division of series for each step given.
     """
-    settings = Settings.check(innovation_length=innovation_length, prior_covariance=prior_covariance, rows=rows)
+    settings = Settings.check(
+        innovation_length=innovation_length, prior_covariance=prior_covariance, row_basis=row_basis
+    )
     if len(equation.equations) != 1 or equation.order_names:
         raise ModelError("a trace needs one equation whose orders are numbers; use .equation(…).with_orders(…)")
     if equation.offset != "none":
@@ -233,7 +235,7 @@ def multi_innovation_trace(
         (False, []),
         settings.innovation_length,
         settings.prior_covariance,
-        settings.rows == "haar",
+        settings.row_basis == "haar",
         True,
     )
     if trace is None:

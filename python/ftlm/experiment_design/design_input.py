@@ -143,13 +143,13 @@ class DesignTask:
 def design_input(
     model: Identification | ModelData,
     *,
-    like: Run | None = None,
+    reference_run: Run | None = None,
     duration: float | None = None,
     step: float | None = None,
     peak: float | Mapping[str, float] | None = None,
     slew: float | Mapping[str, float] | None = None,
     limits: Mapping[str, float] | None = None,
-    names: Sequence[str] | None = None,
+    parameters: Sequence[str] | None = None,
     criterion: Kind = "D",
     noise: Mapping[str, float] | None = None,
     period: float | None = None,
@@ -209,13 +209,13 @@ def design_input(
         raise ModelError(f"progress is a {type(progress).__name__}; pass what is called with (done, all)")
     wanted = _check_arguments(
         model,
-        like,
+        reference_run,
         duration,
         step,
         peak,
         slew,
         limits,
-        names,
+        parameters,
         criterion,
         noise,
         period,
@@ -306,13 +306,13 @@ def _design_candidates(
 
 def _check_arguments(
     model: Identification | ModelData,
-    like: Run | None,
+    reference_run: Run | None,
     duration: float | None,
     step: float | None,
     peak: float | Mapping[str, float] | None,
     slew: float | Mapping[str, float] | None,
     limits: Mapping[str, float] | None,
-    names: Sequence[str] | None,
+    parameters: Sequence[str] | None,
     criterion: str,
     noise: Mapping[str, float] | None,
     period: float | None,
@@ -323,19 +323,23 @@ def _check_arguments(
     check_model(solved)
     check_linear(solved.equations, "a design of the next experiment")
     check_no_input_nonlinearity(solved, "a design of the next experiment")
-    if like is None and isinstance(model, Identification) and model.task is not None:
-        like = model.task.runs[0]
-    if like is not None and not isinstance(like, Run):
-        raise ModelError(f"like is {type(like).__name__}, not a Run; give a run that the machine bore")
+    if reference_run is None and isinstance(model, Identification) and model.task is not None:
+        reference_run = model.task.runs[0]
+    if reference_run is not None and not isinstance(reference_run, Run):
+        raise ModelError(f"like is {type(reference_run).__name__}, not a Run; give a run that the machine bore")
     free = parameter_set_of(solved)
     outputs = solved.outputs
     laid = ModelFit.of(solved, per_signal_values("noise", noise, outputs, free.noise))
-    _check_signals(laid, like)
+    _check_signals(laid, reference_run)
     if free.covariance is None:
         _raise_too_uncertain(laid, "some of its numbers have infinite intervals", None)
-    time = _positive("step", step if step is not None else None if like is None else like.step, "a step [s]")
+    time = _positive(
+        "step", step if step is not None else None if reference_run is None else reference_run.step, "a step [s]"
+    )
     length = _positive(
-        "duration", duration if duration is not None else None if like is None else like.duration, "a length [s]"
+        "duration",
+        duration if duration is not None else None if reference_run is None else reference_run.duration,
+        "a length [s]",
     )
     rows = round(min(length / time, 1e9)) + 1
     if not MIN_RUN_SAMPLES <= rows <= MAX_RUN_SAMPLES:
@@ -343,10 +347,15 @@ def _check_arguments(
             f"duration = {length:g} s in steps of {time:g} s are {rows} rows; give a run of {MIN_RUN_SAMPLES} to "
             f"{MAX_RUN_SAMPLES} rows"
         )
-    swings = dict.fromkeys(outputs, math.inf) | ({} if like is None else _largest_values(like, outputs, moved=True))
+    swings = dict.fromkeys(outputs, math.inf) | (
+        {} if reference_run is None else _largest_values(reference_run, outputs, moved=True)
+    )
     bounds = Bounds(
         per_signal_values(
-            "peak", peak, laid.inputs, None if like is None else _largest_values(like, laid.inputs, moved=False)
+            "peak",
+            peak,
+            laid.inputs,
+            None if reference_run is None else _largest_values(reference_run, laid.inputs, moved=False),
         ),
         per_signal_values("slew", slew, laid.inputs, dict.fromkeys(laid.inputs, math.inf)),
         per_signal_values("limits", limits, outputs, swings),
@@ -364,7 +373,7 @@ def _check_arguments(
         )
     _check_stable(laid, bounds)
     _check_uncertainty(laid, time, length)
-    at = _parameter_indices(laid, names)
+    at = _parameter_indices(laid, parameters)
     if not isinstance(criterion, str) or criterion not in ("D", "E"):
         raise ModelError(
             f"criterion = {short_repr(criterion)} is not known; use 'D' (all intervals) or 'E' (the widest)"
@@ -389,7 +398,7 @@ def _check_arguments(
     )
 
 
-def _check_signals(laid: ModelFit, like: Run | None) -> None:
+def _check_signals(laid: ModelFit, reference_run: Run | None) -> None:
     """Raise if a model has no usable input, or a run lacks its inputs."""
     if not laid.inputs:
         raise ModelError("the model has no input, so there is nothing to design; give one with an input")
@@ -398,19 +407,19 @@ def _check_signals(laid: ModelFit, like: Run | None) -> None:
             "an input of the model passed its sensor filter, and what a rig is given did not; identify it with the "
             "filter on outputs alone"
         )
-    if like is None:
+    if reference_run is None:
         return
-    lacking = [n for n in laid.inputs if n not in like.inputs]
+    lacking = [n for n in laid.inputs if n not in reference_run.inputs]
     if lacking:
         raise DataError(
-            f"run {like.name!r} has no input {lacking[0]!r}{nearest(lacking[0], like.inputs)}, which drives the model; "
-            "give the run of that machine, or leave like= out"
+            f"run {reference_run.name!r} has no input {lacking[0]!r}{nearest(lacking[0], reference_run.inputs)}, which "
+            "drives the model; give the run of that machine, or leave reference_run= out"
         )
 
 
 def _positive(name: str, value: object, what: str) -> float:
     if value is None:
-        raise ModelError(f"{name} is not given; give {name}= {what}, or like= a run")
+        raise ModelError(f"{name} is not given; give {name}= {what}, or reference_run= a run")
     number = real_number(name, value)
     if not (number > 0 and math.isfinite(number)):
         raise ModelError(f"{name} = {number:g} is not {what} above 0; give one")
@@ -464,7 +473,7 @@ def _check_stable(laid: ModelFit, bounds: Bounds) -> None:
     if found.origin_order > 0 and drifting:
         raise ModelError(
             f"the model integrates its input (order {found.origin_order:g}), so that {drifting[0]} may drift anywhere; "
-            "say how far it may go by limits= (--limit), or give like= a run"
+            "say how far it may go by limits= (--limit), or give reference_run= a run"
         )
 
 

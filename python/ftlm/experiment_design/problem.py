@@ -164,7 +164,7 @@ def per_signal_values(
         if said is None:
             if default is None or name not in default:
                 raise ModelError(
-                    f"{what} of {name} is not given; give {what}= a number, or one by name, or like= a run"
+                    f"{what} of {name} is not given; give {what}= a number, or one by name, or reference_run= a run"
                 )
             out[name] = default[name]
             continue

@@ -52,7 +52,7 @@ def load(
     columns: Mapping[str, object] | PathLike | None = None,
     intersample: Mapping[str, str] | None = None,
     step: float | None = None,
-    slice: Sequence[float | None] | None = None,
+    window: Sequence[float | None] | None = None,
     resample: float | None = None,
     name: str | None = None,
     time_unit: str | None = None,
@@ -123,7 +123,7 @@ def load(
     ...            units={"theta11": "deg"})  # doctest: +SKIP
     """
     wanted = select_columns(columns, time, step, inputs, outputs, units, intersample, layout)
-    options = LoadOptions(slice, resample, name, time_unit, missing)
+    options = LoadOptions(window, resample, name, time_unit, missing)
     run = run_from_tables(read_tables(path, wanted.layout), wanted, options)
     PACKAGE_LOGGER.info("read: %s: %d rows, %s", run.name, run.length, ", ".join(run.signals))
     return run

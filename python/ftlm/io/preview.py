@@ -316,7 +316,7 @@ def open_file(
     columns: Mapping[str, object] | PathLike | None = None,
     intersample: Mapping[str, str] | None = None,
     step: float | None = None,
-    slice: Sequence[float | None] | None = None,
+    window: Sequence[float | None] | None = None,
     resample: float | None = None,
     time_unit: str | None = None,
     missing: str | None = None,
@@ -331,7 +331,7 @@ def open_file(
     ----------
     path : path
         One file of any kind that :func:`ftlm.load` reads.
-    time, inputs, outputs, units, columns, intersample, step, slice, resample, time_unit, missing, layout
+    time, inputs, outputs, units, columns, intersample, step, window, resample, time_unit, missing, layout
         As in :func:`ftlm.load`.
 
     Returns
@@ -347,7 +347,7 @@ def open_file(
     if not isinstance(path, (str, os.PathLike)):
         raise DataError(f"path is a {type(path).__name__}; pass the path of one file")
     wanted = select_columns(columns, time, step, inputs, outputs, units, intersample, layout)
-    options = LoadOptions(slice, resample, None, time_unit, missing)
+    options = LoadOptions(window, resample, None, time_unit, missing)
     (table,) = read_tables(path, wanted.layout)
     return _FilePreview(table, Pool([table]), wanted, options).result(os.fspath(path))
 

@@ -191,12 +191,12 @@ class Model(ModelData):
         *,
         tolerance: float = 1e-6,
         initial: Mapping[str, Mapping[float, float]] | None = None,
-        largest_m: int = 1 << 22,
+        max_m: int = 1 << 22,
     ) -> Run:
         """Simulate the outputs from the inputs of a run; see :func:`ftlm.simulate`."""
         from ftlm.simulation.simulate import simulate
 
-        return simulate(self, run, tolerance=tolerance, initial=initial, largest_m=largest_m)
+        return simulate(self, run, tolerance=tolerance, initial=initial, max_m=max_m)
 
     def compare(self, runs: Run | Sequence[Run], *, m: int | None = None) -> Comparison:
         """Compare with measured runs by equation error and output error; see :func:`ftlm.compare`."""

@@ -34,12 +34,12 @@ _WAY_OUT = (
 def certify_orders(
     runs: Run | Sequence[Run],
     equation: Structure,
-    lattice: OrderGrid | None = None,
+    order_grid: OrderGrid | None = None,
     *,
-    within: float = DEFAULT_TOLERANCE,
-    apart: float | None = None,
-    largest: float = DEFAULT_MAX_TERM_RATIO,
-    cells: int = DEFAULT_MAX_CELLS,
+    tolerance: float = DEFAULT_TOLERANCE,
+    min_separation: float | None = None,
+    max_term_ratio: float = DEFAULT_MAX_TERM_RATIO,
+    max_cells: int = DEFAULT_MAX_CELLS,
     m: int | None = None,
     threads: int | None = None,
     progress: Callable[[int, int], None] | None = None,
@@ -57,17 +57,17 @@ def certify_orders(
         One run or several with the same names and units; squares add up.
     equation
         One equation with free orders.
-    lattice
+    order_grid
         Order grid. Only the ends of its intervals are used.
-    within
+    tolerance
         Tolerance: how much smaller than the best error found that of other orders may be, as a fraction below 1.
-    apart
+    min_separation
         Minimum distance of orders of the output from its highest one, and of orders of one signal from one another.
         At distance 0 every equation is trivially satisfied. Default: the increment of the order grid.
-    largest
+    max_term_ratio
         Maximum RMS size of all terms of an equation together, relative to that of the output. Larger terms that
         cancel one another are not identifiable.
-    cells
+    max_cells
         Maximum number of boxes of orders; then the bound reached so far is returned.
     m
         Block pulses per run; default 2 048, or as many as the runs support.
@@ -91,26 +91,32 @@ def certify_orders(
     KeyboardInterrupt
         Ctrl-C, within half a second.
     """
-    share = _check_tolerance(within)
-    most = whole_number(cells)
+    share = _check_tolerance(tolerance)
+    most = whole_number(max_cells)
     if most is None or not 1 <= most < 1 << 62:
-        raise ModelError(f"cells = {cells!r} is no whole number from 1; the default is {DEFAULT_MAX_CELLS}")
+        raise ModelError(f"max_cells = {max_cells!r} is no whole number from 1; the default is {DEFAULT_MAX_CELLS}")
     gap = real_number(
         "apart",
-        (lattice.increment if isinstance(lattice, OrderGrid) else DEFAULT_INCREMENT) if apart is None else apart,
+        (order_grid.increment if isinstance(order_grid, OrderGrid) else DEFAULT_INCREMENT)
+        if min_separation is None
+        else min_separation,
     )
     if not 0 < gap <= 1:
-        raise ModelError(f"apart = {apart!r} is outside (0, 1]; the step of the lattice is usual")
-    size = real_number("largest", largest)
+        raise ModelError(f"min_separation = {min_separation!r} is outside (0, 1]; the step of the lattice is usual")
+    size = real_number("largest", max_term_ratio)
     if not 1 <= size <= 1e9:
-        raise ModelError(f"largest = {largest!r} is outside [1, 1e9]; the default is {DEFAULT_MAX_TERM_RATIO:g}")
-    job = make_job(runs, equation, lattice, Settings.check(**CERTIFIED_SETTINGS, threads=check_threads(threads)), m=m)
-    return certify_job(job, within=share, apart=gap, largest=size, cells=most, progress=progress)
+        raise ModelError(
+            f"max_term_ratio = {max_term_ratio!r} is outside [1, 1e9]; the default is {DEFAULT_MAX_TERM_RATIO:g}"
+        )
+    job = make_job(
+        runs, equation, order_grid, Settings.check(**CERTIFIED_SETTINGS, threads=check_threads(threads)), m=m
+    )
+    return certify_job(job, tolerance=share, min_separation=gap, max_term_ratio=size, max_cells=most, progress=progress)
 
 
-def check_certifiable(job: Job, within: float) -> None:
+def check_certifiable(job: Job, tolerance: float) -> None:
     """Raise ModelError if no certificate exists for a search, or the tolerance is out of range."""
-    _check_tolerance(within)
+    _check_tolerance(tolerance)
     for name, value in CERTIFIED_SETTINGS.items():
         given = getattr(job.settings, name)
         if given != value:
@@ -130,11 +136,11 @@ def check_certifiable(job: Job, within: float) -> None:
         )
 
 
-def _check_tolerance(within: float) -> float:
-    share = real_number("within", within)
+def _check_tolerance(tolerance: float) -> float:
+    share = real_number("within", tolerance)
     if not 0 < share < 1:
         raise ModelError(
-            f"within={within!r} (--certify) is outside (0, 1); 0.05 asks that nothing be better by more than 5 %"
+            f"tolerance={tolerance!r} (--certify) is outside (0, 1); 0.05 asks that nothing be better by more than 5 %"
         )
     return share
 
@@ -142,22 +148,22 @@ def _check_tolerance(within: float) -> float:
 def certify_job(
     job: Job,
     *,
-    within: float,
-    apart: float,
-    largest: float = DEFAULT_MAX_TERM_RATIO,
-    cells: int = DEFAULT_MAX_CELLS,
+    tolerance: float,
+    min_separation: float,
+    max_term_ratio: float = DEFAULT_MAX_TERM_RATIO,
+    max_cells: int = DEFAULT_MAX_CELLS,
     progress: Callable[[int, int], None] | None = None,
 ) -> OrderCertificate:
     """Certify a prepared search; see :func:`certify_orders`."""
-    check_certifiable(job, within)
+    check_certifiable(job, tolerance)
     record, item = job.records[0], job.structure.equations[0]
     intervals = {name: (min(values), max(values)) for name, values in job.values.items()}
     region = _search_region(item, intervals, record.signals)
     try:
         found = _core.certify(
             [r.core() for r in job.records],
-            (*region, apart),
-            (within, largest, cells, job.settings.threads, memory_limit()),
+            (*region, min_separation),
+            (tolerance, max_term_ratio, max_cells, job.settings.threads, memory_limit()),
             None if progress is None else lambda done, total, _pruned: progress(done, total),
         )
     except ModelError as error:
@@ -169,10 +175,10 @@ def certify_job(
         found["at_least"],
         found["best"],
         orders,
-        within,
+        tolerance,
         intervals,
-        apart,
-        largest,
+        min_separation,
+        max_term_ratio,
         found["cells"],
         found["open"],
         record.m,

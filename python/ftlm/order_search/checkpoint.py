@@ -562,7 +562,7 @@ class Store:
     """
 
     def __init__(
-        self, path: str | os.PathLike[str], requests: Sequence[Request] | None = None, *, salvage: bool = False
+        self, path: str | os.PathLike[str], requests: Sequence[Request] | None = None, *, recover: bool = False
     ) -> None:
         self.path = Path(path)
         #: Descriptions of repairs.
@@ -573,12 +573,12 @@ class Store:
         self._failures: dict[tuple[int, int], Failures | None] = {}
         self._log = FrameFile(path, SEARCH_FILE, create=requests is not None)
         try:
-            self._begin(requests, salvage=salvage)
+            self._begin(requests, recover=recover)
         except BaseException:
             self._log.close()
             raise
 
-    def _begin(self, requests: Sequence[Request] | None, *, salvage: bool) -> None:
+    def _begin(self, requests: Sequence[Request] | None, *, recover: bool) -> None:
         data = self._log.read()
         if requests is not None and self._log.has_no_frame(data):
             # A payload read back must be the one asked for: what would not survive is found before any work.
@@ -589,7 +589,7 @@ class Store:
             self._check_same(requests, held.requests)
         self._log.end, self._log.digest = held.end, held.digest
         if held.corruption is not None:
-            self._recover(data, salvage=salvage)
+            self._recover(data, recover=recover)
         elif held.truncated_bytes:
             self.notes.append(f"{held.truncated_bytes} bytes of an unfinished write at byte {held.end} were dropped")
         if held.end < len(data):
@@ -606,13 +606,13 @@ class Store:
                     f"store {self.path} holds another search of {one.name} (asked is {difference}); choose another file"
                 )
 
-    def _recover(self, data: bytes, *, salvage: bool) -> None:
+    def _recover(self, data: bytes, *, recover: bool) -> None:
         lost = len(data) - self.contents.end
-        if not salvage:
+        if not recover:
             raise DataError(
                 f"store {self.path} is damaged: {self.contents.corruption}; {lost} bytes from there on cannot be "
                 "trusted: "
-                "resume with salvage=True (--salvage) to keep what stands before and compute the rest again"
+                "resume with recover=True (--recover) to keep what stands before and compute the rest again"
             )
         copy = self.path.with_name(self.path.name + ".damaged")
         write_atomically(copy, data, force=False)

@@ -83,10 +83,10 @@ class Settings:
     coefficients: str = "multi-innovation"
     innovation_length: int = 7
     prior_covariance: float = 1.0
-    rows: str = "haar"
-    keep: int = 20
+    row_basis: str = "haar"
+    top: int = 20
     threads: int = 1
-    early_stopping: bool = True
+    pruning: bool = True
 
     @classmethod
     def check(
@@ -96,49 +96,49 @@ class Settings:
         coefficients: str = "multi-innovation",
         innovation_length: int = 7,
         prior_covariance: float = 1.0,
-        rows: str = "haar",
-        keep: int = 20,
+        row_basis: str = "haar",
+        top: int = 20,
         threads: int | None = None,
-        early_stopping: bool = True,
+        pruning: bool = True,
     ) -> Settings:
         """Validate the arguments; raise a `ModelError` that names the invalid one."""
         for name, value, known in (
             ("criterion", criterion, ("output-error", "equation-error")),
             ("norm", norm, ("l1", "l2")),
             ("coefficients", coefficients, ("multi-innovation", "least-squares", "instrumental-variables")),
-            ("rows", rows, ("haar", "time")),
+            ("rows", row_basis, ("haar", "time")),
         ):
             if value not in known:
                 raise ModelError(
                     f"{name} = {value!r} is not known in this version; use {' or '.join(map(repr, known))}"
                 )
-        rows_kept, p = whole_number(keep), whole_number(innovation_length)
+        rows_kept, p = whole_number(top), whole_number(innovation_length)
         if rows_kept is None or not 1 <= rows_kept <= 100_000:
-            raise ModelError(f"keep = {keep!r} is outside [1, 100000]; keep as many rows as you will read")
+            raise ModelError(f"top = {top!r} is outside [1, 100000]; keep as many rows as you will read")
         if p is None or not 1 <= p < 1 << 62:
             raise ModelError(f"innovation length p = {innovation_length!r} is no whole number from 1; the paper's is 7")
         k0 = real_number("prior covariance K0", prior_covariance)
         if not 0 < k0 < math.inf:
             raise ModelError(f"prior covariance K0 = {prior_covariance!r} is not positive; a large one is a weak prior")
-        return cls(criterion, norm, coefficients, p, k0, rows, rows_kept, check_threads(threads), early_stopping)
+        return cls(criterion, norm, coefficients, p, k0, row_basis, rows_kept, check_threads(threads), pruning)
 
     @property
     def needs_haar(self) -> bool:
         """Whether m must be a power of two."""
-        return self.coefficients == "multi-innovation" and self.rows == "haar"
+        return self.coefficients == "multi-innovation" and self.row_basis == "haar"
 
     def core_arguments(self, memory: int | None = None) -> tuple[str, str, int, float, bool, int, int, bool, int, int]:
         """Return the settings as arguments of the core; the default memory limit is that of this machine."""
         p = self.innovation_length if self.coefficients == "multi-innovation" else 0
         steps = MAX_IV_ITERATIONS if self.coefficients == "instrumental-variables" else 0
-        ranked = (self.criterion, self.norm, p, self.prior_covariance, self.rows == "haar")
+        ranked = (self.criterion, self.norm, p, self.prior_covariance, self.row_basis == "haar")
         most = memory_limit() if memory is None else memory
-        return *ranked, self.keep, self.threads, self.early_stopping, steps, most
+        return *ranked, self.top, self.threads, self.pruning, steps, most
 
     def to_dict(self) -> dict[str, Any]:
         """Return the settings that results and reports show."""
         out: dict[str, Any] = {"criterion": self.criterion, "norm": self.norm, "coefficients": self.coefficients}
         if self.coefficients == "multi-innovation":
             out |= {"innovation_length": self.innovation_length, "prior_covariance": self.prior_covariance}
-            out["rows"] = self.rows
+            out["rows"] = self.row_basis
         return out

@@ -382,7 +382,7 @@ class EquationSearchState(SearchState[Rounds, "_core._Found"]):
 
     def batches(self) -> Iterator[tuple[int, int]]:
         """Yield batches of rounds with the same rows, each with its own throughput: later ones exclude more."""
-        first, keep = 0, self.work.settings.keep
+        first, keep = 0, self.work.settings.top
         for end in self._ends:
             ranked = sorted({(row[1], row[0]) for part in self._parts for row in part[0]})[:keep]
             if len(ranked) == keep:
@@ -610,7 +610,7 @@ def _table(work: CoupledProblem, joined: CoupledTable) -> _core._FoundStage:
     sound = (
         set(joined.counts) == {"candidates", "kept", "beaten", "bound", "stopped early", "singular", "diverged"}
         and dealt == joined.counts["candidates"]
-        and 0 < len(joined.rows) == joined.counts["kept"] <= work.settings.keep
+        and 0 < len(joined.rows) == joined.counts["kept"] <= work.settings.top
         and all(len(free) == len(work.axes) for _, free, _ in joined.failures)
         and all(len(free) == len(work.axes) for _, _, free, _ in joined.rows)
         and all([len(p[3]) for p in parts] == widths for _, _, _, parts in joined.rows)

@@ -224,19 +224,19 @@ def _result(job: Job, table: list[SearchRow], failures: Failures, counts: _core.
 def search_orders(
     runs: Run | Sequence[Run],
     equation: Structure,
-    lattice: OrderGrid | None = None,
+    order_grid: OrderGrid | None = None,
     *,
     criterion: Criterion = "output-error",
     coefficients: Coefficients = "multi-innovation",
     norm: Literal["l1", "l2"] = "l1",
     innovation_length: int | None = None,
     prior_covariance: float | None = None,
-    rows: Literal["haar", "time"] | None = None,
+    row_basis: Literal["haar", "time"] | None = None,
     m: int | None = None,
-    keep: int = 20,
+    top: int = 20,
     threads: int | None = None,
     progress: Callable[[int, int], None] | None = None,
-    early_stopping: bool = True,
+    pruning: bool = True,
     store: str | os.PathLike[str] | None = None,
     executor: Executor | None = None,
 ) -> SearchResult:
@@ -251,7 +251,7 @@ def search_orders(
         One run or several with the same names and units; scores add up.
     equation
         Structure with free orders; see :func:`ftlm.equation` and :func:`ftlm.flexible_link`.
-    lattice
+    order_grid
         Intervals and step; see :func:`ftlm.lattice`.
     criterion
         ``"output-error"``: the free run, each equation driven by the measured other outputs. ``"equation-error"``:
@@ -263,19 +263,19 @@ def search_orders(
         score.
     norm
         ``"l1"`` (paper (45)) or ``"l2"`` (paper (46)).
-    innovation_length, prior_covariance, rows
+    innovation_length, prior_covariance, row_basis
         p and K0 of paper (43)-(44), and whether rows come in Haar coordinates (``"haar"``) or in the order of time
         (``"time"``); by default 7, 1 and ``"haar"``. Of ``"multi-innovation"`` alone; with other coefficients they are
         refused.
     m
         Block pulses a run; default 2 048, or what the runs carry.
-    keep
+    top
         Rows of the table.
     threads
         Threads; default all cores.
     progress
         Called about twenty times a second with (candidates done, candidates in all).
-    early_stopping
+    pruning
         Whether to leave a candidate once it cannot be kept, by a proved bound of its score or by its partial sum;
         False is brute force, with the same table.
     store
@@ -314,13 +314,11 @@ def search_orders(
     if executor is not None and threads is None:
         threads = 1
     checked = as_runs(runs)
-    weighted = {"innovation_length": innovation_length, "prior_covariance": prior_covariance, "rows": rows}
+    weighted = {"innovation_length": innovation_length, "prior_covariance": prior_covariance, "rows": row_basis}
     words: dict[str, Any] = {n: value for n, value in weighted.items() if value is not None}
-    settings = Settings.check(
-        criterion, norm, coefficients, keep=keep, threads=threads, early_stopping=early_stopping, **words
-    )
+    settings = Settings.check(criterion, norm, coefficients, top=top, threads=threads, pruning=pruning, **words)
     check_options_used(coefficients, words, argument="coefficients")
-    job = make_job(checked, equation, lattice, settings, m=m, progress=progress)
+    job = make_job(checked, equation, order_grid, settings, m=m, progress=progress)
     if store is None:
         return run_job(job, executor=executor)
     with Store(store, [job.request(job.name)]) as kept:
@@ -330,7 +328,7 @@ def search_orders(
 def make_job(
     runs: Run | Sequence[Run],
     equation: Structure,
-    lattice: OrderGrid | None = None,
+    order_grid: OrderGrid | None = None,
     settings: Settings | None = None,
     *,
     m: int | None = None,
@@ -353,8 +351,8 @@ def make_job(
             "the equations share no order law, so they are searched one by one: "
             f"pass .equation({equation.outputs[0]!r}) or use identify"
         )
-    check_order_grid(lattice)
-    values = (lattice or OrderGrid()).values(equation)
+    check_order_grid(order_grid)
+    values = (order_grid or OrderGrid()).values(equation)
     known = {n: v[0] for n, v in values.items() if len(v) == 1}
     for run in checked:
         check_zero_order_hold(run, equation, known)
@@ -369,7 +367,7 @@ def resume_search(
     threads: int | None = None,
     progress: Callable[[int, int], None] | None = None,
     executor: Executor | None = None,
-    salvage: bool = False,
+    recover: bool = False,
 ) -> dict[str, SearchResult]:
     """Go on with the searches of a store; it holds all that they are computed from.
 
@@ -379,7 +377,7 @@ def resume_search(
         A file written with ``store=``.
     threads, progress, executor
         As for :func:`search_orders`.
-    salvage
+    recover
         Whether to go on with a damaged store: what stands before the damage is kept, the rest is computed again, and
         the damaged file stays beside it as ``….damaged``.
 
@@ -400,7 +398,7 @@ def resume_search(
     KeyboardInterrupt
         Ctrl-C, within half a second; the store can be resumed.
     """
-    with Store(path, salvage=salvage) as store:
+    with Store(path, recover=recover) as store:
         return {
             request.name: resume_job(store, number, threads=threads, progress=progress, executor=executor)
             for number, request in enumerate(store.contents.requests)
@@ -494,7 +492,7 @@ def landscape(
     runs: Run | Sequence[Run],
     structure: Structure,
     search: SearchResult,
-    lattice: OrderGrid | None = None,
+    order_grid: OrderGrid | None = None,
     *,
     orders: tuple[str, str] | None = None,
     threads: int | None = None,
@@ -503,7 +501,7 @@ def landscape(
 
     Parameters
     ----------
-    runs, structure, lattice
+    runs, structure, order_grid
         What was searched: an equation, or a stage under its order law.
     search
         What was found.
@@ -521,7 +519,7 @@ def landscape(
     ModelError
         Fewer than two orders with several values, or a name that is none of them.
     """
-    axes = {n: v for n, v in (lattice or OrderGrid()).values(structure).items() if len(v) > 1}
+    axes = {n: v for n, v in (order_grid or OrderGrid()).values(structure).items() if len(v) > 1}
     best = search.orders
     names = orders or tuple(list(axes)[:2])
     if len(names) != 2 or names[0] == names[1] or any(n not in axes for n in names):
@@ -534,7 +532,7 @@ def landscape(
         fixed,
         OrderGrid(orders={names[0]: x.tolist(), names[1]: y.tolist()}),
         m=search.m,
-        keep=x.size * y.size,
+        top=x.size * y.size,
         threads=threads,
         **search.settings,
     ).table

@@ -31,7 +31,7 @@ class ReproductionData:
     sine: Run | None
     simulated: bool
     stages: dict[int, Stage]
-    lattice: OrderGrid
+    order_grid: OrderGrid
     notes: tuple[str, ...] = field(default=())
     panel: Panel = field(default_factory=Panel)
     ran: tuple[PrintedModelRun, ...] = ()
@@ -439,8 +439,8 @@ def _claims_of_tables(found: ReproductionData) -> list[Claim]:
                 for o, t in tables.items()
             )
             + f". A case holds where all are within a factor of {MAX_COEFFICIENT_RATIO:g}. Computed with the arm of whole "
-            "orders and friction, every angle scaled to the deviation that RMSE / NR implies, at the printed orders; errors are "
-            f"those of the equation, and K0 differ by a factor of {max(priors) / min(priors):.3g}.",
+            "orders and friction, every angle scaled to the deviation that RMSE / NR implies, at the printed orders; errors "
+            f"are those of the equation, and K0 differ by a factor of {max(priors) / min(priors):.3g}.",
         ),
         Claim(
             "The printed orders are the best ones, by any error.",
@@ -684,14 +684,14 @@ def _claim_of_rivals(found: ReproductionData) -> Claim | None:
             the_rival=name,
         )
         for c in contests
-        for k, error in c.lattice.items()
+        for k, error in c.order_grid.items()
         for name, errors in (("genetic", c.genetic), ("differential evolution", c.evolution))
     ]
     ruling = combine_cases(cases)
     first = {c.output: c for c in reversed(contests)}
     own = {o: first[o] for o in printed.ANGLE_NAMES if o in first}
     errors = {
-        o: (*c.lattice.values(), *_ends(c.genetic.values()), *_ends(c.evolution.values())) for o, c in own.items()
+        o: (*c.order_grid.values(), *_ends(c.genetic.values()), *_ends(c.evolution.values())) for o, c in own.items()
     }
     budgets = ", ".join(dict.fromkeys(f"{c.candidates} candidates and evaluations a seed" for c in own.values()))
     counts = sorted({len(c.genetic) for c in contests})

@@ -304,7 +304,7 @@ def orders_on_unseen_runs(
     *,
     filtered: bool = True,
     threads: int | None = None,
-    say: Callable[[str], None] = lambda _: None,
+    log: Callable[[str], None] = lambda _: None,
     progress: Callable[[int, int], None] | None = None,
 ) -> UnseenOrders:
     """Fit every deflection of the arm to each run with integer and fractional orders, and validate it on all others.
@@ -324,7 +324,7 @@ def orders_on_unseen_runs(
         Whether both deflections passed the 2 Hz low-pass of the arm's stock model.
     threads, progress
         See :func:`ftlm.search_orders`.
-    say
+    log
         Called with a line about the next step.
 
     Returns
@@ -364,10 +364,10 @@ def orders_on_unseen_runs(
         fits = len(FREE_ORDERS_BY_KIND) * (2 if both else 1) * each
         progress.expect("all of it", *duration_bounds(estimate_duration(fits, check_threads(threads))))
     for stage in stages:
-        found = _deflection(link_structure(stage, both=both, filtered=filtered), "", used, threads, say, progress)
+        found = _deflection(link_structure(stage, both=both, filtered=filtered), "", used, threads, log, progress)
         if both:
             less = link_structure(stage, both=True, filtered=filtered, rate=False)
-            found = replace(found, before=_deflection(less, f", {WITHOUT_RATE_LABEL}", used, threads, say, progress))
+            found = replace(found, before=_deflection(less, f", {WITHOUT_RATE_LABEL}", used, threads, log, progress))
         deflections[found.output] = found
     return UnseenOrders(tuple(used), deflections, filtered, tuple(notes))
 
@@ -395,7 +395,7 @@ def _deflection(
     told: str,
     runs: Sequence[Run],
     threads: int | None,
-    say: Callable[[str], None],
+    log: Callable[[str], None],
     progress: Callable[[int, int], None] | None,
 ) -> Deflection:
     """Fit every kind of structure to every run."""
@@ -407,7 +407,7 @@ def _deflection(
         letters = {n: n.rstrip("0123456789") for n in structure.order_names}
         held = {n: WHOLE_ORDERS[letter] for n, letter in letters.items() if letter not in free}
         for run in runs:
-            say(f"{output}{told}: {kind}, fitted to {run.name}")
+            log(f"{output}{told}: {kind}, fitted to {run.name}")
             try:
                 result = identify(run, structure.with_orders(held), threads=threads, progress=progress)
                 fits[kind][run.name] = RunFit(result, {other.name: result.model.compare(other) for other in runs})

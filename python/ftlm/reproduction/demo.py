@@ -144,12 +144,12 @@ def rows_of(candidate: Candidate) -> list[DemoStage]:
 def run_demo(
     folder: Path,
     *,
-    step: float = 0.1,
+    increment: float = 0.1,
     noise: float = 1e-4,
     seed: int = 1,
     threads: int | None = None,
     force: bool = False,
-    say: Callable[[str], None] = lambda _: None,
+    log: Callable[[str], None] = lambda _: None,
     progress: Callable[[int, int], None] | None = None,
 ) -> Demo:
     """Simulate two runs, and identify every equation by p = 1, 3, 5, 7, least squares and output error.
@@ -161,7 +161,7 @@ def run_demo(
     ----------
     folder
         Folder of runs and models; created if absent.
-    step
+    increment
         Increment of the order grid; the paper's is 0.05, which takes minutes.
     noise, seed
         See :func:`demo_run`.
@@ -169,7 +169,7 @@ def run_demo(
         See :func:`ftlm.search_orders`.
     force
         Whether to overwrite.
-    say
+    log
         Called with a line about the next step.
 
     Returns
@@ -184,7 +184,7 @@ def run_demo(
     """
     names = [f"stage{n}-{stem}.json" for n in STAGE_NUMBERS for stem in SAVED_MODELS]
     check_folder(folder, ["square.csv", "sine.csv", *names, "demo.html"], force=force)
-    say("recording both stages on the virtual rig, under a square and a sine current")
+    log("recording both stages on the virtual rig, under a square and a sine current")
     square, sine = (demo_run(shape, noise=noise, seed=seed) for shape in ("square", "sine"))
     demo = Demo(square, sine, {}, {}, {}, {}, [])
     for run in (square, sine):
@@ -199,9 +199,9 @@ def run_demo(
         course.advance_to(at / parts)
         at += 1
         work.progress = course.subtask(at / parts)
-        say(label)
+        log(label)
 
-    preset = Preset(OrderGrid(increment=step), TOP_CANDIDATES, TRACE_EVERY, common_pulses=False)
+    preset = Preset(OrderGrid(increment=increment), TOP_CANDIDATES, TRACE_EVERY, common_pulses=False)
     for stage in STAGE_NUMBERS:
         work = StageWork(stage, square, sine, preset, threads, begin_part, None)
         models = {

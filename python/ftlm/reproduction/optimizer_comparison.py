@@ -41,14 +41,14 @@ class OptimizerComparison:
 
     settings: Genetic
     candidates: int
-    lattice: dict[float, SearchResult]
+    order_grid: dict[float, SearchResult]
     genetic: GeneticRun
     evolution: GeneticRun
 
 
-def rivals_lattice(step: float, smallest: float = CONTEST_STEP) -> OrderGrid:
+def rivals_order_grid(increment: float, smallest: float = CONTEST_STEP) -> OrderGrid:
     """Return the order grid of the comparison, given the increment of the main grid."""
-    return OrderGrid(increment=max(step, smallest), alpha=RIVAL_ALPHA)
+    return OrderGrid(increment=max(increment, smallest), alpha=RIVAL_ALPHA)
 
 
 def seeds_for(candidates: int) -> tuple[int, ...]:
@@ -59,7 +59,7 @@ def seeds_for(candidates: int) -> tuple[int, ...]:
 def compare_optimizers(
     run: Run,
     single: Structure,
-    lattice: OrderGrid,
+    order_grid: OrderGrid,
     asked: Genetic | None = None,
     *,
     seeds: Sequence[int] | None = None,
@@ -74,7 +74,7 @@ def compare_optimizers(
         Record that starts at rest.
     single
         Structure with one equation.
-    lattice
+    order_grid
         Order grid of multi-innovation; its ends bound the orders of the optimizers.
     asked
         Settings of the genetic algorithm given by the user.
@@ -94,11 +94,11 @@ def compare_optimizers(
         prior: search_orders(
             run,
             blind,
-            lattice,
+            order_grid,
             coefficients="multi-innovation",
             innovation_length=INNOVATION_LENGTHS[-1],
             prior_covariance=prior,
-            keep=1,
+            top=1,
             threads=threads,
             progress=progress,
         )
@@ -109,7 +109,7 @@ def compare_optimizers(
     settings = replace(settings, evaluations=settings.evaluations or max(count, 2 * settings.population))
     records = prepare([run], blind, None, power_of_two=True)
     rivals = [
-        search(records, blind, lattice, settings, threads=threads, progress=progress)
+        search(records, blind, order_grid, settings, threads=threads, progress=progress)
         for search in (genetic_search, differential_evolution_search)
     ]
     return OptimizerComparison(settings, count, searches, *rivals)
@@ -173,9 +173,9 @@ class Contest:
         Arm of the record, angle.
     candidates
         Candidates of the order grid, and evaluations per seed.
-    step
+    increment
         Increment of the order grid.
-    lattice
+    order_grid
         Error (45) of p = 7 by K0.
     genetic, evolution
         Error (45) by seed.
@@ -184,8 +184,8 @@ class Contest:
     arm: str
     output: str
     candidates: int
-    step: float
-    lattice: dict[float, float]
+    increment: float
+    order_grid: dict[float, float]
     genetic: dict[int, float]
     evolution: dict[int, float]
 
@@ -195,8 +195,8 @@ class Contest:
             "arm": self.arm,
             "output": self.output,
             "candidates": self.candidates,
-            "step": self.step,
-            "multi-innovation": {f"{k:g}": finite(v) for k, v in self.lattice.items()},
+            "step": self.increment,
+            "multi-innovation": {f"{k:g}": finite(v) for k, v in self.order_grid.items()},
             "genetic": {str(s): finite(v) for s, v in self.genetic.items()},
             "differential evolution": {str(s): finite(v) for s, v in self.evolution.items()},
         }
@@ -300,7 +300,7 @@ def trials_of(stage: StageNumber, square: Run, arm: str, seed: int, threads: int
                     coefficients="multi-innovation",
                     innovation_length=p,
                     prior_covariance=prior,
-                    keep=1,
+                    top=1,
                     threads=threads,
                 )
                 for p in printed.INNOVATION_LENGTHS
@@ -328,10 +328,10 @@ def trials_of(stage: StageNumber, square: Run, arm: str, seed: int, threads: int
     return found
 
 
-def contest(made: OptimizerComparison, output: str, arm: str, step: float) -> Contest:
+def contest(made: OptimizerComparison, output: str, arm: str, increment: float) -> Contest:
     """Return the errors of all three optimizers."""
-    lattice = {k: search.score for k, search in made.lattice.items()}
-    return Contest(arm, output, made.candidates, step, lattice, made.genetic.errors, made.evolution.errors)
+    lattice = {k: search.score for k, search in made.order_grid.items()}
+    return Contest(arm, output, made.candidates, increment, lattice, made.genetic.errors, made.evolution.errors)
 
 
 def compare_orders(
@@ -383,7 +383,7 @@ def panel_of(stages: Sequence[Stage], square: Run, arm: str, seed: int, threads:
                     arm,
                     output,
                     rival.candidates,
-                    rival.step,
+                    rival.increment,
                     errors,
                     rival.genetic_run.errors,
                     rival.evolution_run.errors,
@@ -403,7 +403,7 @@ def simulated_panel(
     threads: int | None,
     *,
     genetic: Genetic | None = None,
-    lattice: OrderGrid | None = None,
+    order_grid: OrderGrid | None = None,
     begin: Callable[[str], None] = lambda _: None,
     progress: Callable[[int, int], None] | None = None,
 ) -> Panel:
@@ -418,16 +418,16 @@ def simulated_panel(
         run = demo_run("square", noise=noise, seed=seed, parameters=ARM_VARIANTS[arm])
         begin("trials")
         trials += trials_of(stage, run, arm, seed, threads)
-        if lattice is None or seed != seeds[0]:
+        if order_grid is None or seed != seeds[0]:
             continue
         structure = flexible_link(stage=stage, form="published", coupling="measured", laws=())
         own = run.select(list(structure.signals))
         for output in structure.outputs:
             begin("rivals")
             made = compare_optimizers(
-                own, structure.equation(output), lattice, genetic, threads=threads, progress=progress
+                own, structure.equation(output), order_grid, genetic, threads=threads, progress=progress
             )
-            contests.append(contest(made, output, arm, lattice.increment))
+            contests.append(contest(made, output, arm, order_grid.increment))
         begin("freed")
         freed.append(compare_orders(stage, run, arm, threads, progress))
     return Panel(tuple(trials), tuple(contests), tuple(freed))

@@ -178,7 +178,7 @@ def _reidentify(
                 innovation_length=p,
                 prior_covariance=prior,
                 m=printed.PULSE_COUNT,
-                keep=1,
+                top=1,
                 threads=threads,
             ).model
         except FtlmError:  # no candidate has a finite error

@@ -267,8 +267,8 @@ def _runs_section(found: ReproductionData) -> Section:
     first = next(iter(found.stages.values()))
     notes = [
         f"M = {first.candidates['p = 7'].estimation.m} block pulses, order lattice in steps of "
-        f"{found.lattice.increment:g}, "
-        f"α from {found.lattice.alpha[0]:g} to {found.lattice.alpha[1]:g}, K₀ = 1, rows in Haar coordinates from "
+        f"{found.order_grid.increment:g}, "
+        f"α from {found.order_grid.alpha[0]:g} to {found.order_grid.alpha[1]:g}, K₀ = 1, rows in Haar coordinates from "
         f"coarse to fine. Convergence is computed at every {TRACE_EVERY}nd step. Instrumental variables are searched "
         "two steps around the orders of least squares. With K₀ = 1 deflections hardly move, and no bound excludes a "
         f"candidate: lattices finer than {COARSE_INCREMENT:g} are searched in steps of that for them, then around "

@@ -18,7 +18,7 @@ from ftlm.estimation.genetic import Genetic
 from ftlm.model.model import Model
 from ftlm.progress import format_time_left
 from ftlm.reproduction.claims import Claim, ReproductionData, claims
-from ftlm.reproduction.optimizer_comparison import CONTEST_STEP, Panel, panel_of, rivals_lattice, simulated_panel
+from ftlm.reproduction.optimizer_comparison import CONTEST_STEP, Panel, panel_of, rivals_order_grid, simulated_panel
 from ftlm.reproduction.published_models import PrintedModelRun, run_printed_models
 from ftlm.reproduction.published_values import AsPrinted, as_printed
 from ftlm.reproduction.report import reproduction_page
@@ -127,7 +127,7 @@ class Reproduction(ReproductionData):
         return {
             "runs": [run.name for run in self.runs],
             "simulated": self.simulated,
-            "lattice": {"step": self.lattice.increment, "alpha": list(self.lattice.alpha)},
+            "lattice": {"step": self.order_grid.increment, "alpha": list(self.order_grid.alpha)},
             "claims": [c.to_dict() for c in self.claims],
             "as printed": {o: a.to_dict() for o, a in self.as_printed.items()},
             "printed models run": [r.to_dict() for r in self.ran],
@@ -146,15 +146,15 @@ def reproduce(
     square: Run | None = None,
     sine: Run | None = None,
     *,
-    step: float = 0.05,
+    increment: float = 0.05,
     noise: float = 1e-4,
     seed: int = 1,
     genetic: Genetic | None = None,
-    rivals_step: float = CONTEST_STEP,
+    rivals_increment: float = CONTEST_STEP,
     arms: Sequence[str] | None = None,
     records: int = 3,
     threads: int | None = None,
-    say: Callable[[str], None] = lambda _: None,
+    log: Callable[[str], None] = lambda _: None,
     progress: Callable[[int, int], None] | None = None,
 ) -> Reproduction:
     """Reproduce section 5 of the paper, on the virtual rig or on measured runs.
@@ -166,14 +166,14 @@ def reproduce(
         virtual rig under a square current of 0.3 A, period 2 s, for 10 s.
     sine
         Validation run. By default, with the default ``square`` only, 0.6 A at 6.3 rad/s.
-    step
+    increment
         Increment of the order grid; the paper's is 0.05.
     noise, seed
         Noise of the virtual rig's angles, see :func:`ftlm.reproduction.demo_run`.
     genetic
         Seeds and evaluations of the genetic algorithm and of differential evolution; by default ten seeds, or as many
         as 20 000 evaluations an angle allow, each with as many evaluations as the compared order grid has candidates.
-    rivals_step
+    rivals_increment
         Smallest increment of that grid, on every arm; the paper's 0.05 takes sixteen times as long.
     arms
         Simulated arms for verdicts besides the first: keys of `ARM_VARIANTS`, by default all. For a measured run there
@@ -182,7 +182,7 @@ def reproduce(
         Records of each arm with different noise.
     threads
         Threads of each stage; two stages or arms are computed in parallel unless this is 1.
-    say
+    log
         Called with a line about the next step, from the thread of a stage.
     progress
         Called with (parts done, all parts) of the whole, from the thread of a stage; the parts have equal duration.
@@ -200,29 +200,29 @@ def reproduce(
         A sine run without a square run, unknown arms, an invalid step or number of records.
     """
     simulated = square is None
-    others, lattice = _other_arms(arms, records), OrderGrid(increment=step)
-    for each in (step, real_number("rivals_step", rivals_step)):
+    others, lattice = _other_arms(arms, records), OrderGrid(increment=increment)
+    for each in (increment, real_number("rivals_step", rivals_increment)):
         OrderGrid(increment=each).values(flexible_link(stage=1, form="published", coupling="measured", laws=()))
     if square is None:
         if sine is not None:
             raise ModelError("a sine run is given without a square run; give both, or neither")
-        say("recording both stages on the virtual rig, under a square and a sine current")
+        log("recording both stages on the virtual rig, under a square and a sine current")
         square, sine = (demo_run(shape, noise=noise, seed=seed) for shape in ("square", "sine"))
     numbers = stages_of(square, sine)
     more = (len(others), records) if simulated else ()
-    seconds = seconds_of_all(step, len(numbers), *more, rivals_step=rivals_step)
+    seconds = seconds_of_all(increment, len(numbers), *more, rivals_increment=rivals_increment)
     about = format_time_left(estimate_duration(seconds, min(check_threads(threads), len(STAGE_NUMBERS)))).removesuffix(
         " left"
     )
-    say(f"this takes {about}")
-    preset = Preset(lattice, TOP_CANDIDATES, TRACE_EVERY, common_pulses=True, rivals_step=rivals_step)
+    log(f"this takes {about}")
+    preset = Preset(lattice, TOP_CANDIDATES, TRACE_EVERY, common_pulses=True, rivals_increment=rivals_increment)
     own = MAIN_ARM if simulated else MEASURED_LABEL
     seeds = [seed + k for k in range(records)]
     run, other = square, sine
 
     def stage_of(number: StageNumber) -> Job:
         def job(steps: WorkerProgress) -> StageOutcome:
-            work = StageWork(number, run, other, preset, threads, say, steps, simulated=simulated)
+            work = StageWork(number, run, other, preset, threads, log, steps, simulated=simulated)
             stage = work.compute_stage(genetic)
             work.begin(f"stage {number}: the paper's printed models under its own current", "printed")
             rows = run_printed_models(number, threads)
@@ -234,11 +234,11 @@ def reproduce(
 
     def panel_on(arm: str, number: StageNumber) -> Job:
         def job(steps: WorkerProgress) -> Panel:
-            say(f"verdicts: the arm “{arm}”, stage {number}")
+            log(f"verdicts: the arm “{arm}”, stage {number}")
             of_more = seeds[1:] if arm == MAIN_ARM else seeds
 
             def begin(name: str) -> None:
-                steps.begin(seconds_of(name, step, rivals_step))
+                steps.begin(seconds_of(name, increment, rivals_increment))
 
             return simulated_panel(
                 number,
@@ -249,7 +249,7 @@ def reproduce(
                 genetic=genetic,
                 begin=begin,
                 progress=steps,
-                lattice=None if arm == MAIN_ARM else rivals_lattice(step, rivals_step),
+                order_grid=None if arm == MAIN_ARM else rivals_order_grid(increment, rivals_increment),
             )
 
         return job

@@ -26,7 +26,7 @@ from ftlm.order_search.search import search_orders
 from ftlm.plot.comparison_charts import pulse_times
 from ftlm.progress import ShareTracker, Stoppable
 from ftlm.reproduction import published_values as printed
-from ftlm.reproduction.optimizer_comparison import CONTEST_STEP, compare_optimizers, rivals_lattice, seeds_for
+from ftlm.reproduction.optimizer_comparison import CONTEST_STEP, compare_optimizers, rivals_order_grid, seeds_for
 from ftlm.reproduction.simulated_arm import StageNumber, decimate_run
 from ftlm.reproduction.stage_result import (
     MULTI_INNOVATION_LABELS,
@@ -83,24 +83,24 @@ STEPS_PER_STAGE = {
 STEPS_PER_ARM = {"trials": 0, "rivals": 2, "freed": 1}
 
 
-def seconds_of(step: str, lattice_step: float, rivals_step: float = CONTEST_STEP) -> float:
+def seconds_of(increment: str, lattice_step: float, rivals_increment: float = CONTEST_STEP) -> float:
     """Processor time of a step [s]; searches grow with the inverse fourth power of the increment."""
-    if step == "rivals":
-        candidates = round(CONTEST_CANDIDATES * (CONTEST_STEP / max(lattice_step, rivals_step)) ** 4)
+    if increment == "rivals":
+        candidates = round(CONTEST_CANDIDATES * (CONTEST_STEP / max(lattice_step, rivals_increment)) ** 4)
         evaluations = candidates * len(seeds_for(candidates))
-        return STEP_DURATIONS_S[step] * evaluations / (CONTEST_CANDIDATES * len(seeds_for(CONTEST_CANDIDATES)))
-    return STEP_DURATIONS_S[step] * float((0.05 / lattice_step) ** 4 if step == "search" else 1.0)
+        return STEP_DURATIONS_S[increment] * evaluations / (CONTEST_CANDIDATES * len(seeds_for(CONTEST_CANDIDATES)))
+    return STEP_DURATIONS_S[increment] * float((0.05 / lattice_step) ** 4 if increment == "search" else 1.0)
 
 
 def seconds_of_all(
-    lattice_step: float, stages: int, arms: int = 0, records: int = 1, *, rivals_step: float = CONTEST_STEP
+    lattice_step: float, stages: int, arms: int = 0, records: int = 1, *, rivals_increment: float = CONTEST_STEP
 ) -> float:
     """Processor time of the whole reproduction [s]."""
     counts = dict(STEPS_PER_STAGE)
     for step, count in STEPS_PER_ARM.items():
         counts[step] = counts.get(step, 0) + arms * count
     counts["trials"] += (arms + 1) * records - 1
-    return stages * sum(count * seconds_of(step, lattice_step, rivals_step) for step, count in counts.items())
+    return stages * sum(count * seconds_of(step, lattice_step, rivals_increment) for step, count in counts.items())
 
 
 class TotalProgress:
@@ -186,13 +186,13 @@ WHOLE_ROWS = 1250
 class Preset:
     """Settings that differ between the reproduction and the demonstration."""
 
-    lattice: OrderGrid
+    order_grid: OrderGrid
     top: int  # rows of an order search
     trace_every: int  # steps between two points of a convergence curve
     # Whether all models are judged alike, on the paper's pulses (a sum over other pulses is another number) and from
     # the currents alone as well, or each as its method worked.
     common_pulses: bool
-    rivals_step: float = CONTEST_STEP  # of the lattice that the rivals are held against
+    rivals_increment: float = CONTEST_STEP  # of the lattice that the rivals are held against
 
 
 @dataclass
@@ -204,7 +204,7 @@ class StageWork:
     sine: Run | None
     preset: Preset
     threads: int | None
-    say: Callable[[str], None]
+    log: Callable[[str], None]
     progress: Callable[[int, int], None] | None
     notes: list[str] = field(default_factory=list)
     # Whether the runs are simulated from rest, so that initial conditions are known.
@@ -228,9 +228,9 @@ class StageWork:
 
     def begin(self, words: str, step: str) -> None:
         """Announce the next step and its share of the whole."""
-        self.say(words)
+        self.log(words)
         if isinstance(self.progress, WorkerProgress):
-            self.progress.begin(seconds_of(step, self.preset.lattice.increment, self.preset.rivals_step))
+            self.progress.begin(seconds_of(step, self.preset.order_grid.increment, self.preset.rivals_increment))
 
     def compute_stage(self, genetic: Genetic | None) -> Stage:
         """Compute all results of section 5 for a stage."""
@@ -347,21 +347,21 @@ class StageWork:
         for label, options in kinds.items():
             self.begin(f"stage {self.number}: orders on the lattice, {label}", "search")
             if self.preset.common_pulses:
-                found[label] = self.search_candidate(label, self.preset.lattice, **options)
+                found[label] = self.search_candidate(label, self.preset.order_grid, **options)
                 continue
             method = {"method": options["coefficients"], **{n: v for n, v in options.items() if n != "coefficients"}}
             found[label] = self.identify_candidate(
-                label, self.on, self.measured, lattice=self.preset.lattice, keep=self.preset.top, **method
+                label, self.on, self.measured, lattice=self.preset.order_grid, keep=self.preset.top, **method
             )
         return found
 
-    def search_candidate(self, label: str, lattice: OrderGrid, **options: Any) -> Candidate:
+    def search_candidate(self, label: str, order_grid: OrderGrid, **options: Any) -> Candidate:
         """Return the best orders of each equation by itself, without the statistics of an identification."""
         orders: dict[str, float] = {}
         coefficients: dict[str, float] = {}
         for output in self.measured.outputs:
             single = self.measured.equation(output)
-            own = replace(lattice, orders={n: v for n, v in lattice.orders.items() if n in single.order_names})
+            own = replace(order_grid, orders={n: v for n, v in order_grid.orders.items() if n in single.order_names})
             best = self._best_orders(single, own, options)
             orders |= best.orders
             coefficients |= best.coefficients
@@ -377,9 +377,9 @@ class StageWork:
         bound excludes any, and each would have to be simulated completely.
         """
 
-        def run_search(lattice: OrderGrid, keep: int) -> SearchResult:
+        def run_search(order_grid: OrderGrid, top: int) -> SearchResult:
             return search_orders(
-                self.on, single, lattice, keep=keep, threads=self.threads, progress=self.progress, **options
+                self.on, single, order_grid, top=top, threads=self.threads, progress=self.progress, **options
             )
 
         own_terms = sum(t.signal == single.outputs[0] for t in single.equations[0].terms)
@@ -395,7 +395,7 @@ class StageWork:
     def instrumental(self, start: Candidate) -> Candidate:
         """Search by instrumental variables on the part of the grid around the orders of another model."""
         self.begin(f"stage {self.number}: orders by instrumental variables", "instrumental")
-        step, top = self.preset.lattice.increment, self.preset.lattice.alpha[1]
+        step, top = self.preset.order_grid.increment, self.preset.order_grid.alpha[1]
         axes = {}
         for name, value in start.model.orders.items():
             steps = 1 if name.startswith("alpha") else INSTRUMENTAL_RADIUS_STEPS
@@ -487,7 +487,7 @@ class StageWork:
 
     def rivals(self, genetic: Genetic | None) -> dict[str, Rival]:
         """Compare the optimizers on each equation at equal budgets."""
-        lattice = rivals_lattice(self.preset.lattice.increment, self.preset.rivals_step)
+        lattice = rivals_order_grid(self.preset.order_grid.increment, self.preset.rivals_increment)
         found = {}
         for output in self.measured.outputs:
             single = self.measured.equation(output)
@@ -508,7 +508,7 @@ class StageWork:
             ends: dict[str, GeneticRun | SearchResult] = {
                 "genetic": made.genetic,
                 "differential evolution": made.evolution,
-                **dict(zip(MULTI_INNOVATION_LABELS, made.lattice.values(), strict=True)),
+                **dict(zip(MULTI_INNOVATION_LABELS, made.order_grid.values(), strict=True)),
             }
             candidates = {
                 n: self.candidate(n, _known_model(single, end.orders, end.coefficients)) for n, end in ends.items()
@@ -523,7 +523,7 @@ class StageWork:
         orders: dict[str, float] = {}
         for output in self.measured.outputs:
             orders |= printed.last_orders(output)
-        axes = OrderGrid(increment=self.preset.lattice.increment, orders={n: [v] for n, v in orders.items()})
+        axes = OrderGrid(increment=self.preset.order_grid.increment, orders={n: [v] for n, v in orders.items()})
         return self.search_candidate("printed orders", axes, coefficients="least-squares")
 
     def by_equation(self) -> Candidate:
@@ -531,7 +531,7 @@ class StageWork:
         self.begin(f"stage {self.number}: orders by the equation error", "equation")
         return self.search_candidate(
             "smallest equation error",
-            self.preset.lattice,
+            self.preset.order_grid,
             coefficients="least-squares",
             criterion="equation-error",
             norm="l2",
@@ -580,9 +580,9 @@ class StageWork:
         )
 
 
-def grid_values_around(orders: Mapping[str, float], lattice: OrderGrid, single: Structure) -> dict[str, list[float]]:
+def grid_values_around(orders: Mapping[str, float], order_grid: OrderGrid, single: Structure) -> dict[str, list[float]]:
     """Grid values less than two coarse increments away from these orders."""
-    values = lattice.values(single)
+    values = order_grid.values(single)
     return {n: [v for v in values[n] if abs(v - at) < 2 * COARSE_INCREMENT - 1e-9] for n, at in orders.items()}
 
 

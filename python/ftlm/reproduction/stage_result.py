@@ -79,7 +79,7 @@ class Rival:
     ----------
     candidates
         Candidates of the order grid, and default evaluations per seed.
-    step
+    increment
         Increment of the order grid.
     population
         Population size of the genetic algorithm.
@@ -90,7 +90,7 @@ class Rival:
     """
 
     candidates: int
-    step: float
+    increment: float
     population: int
     genetic_run: GeneticRun
     evolution_run: GeneticRun
@@ -111,7 +111,7 @@ class Rival:
         runs = {"genetic": self.genetic_run, "differential evolution": self.evolution_run}
         return {
             "candidates": self.candidates,
-            "step": self.step,
+            "step": self.increment,
             "population": self.population,
             "models": {n: c.to_dict() for n, c in self.models.items()},
             "errors": {n: {str(s): finite(e) for s, e in r.errors.items()} for n, r in runs.items()},

@@ -42,11 +42,11 @@ def control(
     seed: int = 0,
     parameters: str | os.PathLike[str] | ArmParameters = "effective",
     offset: tuple[float, float] | None = None,
-    paced: bool = False,
+    real_time: bool = False,
     sensor_filter: Literal["stock"] | None = None,
     watchdog: float = 0.1,
     arm: bool = False,
-    card: str = "0",
+    board: str = "0",
     name: str = "control",
     out: str | os.PathLike[str] | None = None,
     force: bool = False,
@@ -71,7 +71,7 @@ def control(
         The simulated arm, the arm on a Q8-USB board, or a user-defined board.
     duration : float, optional
         Duration [s]; default that of the reference.
-    limit, rate, seed, parameters, offset, paced, sensor_filter, watchdog, arm, card, out, force, live, progress
+    limit, rate, seed, parameters, offset, real_time, sensor_filter, watchdog, arm, board, out, force, live, progress
         See :func:`ftlm.rig.record`.
     name : str
         Name of the run.
@@ -130,11 +130,11 @@ def control(
         seed,
         parameters,
         offset,
-        paced,
+        real_time,
         sensor_filter,
         watchdog,
         arm,
-        card,
+        board,
         name,
         out,
         force,

@@ -198,11 +198,11 @@ def record(
     seed: int = 0,
     parameters: str | os.PathLike[str] | ArmParameters = "effective",
     offset: tuple[float, float] | None = None,
-    paced: bool = False,
+    real_time: bool = False,
     sensor_filter: Literal["stock"] | None = None,
     watchdog: float = 0.1,
     arm: bool = False,
-    card: str = "0",
+    board: str = "0",
     name: str | None = None,
     out: str | os.PathLike[str] | None = None,
     force: bool = False,
@@ -295,11 +295,11 @@ def record(
         seed,
         parameters,
         offset,
-        paced,
+        real_time,
         sensor_filter,
         watchdog,
         arm,
-        card,
+        board,
         excitation.shape if name is None else name,
         out,
         force,
@@ -337,11 +337,11 @@ class Experiment:
     seed: int
     parameters: str | os.PathLike[str] | ArmParameters
     offset: tuple[float, float] | None
-    paced: bool
+    real_time: bool
     sensor_filter: Literal["stock"] | None
     watchdog: float
     arm: bool
-    card: str
+    board: str
     name: str
     out: str | os.PathLike[str] | None
     force: bool
@@ -351,7 +351,7 @@ class Experiment:
     def record_run(self, source_on: Callable[[Board], CommandSource], told: dict[str, Any]) -> Run:
         """Run the experiment with a command source and return the recorded run."""
         # Flags that let an arm move must be bool; truthy values are rejected.
-        for name, flag in (("paced", self.paced), ("arm", self.arm), ("force", self.force)):
+        for name, flag in (("paced", self.real_time), ("arm", self.arm), ("force", self.force)):
             if not isinstance(flag, bool):
                 raise ModelError(f"{name} = {short_repr(flag)} is neither True nor False; use one of them")
         if self.progress is not None and not callable(self.progress):
@@ -361,9 +361,15 @@ class Experiment:
         ):
             raise ModelError(f"sensor_filter = {short_repr(self.sensor_filter)} is not known; use 'stock' or None")
         board, known = _board(
-            self.rig, self.parameters, self.seed, self.offset, paced=self.paced, horizon=self.limit, card=self.card
+            self.rig,
+            self.parameters,
+            self.seed,
+            self.offset,
+            real_time=self.real_time,
+            horizon=self.limit,
+            board=self.board,
         )
-        paced = self.paced or board.hardware or bool(getattr(board, "paced", False))
+        paced = self.real_time or board.hardware or bool(getattr(board, "paced", False))
         if board.hardware and not self.arm:
             raise ModelError(
                 f"the {board.name} moves a real arm: clear its workspace, keep the emergency stop at hand, and say so "
@@ -544,9 +550,9 @@ def _board(
     seed: int,
     offset: tuple[float, float] | None,
     *,
-    paced: bool,
+    real_time: bool,
     horizon: float,
-    card: str,
+    board: str,
 ) -> tuple[Board, dict[str, Any]]:
     """Return the selected board, and its metadata for the run."""
     virtual = isinstance(rig, str) and rig == "virtual"
@@ -562,10 +568,10 @@ def _board(
             if isinstance(offset, str) or not (math.isfinite(first) and math.isfinite(second)):
                 raise ModelError(f"offset = {short_repr(offset)} is not a pair of currents [A], of motor 1 and motor 2")
             arm = replace(arm, current_offset=(first, second))
-        return VirtualBoard(arm, seed=seed, paced=paced, horizon=horizon), {"parameters": arm.to_dict()}
+        return VirtualBoard(arm, seed=seed, real_time=real_time, horizon=horizon), {"parameters": arm.to_dict()}
     if isinstance(rig, str):
         check_choice("rig", rig, ("virtual", "q8"))
-        return QuanserBoard(card=card), {"card": card}
+        return QuanserBoard(card=board), {"card": board}
     if not hasattr(rig, "hardware"):
         raise ModelError(f"rig is a {type(rig).__name__}; use 'virtual', 'q8' or a board of your own")
     own = getattr(rig, "parameters", None)

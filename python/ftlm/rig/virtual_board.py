@@ -40,7 +40,7 @@ class VirtualBoard:
         Parameters of the arm.
     seed
         Seed of the measurement noise.
-    paced
+    real_time
         Whether to run in real time instead of as fast as possible.
     horizon
         Longest run [s]; determines the size of the simulation history.
@@ -52,7 +52,7 @@ class VirtualBoard:
 
     parameters: ArmParameters = field(default_factory=lambda: PARAMETER_SETS["effective"])
     seed: int = 0
-    paced: bool = False
+    real_time: bool = False
     horizon: float = 30.0
     page: str | os.PathLike[str] | None = None
     inject: tuple[tuple[str, int, float, float], ...] = ()
@@ -103,18 +103,18 @@ class VirtualBoard:
     def start_watchdog(self, seconds: float) -> None:
         """Start the watchdog process."""
         page = self._access()
-        if self.paced:
+        if self.real_time:
             check_watchdog(self._rate, seconds)
         try:
             self._process = watchdog.start(page, keep=self.page is not None)
         except OSError as error:
             raise RigFault(f"virtual rig: {error}; check the Python installation") from None
         self._seconds = seconds
-        page.set("timeout", seconds if self.paced else max(seconds, _MIN_FAST_WATCHDOG_S))
+        page.set("timeout", seconds if self.real_time else max(seconds, _MIN_FAST_WATCHDOG_S))
 
     def start(self, rate: float) -> None:
         """Start the clock."""
-        self._require_arm().start(self.paced)
+        self._require_arm().start(self.real_time)
         self._started = True
 
     def enable(self, on: bool) -> None:

@@ -134,7 +134,7 @@ def check_m(m: int, runs: Sequence[Run], *, power_of_two: bool) -> int:
     if power_of_two and m & (m - 1):
         below = 1 << (m.bit_length() - 1)
         raise ModelError(
-            f"m = {m} is no power of two, which Haar rows need; take m = {below} or {2 * below}, or rows='time'"
+            f"m = {m} is no power of two, which Haar rows need; take m = {below} or {2 * below}, or row_basis='time'"
         )
     return m
 
@@ -293,7 +293,7 @@ def _check_missing(run: Run, structure: Structure) -> None:
         raise DataError(
             f"signal {lacking!r} of run {run.name!r} holds no value in {int(gone.sum())} rows, first row "
             f"{int(np.flatnonzero(gone)[0])}, and drives the equation of {drivers[lacking]} as measured; fill these "
-            "rows yourself, avoid them with slice=, or use coupling='simulated'"
+            "rows yourself, avoid them with window=, or use coupling='simulated'"
         )
     if structure.all_filtered and any(name in missing for name in outputs):
         raise DataError(

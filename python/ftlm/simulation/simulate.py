@@ -73,7 +73,7 @@ def simulate(
     *,
     tolerance: float = 1e-6,
     initial: Mapping[str, Mapping[float, float]] | None = None,
-    largest_m: int = 1 << 22,
+    max_m: int = 1 << 22,
 ) -> Run:
     """Simulate the outputs of a model on the inputs of a run, at its sample times.
 
@@ -94,7 +94,7 @@ def simulate(
         Coefficients of initial terms, by output and exponent; default at rest. They are valid for this record only.
         After a sensor filter, -1 and -2 are an impulse and its derivative, which represent the filter's initial state.
         An offset c of the equation is the exponent alpha with the coefficient c / Gamma(alpha + 1); default none.
-    largest_m
+    max_m
         Maximum number of pulses; a larger remaining change raises ConvergenceError.
 
     Returns
@@ -110,7 +110,7 @@ def simulate(
     ModelError
         An equation that cannot be solved for its output, or a tolerance that is not positive.
     ConvergenceError
-        Overflow of an unstable model (with the time), or a response that has not converged at ``largest_m`` pulses.
+        Overflow of an unstable model (with the time), or a response that has not converged at ``max_m`` pulses.
     """
     check_model(model)
     if not isinstance(run, Run):
@@ -124,11 +124,11 @@ def simulate(
     if not real_number("tolerance", tolerance) > 0:
         raise ModelError(f"tolerance = {tolerance} is not positive; the default is 1e-6")
     own = run.length - 1
-    largest_m = min(largest_m, MAX_M)
-    if own > largest_m:
-        raise ModelError(f"run {run.name!r} has {own} intervals, more than {largest_m}; slice it")
+    max_m = min(max_m, MAX_M)
+    if own > max_m:
+        raise ModelError(f"run {run.name!r} has {own} intervals, more than {max_m}; slice it")
     free = simulate_refined(
-        model, _with_missing_outputs(run, model), initial or {}, tolerance=tolerance, largest_m=largest_m, on_grid=True
+        model, _with_missing_outputs(run, model), initial or {}, tolerance=tolerance, max_m=max_m, on_grid=True
     )
     for name, samples in zip(model.outputs, free.outputs, strict=True):
         if not np.all(np.isfinite(samples)):

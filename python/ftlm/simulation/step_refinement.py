@@ -339,14 +339,14 @@ class SampleResponses:
 
 
 def simulate_long(
-    model: ModelData, run: Run, initial: Terms | None, *, tolerance: float, largest_m: int
+    model: ModelData, run: Run, initial: Terms | None, *, tolerance: float, max_m: int
 ) -> OutputSamples | None:
     """Simulate a long run as :func:`refined` does; None if superposition does not apply.
 
     The initial conditions of the model are resolved. The refinement is that of the whole record.
     """
     own = run.length - 1
-    if own < LONG_RECORD_INTERVALS or FULL_GRID_REFINEMENTS[-1] * own > largest_m or model.structure.has_friction:
+    if own < LONG_RECORD_INTERVALS or FULL_GRID_REFINEMENTS[-1] * own > max_m or model.structure.has_friction:
         return None
     given = None if initial is None else [(o, p) for o in model.outputs for p in initial.get(o, {})]
     names = initial_names(model, resolve_initial_conditions(run, model.structure)) if given is None else given
@@ -387,15 +387,13 @@ def simulate_long(
             limit.add(grids[every][:, first:end])
         pieces.append(ResponsePiece(first, end, FULL_GRID_REFINEMENTS[-1], limit))
     del grids
-    change = _refine_pieces(pieces, answers, tolerance, largest_m)
+    change = _refine_pieces(pieces, answers, tolerance, max_m)
     best = np.concatenate([p.limit.estimate().samples for p in pieces], axis=1)
     outputs, terms = superpose_with_terms(best)
     return OutputSamples(outputs, terms, pieces[-1].refinement, change)
 
 
-def _refine_pieces(
-    pieces: Sequence[ResponsePiece], answers: SampleResponses, tolerance: float, largest_m: int
-) -> Floats:
+def _refine_pieces(pieces: Sequence[ResponsePiece], answers: SampleResponses, tolerance: float, max_m: int) -> Floats:
     """Halve the step on pieces that have not converged; return the remaining change."""
     while True:
         changes = [p.limit.estimate().change for p in pieces]
@@ -403,7 +401,7 @@ def _refine_pieces(
         restless = [
             p
             for p, c in zip(pieces, changes, strict=True)
-            if np.any(c > tolerance / len(pieces)) and 2 * p.refinement * p.end <= largest_m
+            if np.any(c > tolerance / len(pieces)) and 2 * p.refinement * p.end <= max_m
         ]
         if np.all(left <= tolerance) or not restless:
             return left
@@ -439,7 +437,7 @@ def simulate_refined(
     initial: Terms | None,
     *,
     tolerance: float,
-    largest_m: int = MAX_M,
+    max_m: int = MAX_M,
     on_grid: bool = False,
 ) -> OutputSamples:
     """Simulate samples on refined grids, with Richardson extrapolation, until converged or out of pulses.
@@ -464,7 +462,7 @@ def simulate_refined(
         initial = friction_initial_terms(model, fit_initial_terms_with_friction(model, run, rec, FRICTION_REFINEMENT))
     elif initial is None:
         model = with_initial_conditions(model, run)
-    long = simulate_long(model, run, initial, tolerance=tolerance, largest_m=largest_m)
+    long = simulate_long(model, run, initial, tolerance=tolerance, max_m=max_m)
     if long is not None:
         return long
     times = (
@@ -472,7 +470,7 @@ def simulate_refined(
     )
     limit, lost = RichardsonTable(), 0
     while True:
-        last = 2 * every * own > largest_m
+        last = 2 * every * own > max_m
         samples, terms = _simulate_grid(model, run, every, initial, times, last=lost == 1)
         finite = bool(np.all(np.isfinite(samples)))
         owners = [i for i, o in enumerate(model.outputs) for _ in terms[o]]

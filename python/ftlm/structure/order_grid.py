@@ -72,7 +72,7 @@ class OrderGrid:
 
 
 def order_grid(
-    step: float = DEFAULT_INCREMENT, alpha: tuple[float, float] = DEFAULT_ALPHA_RANGE, **orders: Values
+    increment: float = DEFAULT_INCREMENT, alpha: tuple[float, float] = DEFAULT_ALPHA_RANGE, **orders: Values
 ) -> OrderGrid:
     """Intervals and step of an order search.
 
@@ -103,14 +103,14 @@ def order_grid(
     low, high = (real_number("alpha", a) for a in alpha)
     if not 0 < low <= MAX_ORDER:
         raise ModelError(f"alpha interval {low:g}:{high:g} starts outside (0, 10]; choose a positive order")
-    order_axis("alpha", low, high, step)
-    return OrderGrid(step, (float(low), float(high)), dict(orders))
+    order_axis("alpha", low, high, increment)
+    return OrderGrid(increment, (float(low), float(high)), dict(orders))
 
 
-def check_order_grid(lattice: OrderGrid | None) -> None:
+def check_order_grid(order_grid: OrderGrid | None) -> None:
     """Raise if an argument is not an order grid."""
-    if not (lattice is None or isinstance(lattice, OrderGrid)):
-        raise ModelError(f"lattice is {type(lattice).__name__}, not a Lattice; use ftlm.lattice(…)")
+    if not (order_grid is None or isinstance(order_grid, OrderGrid)):
+        raise ModelError(f"lattice is {type(order_grid).__name__}, not a Lattice; use ftlm.lattice(…)")
 
 
 def axis_of(order: Order, values: Mapping[str, tuple[float, ...]]) -> list[float]:

@@ -276,7 +276,7 @@ def compare(model: ModelData, runs: Run | Sequence[Run], *, m: int | None = None
 def simulate_runs(model: ModelData, runs: Sequence[Run]) -> list[OutputSamples]:
     """Simulate each run, with initial terms fitted to it, on a grid refined until converged."""
     return [
-        simulate_refined(model, run, None, tolerance=REFINEMENT_TOLERANCE, largest_m=max(MAX_PULSES, 4 * run.length))
+        simulate_refined(model, run, None, tolerance=REFINEMENT_TOLERANCE, max_m=max(MAX_PULSES, 4 * run.length))
         for run in runs
     ]
 
