@@ -4,8 +4,8 @@
 //! y = Σ_k c_k I^{α−ν_k} s_k + initial terms, which is how everything else reads it.
 
 use crate::error::{check_finite, check_length, check_points, check_step, Error, Result};
-use crate::excess::MAX_EXCESS;
-use crate::kernels::{block_pulse_kernel, MAX_ORDER, MIN_INPUT_ORDER};
+use crate::fractional::excess::MAX_EXCESS;
+use crate::fractional::kernels::{block_pulse_kernel, MAX_ORDER, MIN_INPUT_ORDER};
 use crate::series;
 
 /// Orders closer than this are one order: lattices are written in steps, not in rounding errors.

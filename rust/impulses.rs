@@ -4,7 +4,7 @@
 //! added to the output that came through the sensor. Only where the whole equation is put through the filter afterwards, with
 //! an output that was not measured through it, do they drive the equation like others: what drives then held them.
 
-use crate::kernels::power_means;
+use crate::fractional::kernels::power_means;
 
 /// Whether an exponent stands for an impulse or a derivative of one.
 pub(crate) fn is_impulse(exponent: f64) -> bool {

@@ -2,12 +2,12 @@
 
 use std::collections::{BTreeMap, BTreeSet, HashMap};
 
-use crate::abreast;
 use crate::equation::{grains, tidy};
 use crate::error::{check_finite, check_length, check_step, Error, Result};
-use crate::excess::kernel;
+use crate::fractional::excess::kernel;
+use crate::fractional::kernels::{power_means, power_pulses};
 use crate::impulses::is_impulse;
-use crate::kernels::{power_means, power_pulses};
+use crate::parallel;
 use crate::series::{self, Buffers, Kernel};
 use crate::stop::Stop;
 
@@ -459,14 +459,14 @@ impl Bank {
             orders.values().filter(|made| made.order != 0).flat_map(|made| &made.columns).map(|(s, _)| *s).collect();
         let signals = integrated.into_iter().collect();
         let spectrum = |(): &mut (), signal: usize| (signal, Kernel::new(record.signal(signal)));
-        let spectra: BTreeMap<usize, Kernel> = abreast::map(signals, || (), spectrum).into_iter().collect();
-        abreast::map(orders.into_values().collect(), Buffers::default, |buffers, made| {
+        let spectra: BTreeMap<usize, Kernel> = parallel::map(signals, || (), spectrum).into_iter().collect();
+        parallel::map(orders.into_values().collect(), Buffers::default, |buffers, made| {
             if !stop.is_set() {
                 made.write(record, &spectra, buffers);
             }
         });
         stop.check()?;
-        abreast::map(
+        parallel::map(
             initial,
             || (),
             |(), (exponent, column)| {

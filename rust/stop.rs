@@ -1,8 +1,9 @@
 //! A computation that is told to stop.
 
-use crate::error::{Error, Result};
 use std::sync::atomic::{AtomicBool, Ordering};
 use std::sync::Arc;
+
+use crate::error::{Error, Result};
 
 /// Set from any thread, looked at by the one that computes; its clones are the same stop.
 ///

@@ -1,7 +1,7 @@
 //! Signals integrated by any order: pulse means on the level of an output, and its velocity at edges.
 
-use crate::excess::kernel_and_slope;
-use crate::kernels::digamma;
+use crate::fractional::excess::kernel_and_slope;
+use crate::fractional::kernels::digamma;
 use crate::series::{Buffers, Kernel};
 
 /// What pulses of a signal give at the ends of pulses, integrated by η > 0, and its derivative with respect to η.

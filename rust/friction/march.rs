@@ -1,8 +1,8 @@
 //! The set-valued law φ ∈ F(V) sgn(V), V = L − g ∗ φ, of all bodies that may stick, pulse by pulse, and what moves with it.
 
+use super::contact::Rubbing;
+use super::convolution::{Heads, Online};
 use super::law::{Moves, Phase, Pulse};
-use super::online::{Heads, Online};
-use super::pulses::Rubbing;
 
 /// What a body that may stick did.
 #[derive(Debug, Clone, PartialEq)]

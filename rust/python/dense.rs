@@ -3,10 +3,10 @@
 use numpy::{PyArray1, PyArray2, PyReadonlyArray2};
 use pyo3::prelude::*;
 
-use super::arrays::{columns, matrix, rows, stacked};
-use super::search::watch::leavable;
-use crate::dense;
+use super::convert::{columns, matrix, rows, stacked};
 use crate::error::{check_finite, Error};
+use crate::linalg::dense;
+use crate::python::order_search::watch::leavable;
 
 type Matrix<'py> = Bound<'py, PyArray2<f64>>;
 

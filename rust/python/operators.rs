@@ -3,16 +3,18 @@
 use numpy::{PyArray1, PyArray2, PyReadonlyArray1, PyReadonlyArray2};
 use pyo3::prelude::*;
 
-use super::arrays::{columns, copied, matrix, rows, stacked, vector};
+use super::convert::{columns, copied, matrix, rows, stacked, vector};
 use super::errors::detached;
 use super::lists::List;
-use super::search::watch::leavable;
 use crate::equation::Filter;
 use crate::error::{check_dense, check_finite, check_length, check_points, check_step, Error};
-use crate::fractional::{self, Derivative, IntegralRule};
-use crate::kernels;
-use crate::means::{self, Intersample};
-use crate::{haar, operational, series};
+use crate::fractional::haar;
+use crate::fractional::integral::{self, Derivative, IntegralRule};
+use crate::fractional::kernels;
+use crate::fractional::operational_matrices;
+use crate::python::order_search::watch::leavable;
+use crate::series;
+use crate::signal::block_pulse::{self, Intersample};
 
 type Array<'py> = Bound<'py, PyArray1<f64>>;
 type Matrix<'py> = Bound<'py, PyArray2<f64>>;
@@ -85,7 +87,7 @@ pub fn haar_matrix(py: Python<'_>, m: usize) -> PyResult<Matrix<'_>> {
 pub fn block_pulse_matrix(py: Python<'_>, order: f64, m: usize, step: f64) -> PyResult<Matrix<'_>> {
     let values = detached(py, || {
         check_dense(m)?;
-        operational::block_pulse_matrix(order, m, step)
+        operational_matrices::block_pulse_matrix(order, m, step)
     })?;
     matrix(py, values, m)
 }
@@ -96,9 +98,9 @@ pub fn operational_matrix(py: Python<'_>, order: f64, m: usize, step: f64, dense
     let values = detached(py, || {
         check_dense(m)?;
         if dense {
-            operational::operational_matrix_dense(order, m, step)
+            operational_matrices::operational_matrix_dense(order, m, step)
         } else {
-            operational::operational_matrix(order, m, step)
+            operational_matrices::operational_matrix(order, m, step)
         }
     })?;
     matrix(py, values, m)
@@ -160,7 +162,7 @@ pub fn fractional_integral<'py>(
     let out = leavable(py, points, None, move |stop| {
         let integral = |row: &Vec<f64>| {
             stop.check()?;
-            fractional::fractional_integral(row, order, step, rule)
+            integral::fractional_integral(row, order, step, rule)
         };
         all.iter().map(integral).collect()
     })?;
@@ -188,7 +190,7 @@ pub fn fractional_derivative<'py>(
         check_length("initial", all.len(), starts.len())?;
         let derivative = |(row, start): (&Vec<f64>, &Vec<f64>)| {
             stop.check()?;
-            fractional::fractional_derivative(row, order, step, definition, start)
+            integral::fractional_derivative(row, order, step, definition, start)
         };
         all.iter().zip(&starts).map(derivative).collect()
     })?;
@@ -209,13 +211,13 @@ pub fn pulse_means<'py>(
 ) -> PyResult<Array<'py>> {
     let samples = vector("samples", &samples)?;
     let between = if hold { Intersample::Hold } else { Intersample::Linear };
-    Ok(PyArray1::from_vec(py, detached(py, || means::pulse_means(&samples, m, between))?))
+    Ok(PyArray1::from_vec(py, detached(py, || block_pulse::pulse_means(&samples, m, between))?))
 }
 
 #[pyfunction]
 pub fn point_samples<'py>(py: Python<'py>, means: PyReadonlyArray1<'py, f64>) -> PyResult<Array<'py>> {
     let values = copied("means", &means)?;
-    Ok(PyArray1::from_vec(py, detached(py, || Ok(means::point_samples(&values)))?))
+    Ok(PyArray1::from_vec(py, detached(py, || Ok(block_pulse::point_samples(&values)))?))
 }
 
 #[pyfunction]
@@ -226,7 +228,7 @@ pub fn delayed<'py>(
     before: f64,
 ) -> PyResult<Array<'py>> {
     let samples = vector("samples", &samples)?;
-    Ok(PyArray1::from_vec(py, detached(py, || means::delayed(&samples, delay, before))?))
+    Ok(PyArray1::from_vec(py, detached(py, || block_pulse::delayed(&samples, delay, before))?))
 }
 
 #[pyfunction]

@@ -4,7 +4,7 @@
 //! so that a search can stop reading a candidate that has lost.
 
 use crate::fft::{self, Bin, Plan, Workspace};
-use crate::lanes;
+use crate::simd;
 
 /// Length of a block of forward substitution; measured best of 16, 32, 64, 128 at m = 2048.
 pub const BLOCK: usize = 64;
@@ -47,7 +47,7 @@ struct Substitution<'a> {
     block: &'a mut [f64],
 }
 
-impl lanes::Kernel for Substitution<'_> {
+impl simd::Kernel for Substitution<'_> {
     type Output = ();
 
     #[inline(always)]
@@ -88,7 +88,7 @@ struct Join<'a> {
     open: &'a mut [f64],
 }
 
-impl lanes::Kernel for Join<'_> {
+impl simd::Kernel for Join<'_> {
     type Output = ();
 
     #[inline(always)]
@@ -248,7 +248,7 @@ impl Division {
                     let mut solved = [0.0; BLOCK];
                     solved[..hi - lo].copy_from_slice(&self.rest[j][lo..hi]);
                     let open = &mut self.rest[i][hi..end];
-                    lanes::widest(Join { series: a, solved: &solved[..hi - lo], open });
+                    simd::widest(Join { series: a, solved: &solved[..hi - lo], open });
                 }
             }
             return;
@@ -292,7 +292,7 @@ impl Division {
         let n = self.n;
         if n == 1 {
             let (divisor, block) = (series(0, 0, hi - lo), &mut self.rest[0][lo..hi]);
-            lanes::widest(Substitution { divisor, inverse: inverse[0], block });
+            simd::widest(Substitution { divisor, inverse: inverse[0], block });
             return;
         }
         let mut values = vec![0.0; n];

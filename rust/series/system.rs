@@ -1,10 +1,11 @@
 //! Quotients of series, and systems of series solved for one right-hand side or for many.
 
+use std::borrow::Cow;
+
 use super::division::Division;
 use super::product::Kernel;
 use crate::error::{check_length, Error, Result};
-use crate::small;
-use std::borrow::Cow;
+use crate::linalg::small;
 
 /// Quotient mod z^m, m the numerator's length; exact whether or not the divisor is stable. O(m log² m).
 ///
@@ -18,7 +19,7 @@ pub fn divide(numerator: &[f64], divisor: &[f64]) -> Result<Vec<f64>> {
 /// 1 over a series, mod z^m; not finite where it starts with zero. O(m log² m).
 ///
 /// ```
-/// assert_eq!(ftlm::series::reciprocal(&[1.0, -1.0, 0.0]), [1.0, 1.0, 1.0]);
+/// assert_eq!(ftlm::series::system::reciprocal(&[1.0, -1.0, 0.0]), [1.0, 1.0, 1.0]);
 /// ```
 #[must_use]
 pub fn reciprocal(series: &[f64]) -> Vec<f64> {

@@ -1,10 +1,13 @@
 //! Haar coordinates and operational matrices: orthogonality, and the fast paths against the dense ones.
 
 use ftlm::error::Error;
-use ftlm::kernels::block_pulse_kernel;
-use ftlm::search::threads::pool;
+use ftlm::fractional::haar;
+use ftlm::fractional::kernels::block_pulse_kernel;
+use ftlm::fractional::operational_matrices;
+use ftlm::linalg::dense;
+use ftlm::series;
 use ftlm::stop::Stop;
-use ftlm::{dense, haar, operational, series};
+use ftlm::threads::pool;
 use proptest::prelude::*;
 
 use crate::common::{cases, check, distance, largest, norm, toeplitz, Random};
@@ -57,8 +60,8 @@ fn lengths_that_are_no_power_of_two_are_named_with_their_neighbours() {
         assert_eq!(haar::inverse(&mut x), Err(error.clone()));
         assert!(x.iter().all(|&v| v == 1.0), "a refused signal is left as it was");
         assert_eq!(haar::matrix(m), Err(error.clone()));
-        assert_eq!(operational::operational_matrix(0.5, m, 0.1), Err(error.clone()));
-        assert_eq!(operational::operational_matrix_dense(0.5, m, 0.1), Err(error));
+        assert_eq!(operational_matrices::operational_matrix(0.5, m, 0.1), Err(error.clone()));
+        assert_eq!(operational_matrices::operational_matrix_dense(0.5, m, 0.1), Err(error));
     }
     let message = haar::check_power_of_two(12).unwrap_err().to_string();
     assert_eq!(
@@ -75,7 +78,7 @@ fn the_matrix_of_block_pulses_is_the_kernel() {
     let mut random = Random::new(21);
     let (m, step) = (100, 0.05);
     for eta in [0.0, 0.4, 1.0, 1.7, 3.0] {
-        let f = operational::block_pulse_matrix(eta, m, step).unwrap();
+        let f = operational_matrices::block_pulse_matrix(eta, m, step).unwrap();
         let transposed = toeplitz(&block_pulse_kernel(eta, m, step));
         let mut worst = 0.0_f64;
         for i in 0..m {
@@ -96,8 +99,8 @@ fn the_fast_operational_matrix_is_the_dense_one() {
     let mut worst = 0.0_f64;
     for m in [1, 2, 4, 32, 64, 256, 512] {
         for eta in [0.0, 0.15, 0.5, 1.0, 1.85, 2.2, 3.0] {
-            let fast = operational::operational_matrix(eta, m, 1.0 / m as f64).unwrap();
-            let dense = operational::operational_matrix_dense(eta, m, 1.0 / m as f64).unwrap();
+            let fast = operational_matrices::operational_matrix(eta, m, 1.0 / m as f64).unwrap();
+            let dense = operational_matrices::operational_matrix_dense(eta, m, 1.0 / m as f64).unwrap();
             worst = worst.max(distance(&fast, &dense) / largest(&dense));
         }
     }
@@ -108,13 +111,13 @@ fn the_fast_operational_matrix_is_the_dense_one() {
 fn the_operational_matrix_integrates_haar_coefficients() {
     // P of order 1 over unit time as the literature prints it, for two wavelets.
     let printed = [0.5, -0.25, 0.25, 0.0];
-    assert!(distance(&operational::operational_matrix(1.0, 2, 0.5).unwrap(), &printed) < 1e-15);
+    assert!(distance(&operational_matrices::operational_matrix(1.0, 2, 0.5).unwrap(), &printed) < 1e-15);
     let mut random = Random::new(22);
     let (m, step, eta) = (256, 0.02, 0.85);
     let f = random.signal(m);
     let mut coefficients = f.clone();
     haar::transform(&mut coefficients).unwrap();
-    let p = operational::operational_matrix(eta, m, step).unwrap();
+    let p = operational_matrices::operational_matrix(eta, m, step).unwrap();
     let by_matrix = dense::multiply(&coefficients, &p, 1, m, m);
     let mut by_series = series::multiply(&block_pulse_kernel(eta, m, step), &f, m);
     haar::transform(&mut by_series).unwrap();
@@ -125,9 +128,9 @@ fn the_operational_matrix_integrates_haar_coefficients() {
 fn operational_matrices_refuse_bad_arguments() {
     for (eta, step) in [(-0.1, 0.1), (10.1, 0.1), (f64::NAN, 0.1), (0.5, 0.0), (0.5, -1.0), (0.5, f64::INFINITY)] {
         for made in [
-            operational::block_pulse_matrix(eta, 8, step),
-            operational::operational_matrix(eta, 8, step),
-            operational::operational_matrix_dense(eta, 8, step),
+            operational_matrices::block_pulse_matrix(eta, 8, step),
+            operational_matrices::operational_matrix(eta, 8, step),
+            operational_matrices::operational_matrix_dense(eta, 8, step),
         ] {
             assert!(matches!(made, Err(Error::OutOfRange { .. })), "eta {eta}, step {step}");
         }

@@ -1,14 +1,14 @@
 //! The end of a joint fit: against figures of an independent implementation in NumPy, other starts that take over, and stops.
 
-use ftlm::colour;
 use ftlm::equation::{AffineOrder, Initial};
 use ftlm::error::Error;
-use ftlm::estimate::joint::covariance::long_run;
-use ftlm::estimate::joint::{
+use ftlm::estimation::joint_fit::covariance::long_run;
+use ftlm::estimation::joint_fit::{
     freed, refined, settled, Grid, Loss, Optimum, Place, Problem, Sampled, Sampling, Signal, Source, Weights,
 };
-use ftlm::estimate::output_error::{Coordinate, FreeEquation, FreeModel, Monomial, Point};
-use ftlm::means::Intersample;
+use ftlm::estimation::output_error::{Coordinate, FreeEquation, FreeModel, Monomial, Point};
+use ftlm::signal::block_pulse::Intersample;
+use ftlm::signal::colour;
 use ftlm::stop::Stop;
 use serde_json::Value;
 

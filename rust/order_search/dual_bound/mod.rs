@@ -1,0 +1,14 @@
+//! What is proved of a candidate's output error from a few inner products with test vectors, without running it.
+
+pub(crate) mod infeasibility;
+pub(crate) mod linearized_vectors;
+mod losses;
+pub mod lower_bound;
+pub(crate) mod probes;
+pub(crate) mod tailored_vectors;
+mod test_vectors;
+pub(crate) mod unstable_zeros;
+
+pub use linearized_vectors::excluded_along;
+pub use lower_bound::{excluded_by, excluded_in_turn, lower_bounds, out_of_reach};
+pub use unstable_zeros::explodes;

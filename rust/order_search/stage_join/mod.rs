@@ -1,0 +1,11 @@
+//! Order search over all equations of a stage under its order law, by joining the equations' score tables on the law.
+
+mod best_first;
+mod join;
+mod known;
+mod orders;
+mod sums;
+mod tuples;
+
+pub use best_first::{search, Course, Stage, StageOutcome, StageRow};
+pub use known::Span;
