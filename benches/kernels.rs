@@ -5,7 +5,6 @@ use std::time::Duration;
 
 use criterion::{criterion_group, criterion_main, BatchSize, BenchmarkId, Criterion, SamplingMode, Throughput};
 use ftlm::equation::{Equation, Initial, Structure, Term};
-use ftlm::fractional::haar;
 use ftlm::fractional::kernels::{block_pulse_kernel, kernel_with_derivative};
 use ftlm::fractional::operational_matrices;
 use ftlm::order_search::batches::search;
@@ -78,7 +77,7 @@ fn haar_transform(c: &mut Criterion) {
         let signal = noise(m, 3);
         group.throughput(Throughput::Elements(m as u64));
         group.bench_with_input(BenchmarkId::new("transform", m), &m, |b, _| {
-            b.iter_batched_ref(|| signal.clone(), |x| haar::transform(x), BatchSize::LargeInput);
+            b.iter_batched_ref(|| signal.clone(), |x| operational_matrices::transform(x), BatchSize::LargeInput);
         });
     }
     group.finish();

@@ -11,10 +11,9 @@ use std::time::Instant;
 use ftlm::equation::{Equation, Initial, Structure, Term};
 use ftlm::estimation::joint_fit::fit;
 use ftlm::estimation::joint_fit::initial_guesses::Lattices;
-use ftlm::estimation::joint_fit::order::Order;
 use ftlm::estimation::joint_fit::parameter_set::Free;
 use ftlm::estimation::joint_fit::structure::{
-    Coefficient, Equation as FreeEquation, Structure as FreeStructure, Term as FreeTerm,
+    Coefficient, Equation as FreeEquation, Order, Structure as FreeStructure, Term as FreeTerm,
 };
 use ftlm::estimation::joint_fit::{Loss, Outset, Sampled, Settings, Signal, Size, Sought};
 use ftlm::estimation::least_squares;
@@ -26,12 +25,11 @@ use ftlm::order_search::certificate::{certify, Asked, Range, Region};
 use ftlm::order_search::control::Control;
 use ftlm::order_search::grid::{Lattice, TermAxis};
 use ftlm::order_search::options::{Criterion, Estimator, Norm, Options};
+use ftlm::parallel::{pool, Stop};
 use ftlm::regressors::Record;
 use ftlm::series::{self, Buffers, Division, Kernel};
 use ftlm::signal::block_pulse::Intersample;
 use ftlm::simulate;
-use ftlm::stop::Stop;
-use ftlm::threads::pool;
 
 /// Processor seconds of this thread where the system tells them; right to a few milliseconds.
 fn processor() -> Option<f64> {

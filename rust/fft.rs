@@ -12,7 +12,7 @@ use realfft::{ComplexToReal, RealFftPlanner, RealToComplex};
 
 pub use realfft::num_complex::Complex;
 
-use crate::shared::Shared;
+use crate::parallel::Shared;
 
 /// One complex number of a spectrum.
 pub type Bin = Complex<f64>;

@@ -46,7 +46,7 @@
 #![cfg_attr(docsrs, feature(doc_cfg))]
 
 pub mod error;
-mod parallel;
+pub mod parallel;
 
 pub mod fft;
 pub mod linalg;
@@ -71,9 +71,3 @@ pub mod rig;
 
 #[cfg(feature = "python")]
 mod python;
-
-mod impulses;
-pub mod regularity;
-mod shared;
-pub mod stop;
-pub mod threads;

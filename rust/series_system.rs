@@ -2,9 +2,8 @@
 
 use crate::equation::Equation;
 use crate::error::{check_length, Error, Result};
-use crate::fractional::excess::kernel;
-use crate::impulses::is_impulse;
-use crate::regressors::Record;
+use crate::fractional::kernels::kernel;
+use crate::regressors::{is_impulse, Record};
 use crate::series::{self, Buffers, Kernel, SumOfProducts};
 
 /// The series system A y = b of some equations: their outputs are unknown, every other signal is read from the record.

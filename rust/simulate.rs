@@ -1,12 +1,10 @@
 //! Response of an equation and of a coupled model, the two errors of a model, and the explicit Euler baseline.
 
-use crate::equation::{Equation, Initial, Structure, ORDER_GRAIN};
+use crate::equation::{check_regular, Equation, Initial, Structure, ORDER_GRAIN};
 use crate::error::{check_finite, check_length, check_step, Error, Result};
 use crate::estimation::least_squares;
-use crate::fractional::excess::kernel;
-use crate::impulses::is_impulse;
-use crate::regressors::Record;
-use crate::regularity::check_regular;
+use crate::fractional::kernels::kernel;
+use crate::regressors::{is_impulse, Record};
 use crate::series;
 use crate::series_system::System;
 

@@ -8,7 +8,7 @@
 use crate::equation::{Initial, Structure};
 use crate::error::{Error, Result};
 use crate::estimation::least_squares::{self, Estimate, Regression};
-use crate::fractional::haar;
+use crate::fractional::operational_matrices;
 use crate::linalg::small::Recursion;
 use crate::regressors::Record;
 
@@ -166,7 +166,7 @@ fn rows(
     if innovation.rows == Rows::Haar {
         for series in regression.columns.iter_mut().chain(std::iter::once(&mut regression.target)) {
             for pair in regression.starts.windows(2) {
-                haar::transform(&mut series[pair[0]..pair[1]])?;
+                operational_matrices::transform(&mut series[pair[0]..pair[1]])?;
             }
         }
     }

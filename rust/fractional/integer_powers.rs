@@ -4,7 +4,7 @@ use std::cell::RefCell;
 use std::sync::Arc;
 use std::thread::LocalKey;
 
-use crate::shared::Shared;
+use crate::parallel::Shared;
 
 /// `n^exponent` for n = 0 … m−1. Powers are multiplicative: only primes cost a power, everything else one product, so
 /// the relative error grows by half an ε per prime factor, of which n < 2^20 has at most 19.

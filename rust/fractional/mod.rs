@@ -1,8 +1,6 @@
 //! Fractional integrals and derivatives: kernels, operational matrices, and memory in bounded space.
 
-pub mod excess;
 pub mod exponential_sum;
-pub mod haar;
 mod integer_powers;
 pub mod integral;
 pub mod kernels;

@@ -8,19 +8,15 @@
 //! ([`crate::fractional::kernels::block_pulse_kernel`]). So a body feels at once what carries it, friction of the pulse
 //! included.
 
-use super::contact::{is_p_matrix, Rubbing};
-use super::convolution::Heads;
+use super::contact::{is_p_matrix, March, Rubbing, Trace};
+use super::convolution::{product, Driver, Heads, Integrated};
 use super::initial_state::{Forcing, Link};
-use super::integrals::{product, Driver, Integrated};
 use super::law::Law;
-use super::march::{March, Trace};
-use crate::equation::{Equation, Initial, ORDER_GRAIN};
+use crate::equation::{check_regular, Equation, Initial, ORDER_GRAIN};
 use crate::error::{check_finite, check_length, Error, Result};
-use crate::fractional::excess::{kernel_and_slope, MAX_EXCESS};
-use crate::impulses::{add_impulses, parted};
+use crate::fractional::kernels::{kernel_and_slope, MAX_EXCESS};
 use crate::linalg::small;
-use crate::regressors::Record;
-use crate::regularity::check_regular;
+use crate::regressors::{add_impulses, parted, Record};
 use crate::series::{self, Kernel, Solver};
 
 /// Equations that follow each other's outputs, some of them with friction of their own output's velocity.

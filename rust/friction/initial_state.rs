@@ -1,12 +1,11 @@
 //! What a run starts with, and the constants on its right-hand sides, as powers of t that drive outputs and velocities.
 
-use super::integrals::Integrated;
+use super::convolution::Integrated;
 use crate::equation::{Equation, Initial, ORDER_GRAIN};
 use crate::error::{Error, Result};
-use crate::fractional::excess::kernel;
-use crate::fractional::kernels::power_means;
-use crate::impulses::is_impulse;
+use crate::fractional::kernels::{kernel, power_means};
 use crate::linalg::small;
+use crate::regressors::is_impulse;
 
 /// A term of an output that is followed.
 #[derive(Debug, Clone, Copy, PartialEq)]

@@ -3,7 +3,7 @@
 //! D^α y = Σ c D^ν s − F(Dy) sgn(Dy) + … with 1 < α ≤ 2, sgn set-valued at rest and F(v) = fc + fs exp(−(v/vs)²)
 //! ([`law`]). Everything but friction is linear, so superposition leaves one number a pulse and body that may stick: the
 //! velocity at the edges of the pulses is V = L − g ∗ φ with φ ∈ F(V) sgn(V), L the velocity without friction and g what a
-//! pulse of force does to it, both of the coupled equations ([`dynamics`]). It is marched pulse by pulse ([`march`]), the
+//! pulse of force does to it, both of the coupled equations ([`dynamics`]). It is marched pulse by pulse, the
 //! frictions of several bodies decided together ([`contact`]), the sum over the past by blocked transforms
 //! ([`convolution`]). A body at rest stays exactly at rest while friction can hold it.
 //!
@@ -15,9 +15,7 @@ pub mod convolution;
 pub mod dynamics;
 pub mod fit;
 mod initial_state;
-mod integrals;
 pub mod law;
-pub mod march;
 mod model;
 
 pub use dynamics::{Body, Motion};

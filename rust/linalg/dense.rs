@@ -4,8 +4,7 @@ use faer::linalg::matmul::matmul;
 use faer::{Accum, Mat, MatRef, Par};
 
 use crate::linalg::orthogonal;
-use crate::parallel;
-use crate::stop::Stop;
+use crate::parallel::{self, Stop};
 
 /// Rows over which one product of long columns is summed, at least, and into how many such parts their rows are cut at
 /// most; the parts do not depend on the threads, nor do their sums.

@@ -1,9 +1,8 @@
 //! Long columns against one another: orthonormal bases, projections, triangular factors, in the widest vectors at hand.
 
 use crate::error::Result;
-use crate::parallel;
+use crate::parallel::{self, Stop};
 use crate::simd::{dot, widest, Kernel};
-use crate::stop::Stop;
 
 /// Rows that are taken into a triangular factor at a time: what fits a cache.
 const ROWS: usize = 1 << 10;

@@ -4,15 +4,14 @@ use std::borrow::Cow;
 
 use crate::equation::Initial;
 use crate::error::{check_length, Result};
-use crate::order_search::budget::Budget;
 use crate::order_search::candidate::columns::Needed;
 use crate::order_search::candidate::problem::Problem;
 use crate::order_search::dual_bound::lower_bound::Bound;
 use crate::order_search::grid::independent::Lattice;
 use crate::order_search::grid::traversal::Cursor;
-use crate::order_search::options::Options;
+use crate::order_search::options::{Budget, Options};
+use crate::parallel::Stop;
 use crate::regressors::Record;
-use crate::stop::Stop;
 
 /// All candidates of a lattice over one equation, and what they share.
 pub(crate) struct Catalogue<'a> {

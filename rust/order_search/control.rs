@@ -5,7 +5,7 @@ use std::sync::{Mutex, PoisonError};
 
 use crate::error::{Error, Result};
 use crate::order_search::result::Part;
-use crate::stop::Stop;
+use crate::parallel::Stop;
 
 /// Shared with the caller while a search runs: any thread may read the counters, stop the search, take its checkpoints.
 #[derive(Debug, Default)]

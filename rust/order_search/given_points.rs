@@ -11,8 +11,8 @@ use crate::order_search::candidate::simulation::March;
 use crate::order_search::control::Control;
 use crate::order_search::options::Norm;
 use crate::order_search::result::Verdict;
+use crate::parallel::{pool, PerThread};
 use crate::regressors::{Key, Record};
-use crate::threads::{pool, PerThread};
 
 /// Memory for regressors kept from one call to the next; a population that has settled asks for the same ones again.
 const KEPT_BYTES: usize = 256 << 20;

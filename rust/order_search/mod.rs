@@ -5,7 +5,6 @@
 
 pub mod batches;
 pub mod branch_and_bound;
-mod budget;
 mod candidate;
 mod candidate_index;
 pub mod certificate;

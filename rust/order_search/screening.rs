@@ -1,16 +1,13 @@
 //! Screening: coefficients of candidates side by side, and those left open that no proved lower bound excludes.
 
-use crate::order_search::candidate::columns_part::{part_of, Columns};
-use crate::order_search::candidate::normal_equations::Solve;
+use crate::order_search::candidate::columns::{part_of, Columns};
+use crate::order_search::candidate::normal_equations::{Solve, Squares};
 use crate::order_search::candidate::problem::Problem;
 use crate::order_search::candidate::row_bound::Shared;
-use crate::order_search::candidate::squares::Squares;
 use crate::order_search::candidate_index::Catalogue;
 use crate::order_search::dual_bound::linearized_vectors::Held;
 use crate::order_search::dual_bound::tailored_vectors::Memory;
-use crate::order_search::grid::slab::Slab;
-use crate::order_search::grid::spread::spread;
-use crate::order_search::grid::traversal::Cursor;
+use crate::order_search::grid::traversal::{spread, Cursor, Slab};
 use crate::simd::{self, WIDTH};
 
 /// A candidate that its bound has not excluded.

@@ -4,9 +4,10 @@ use numpy::{PyArray1, PyArray2, PyReadonlyArray1, PyReadonlyArray2};
 use pyo3::prelude::*;
 use pyo3::types::PyDict;
 
-use super::convert::{initial, record, records, rows, stacked, structure, vector, InitialArg, RecordArg, StructureArg};
+use super::convert::{
+    initial, nested, record, records, rows, stacked, structure, vector, InitialArg, List, RecordArg, StructureArg,
+};
 use super::errors::{attached, detached};
-use super::lists::{nested, List};
 use crate::equation::{AffineOrder, Initial};
 use crate::error::{check_finite, check_length, Error};
 use crate::estimation::instrumental_variables as instruments;
@@ -17,7 +18,7 @@ use crate::estimation::resonance_scan;
 use crate::estimation::streaming::Streaming as StreamingFit;
 use crate::python::order_search::watch::{leavable, Stop};
 use crate::regressors::Record;
-use crate::signal::readings::{Jumps, Readings};
+use crate::signal::block_pulse::{Jumps, Readings};
 
 /// (coefficients, initial terms per record, exponents, dropped (record, position) pairs).
 pub type EstimateTuple = (Vec<f64>, Vec<Vec<f64>>, Vec<f64>, Vec<(usize, usize)>);

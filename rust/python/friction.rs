@@ -4,16 +4,15 @@ use numpy::{PyArray1, PyArray2};
 use pyo3::prelude::*;
 use pyo3::types::PyDict;
 
-use super::convert::{initial, record, stacked, structure, InitialArg, RecordArg, StructureArg};
+use super::convert::{initial, nested, record, stacked, structure, InitialArg, List, RecordArg, StructureArg};
 use super::estimation::{
     coordinates, evaluated, experiment, free_equation, free_inputs, status, ExperimentArg, FreeEquationArg,
     FreeInputArg, MonomialArg,
 };
-use super::lists::{nested, List};
 use crate::equation::Equation;
 use crate::estimation::output_error as joint;
+use crate::friction::contact::Trace;
 use crate::friction::law::Phase;
-use crate::friction::march::Trace;
 use crate::friction::{self, Body, FreeLaw, FrictionModel, Law, Start};
 use crate::python::order_search::watch::{leavable, Stop};
 

@@ -2,12 +2,10 @@
 //! call that computes.
 
 mod convert;
-mod dense;
 mod errors;
 mod estimation;
 mod friction;
 mod joint_fit;
-mod lists;
 mod operators;
 mod order_search;
 mod simulation;
@@ -28,7 +26,7 @@ mod _core {
     };
 
     #[pymodule_export]
-    use crate::python::dense::{singular, triangle};
+    use crate::python::operators::{singular, triangle};
 
     #[pymodule_export]
     use crate::python::estimation::{

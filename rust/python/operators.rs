@@ -1,17 +1,18 @@
 //! Kernels, transforms, matrices, fractional integrals and derivatives, pulse means.
+//!
+//! Factors of tall matrices, given by their columns as rows of an array.
 
 use numpy::{PyArray1, PyArray2, PyReadonlyArray1, PyReadonlyArray2};
 use pyo3::prelude::*;
 
-use super::convert::{columns, copied, matrix, rows, stacked, vector};
+use super::convert::{columns, copied, matrix, rows, stacked, vector, List};
 use super::errors::detached;
-use super::lists::List;
 use crate::equation::Filter;
 use crate::error::{check_dense, check_finite, check_length, check_points, check_step, Error};
-use crate::fractional::haar;
 use crate::fractional::integral::{self, Derivative, IntegralRule};
 use crate::fractional::kernels;
 use crate::fractional::operational_matrices;
+use crate::linalg::dense;
 use crate::python::order_search::watch::leavable;
 use crate::series;
 use crate::signal::block_pulse::{self, Intersample};
@@ -50,12 +51,12 @@ pub fn grunwald_letnikov_weights(py: Python<'_>, order: f64, m: usize) -> PyResu
 
 #[pyfunction]
 pub fn haar_transform<'py>(py: Python<'py>, x: PyReadonlyArray2<'py, f64>) -> PyResult<Matrix<'py>> {
-    transformed(py, &x, haar::transform)
+    transformed(py, &x, operational_matrices::transform)
 }
 
 #[pyfunction]
 pub fn haar_inverse<'py>(py: Python<'py>, x: PyReadonlyArray2<'py, f64>) -> PyResult<Matrix<'py>> {
-    transformed(py, &x, haar::inverse)
+    transformed(py, &x, operational_matrices::inverse)
 }
 
 fn transformed<'py>(
@@ -78,7 +79,7 @@ fn transformed<'py>(
 pub fn haar_matrix(py: Python<'_>, m: usize) -> PyResult<Matrix<'_>> {
     let values = detached(py, || {
         check_dense(m)?;
-        haar::matrix(m)
+        operational_matrices::matrix(m)
     })?;
     matrix(py, values, m)
 }
@@ -241,4 +242,36 @@ pub fn filter_series(
 ) -> PyResult<Array<'_>> {
     let filter = Filter { numerator: numerator.into(), denominator: denominator.into() };
     Ok(PyArray1::from_vec(py, detached(py, || filter.series(m, step))?))
+}
+
+fn finite(array: &PyReadonlyArray2<'_, f64>) -> PyResult<Vec<Vec<f64>>> {
+    let given = rows(array)?;
+    for column in &given {
+        check_finite("a column", column)?;
+    }
+    Ok(given)
+}
+
+#[pyfunction]
+pub fn triangle<'py>(py: Python<'py>, given: PyReadonlyArray2<'py, f64>) -> PyResult<Matrix<'py>> {
+    let tall = finite(&given)?;
+    let count = tall.len();
+    let factor = leavable(py, columns(&given), None, move |_| Ok(dense::triangular_factor(&tall)))?;
+    matrix(py, factor, count)
+}
+
+#[pyfunction]
+#[allow(clippy::type_complexity)]
+pub fn singular<'py>(
+    py: Python<'py>,
+    given: PyReadonlyArray2<'py, f64>,
+) -> PyResult<(Matrix<'py>, Bound<'py, PyArray1<f64>>, Matrix<'py>)> {
+    let tall = finite(&given)?;
+    let found = leavable(py, columns(&given), None, move |_| {
+        dense::singular(&tall).ok_or_else(|| Error::Structure {
+            what: "singular values are not found".into(),
+            remedy: "scale the columns".into(),
+        })
+    })?;
+    Ok((stacked(py, &found.left)?, PyArray1::from_vec(py, found.sizes), stacked(py, &found.right)?))
 }

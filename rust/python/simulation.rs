@@ -4,14 +4,13 @@ use numpy::{PyArray1, PyArray2, PyReadonlyArray1, PyReadonlyArray2};
 use pyo3::prelude::*;
 
 use super::convert::{
-    copied, equations, initial, record, rows, stacked, structure, vector, EquationArg, InitialArg, RecordArg,
-    StructureArg,
+    copied, equations, initial, nested, record, rows, stacked, structure, vector, EquationArg, InitialArg, List,
+    RecordArg, StructureArg,
 };
 use super::errors::detached;
 use super::estimation::jumps_near;
-use super::lists::{nested, List};
 use crate::python::order_search::watch::leavable;
-use crate::signal::readings::Readings;
+use crate::signal::block_pulse::Readings;
 use crate::simulate::{self, OutputFilter};
 
 #[pyfunction]

@@ -3,9 +3,8 @@
 use numpy::{PyArray1, PyArray2, PyReadonlyArray1, PyReadonlyArray2, PyUntypedArrayMethods};
 use pyo3::prelude::*;
 
-use super::convert::{equations, stacked, vector, EquationArg};
+use super::convert::{equations, stacked, vector, EquationArg, List};
 use super::errors::{attached, detached};
-use super::lists::List;
 use crate::error::{check_length, Error};
 use crate::fractional::exponential_sum::integral_by_memory;
 use crate::rig::arm_model::{Arm, Parameters, SIGNALS};

@@ -11,12 +11,11 @@
 //! any value up to its limit at standstill, by the law of a pulse of [`crate::friction::law`] for each of two hubs that
 //! feel each other.
 
-use crate::equation::{tidy, Equation, ORDER_GRAIN};
+use crate::equation::{check_regular, tidy, Equation, ORDER_GRAIN};
 use crate::error::{check_length, check_step, Error, Result};
 use crate::fractional::exponential_sum::{decay, Rates};
 use crate::friction::law::{pulse, Phase};
 use crate::linalg::small;
-use crate::regularity::check_regular;
 
 /// Accuracy of the memory's kernels: far below what the trapezoidal steps leave.
 const MEMORY_TOLERANCE: f64 = 1e-10;

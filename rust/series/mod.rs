@@ -2,7 +2,7 @@
 //!
 //! A causal operator on pulse means is a polynomial in the delay z cut off at z^m; the fractional integral F^η is one of
 //! them. All such operators commute. Products ([`product`]) are convolutions by FFT, quotients ([`division`]) forward
-//! substitution in blocks joined by FFT products; [`system`] solves several unknown series at once. Where all orders are
+//! substitution in blocks joined by FFT products; [`solve`] solves several unknown series at once. Where all orders are
 //! whole, [`mod@running_sums`] does the same by running sums.
 //!
 //! ```
@@ -21,11 +21,9 @@ pub mod division;
 pub mod naive;
 pub mod product;
 pub mod running_sums;
-pub mod system;
 
-pub use division::{Division, BLOCK};
+pub use division::{divide, reciprocal, solve, Division, Solver, BLOCK};
 #[cfg(feature = "oracles")]
 pub use naive::{divide_naive, multiply_naive};
 pub use product::{multiply, Buffers, Kernel, SumOfProducts};
 pub use running_sums::{running_sums, Recursion, Source, ABREAST, MAX_SUMS};
-pub use system::{divide, reciprocal, solve, Solver};

@@ -94,7 +94,7 @@ impl Recursion {
             for (l, weight) in running_sums(order, step).iter().enumerate() {
                 own[(i * (sums + 1) + l) * n + j] += c * weight;
             }
-            leading[i * n + j] -= c * crate::fractional::excess::first(whole(order), step);
+            leading[i * n + j] -= c * crate::fractional::kernels::first(whole(order), step);
         }
         Ok(Self { n, sums, step, own, inverse: small::inverse(&leading, n)? })
     }

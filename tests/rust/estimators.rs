@@ -5,13 +5,13 @@ use ftlm::equation::{Initial, Structure};
 use ftlm::error::Error;
 use ftlm::estimation::least_squares::{self, Regression};
 use ftlm::estimation::multi_innovation::{closed_form, recursion, Innovation, Rows};
-use ftlm::fractional::haar;
+use ftlm::fractional::operational_matrices;
 use ftlm::linalg::small::{self, packed};
+use ftlm::parallel::pool;
 use ftlm::regressors::{Bank, Index, Key, Record, BANK_LIMIT};
 use ftlm::series;
 use ftlm::simd::{self, WIDTH};
 use ftlm::simulate;
-use ftlm::threads::pool;
 use proptest::prelude::*;
 
 use crate::common::{
@@ -216,7 +216,7 @@ fn least_squares_is_the_same_in_haar_coordinates() {
         let time = least_squares::fit(std::slice::from_ref(&record), &model.structure, &FREE, &Initial::Rest).unwrap();
         let mut regression = Regression::new(&[record], &model.structure, &FREE, &Initial::Rest).unwrap();
         for series in regression.columns.iter_mut().chain([&mut regression.target]) {
-            haar::transform(series).unwrap();
+            operational_matrices::transform(series).unwrap();
         }
         let (coefficients, _) = least_squares::solve(&regression.columns, &regression.target, 4).unwrap();
         check("Haar against block pulses", relative_distance(&coefficients, &time.coefficients), 1e-11);
@@ -273,7 +273,7 @@ fn the_recursion_is_the_published_one() {
             let mut regression = Regression::new(records, &model.structure, &FREE, &Initial::Rest).unwrap();
             if rows == Rows::Haar {
                 for series in regression.columns.iter_mut().chain([&mut regression.target]) {
-                    haar::transform(series).unwrap();
+                    operational_matrices::transform(series).unwrap();
                 }
             }
             let oracle = published(&regression.columns, &regression.target, length, 10.0);
@@ -336,7 +336,7 @@ fn every_row_weighs_as_often_as_it_is_used() {
             let mut regression = Regression::new(records, &model.structure, &FREE, &Initial::Rest).unwrap();
             if rows == Rows::Haar {
                 for series in regression.columns.iter_mut().chain([&mut regression.target]) {
-                    haar::transform(series).unwrap();
+                    operational_matrices::transform(series).unwrap();
                 }
             }
             let weighted =

@@ -3,10 +3,9 @@
 use ftlm::equation::{AffineOrder, Equation, Initial, Structure, Term};
 use ftlm::error::Error;
 use ftlm::estimation::output_error::{Coordinate, Experiment, FreeEquation, Monomial, Settings};
-use ftlm::friction::contact::{is_p_matrix, Rubbing};
+use ftlm::friction::contact::{is_p_matrix, March, Rubbing, Trace};
 use ftlm::friction::convolution::{Heads, Online};
 use ftlm::friction::law::{Moves, Phase};
-use ftlm::friction::march::{March, Trace};
 use ftlm::friction::{fit, Body, FreeLaw, FrictionModel, Law, Start};
 use ftlm::regressors::Record;
 

@@ -12,10 +12,10 @@ use ftlm::order_search::batches::search;
 use ftlm::order_search::control::Control;
 use ftlm::order_search::grid::{Lattice, TermAxis};
 use ftlm::order_search::options::{Criterion, Estimator, Norm, Options};
+use ftlm::parallel::Stop;
 use ftlm::regressors::Record;
 use ftlm::series::{divide_naive, multiply_naive, Kernel};
 use ftlm::simulate;
-use ftlm::stop::Stop;
 
 use crate::common::{
     check, dense_solve, deviation, distance, equation, largest, norm, record, relative_distance, with_signal, Random,

@@ -3,7 +3,7 @@
 use ftlm::error::Error;
 use ftlm::fractional::kernels::block_pulse_kernel;
 use ftlm::series;
-use ftlm::signal::readings::Readings;
+use ftlm::signal::block_pulse::Readings;
 use proptest::prelude::*;
 
 use crate::common::{cases, check, Random};

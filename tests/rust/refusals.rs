@@ -8,7 +8,6 @@ use ftlm::estimation::output_error::Experiment;
 use ftlm::estimation::streaming::Streaming;
 use ftlm::fft;
 use ftlm::fractional::exponential_sum::{integral_by_memory, Rates};
-use ftlm::fractional::haar;
 use ftlm::fractional::kernels::digamma;
 use ftlm::fractional::operational_matrices;
 use ftlm::linalg::small::{self, Recursion};
@@ -38,7 +37,7 @@ fn lengths_beyond_memory() {
         refused(check_dense(m));
         refused(pulse_means(&[0.0, 1.0], m, Intersample::Hold));
         refused(Filter { numerator: vec![(1.0, 0.0)], denominator: vec![(1.0, 1.0)] }.series(m, 0.1));
-        refused(haar::matrix(m));
+        refused(operational_matrices::matrix(m));
         refused(operational_matrices::block_pulse_matrix(0.5, m, 0.1));
         refused(operational_matrices::operational_matrix(0.5, m, 0.1));
     }

@@ -14,9 +14,9 @@ use ftlm::order_search::dual_bound::{excluded_by, lower_bounds, out_of_reach};
 use ftlm::order_search::grid::{Lattice, TermAxis, MAX_CANDIDATES};
 use ftlm::order_search::options::{Criterion, Estimator, Norm, Options};
 use ftlm::order_search::result::{Counts, Failure, Outcome};
+use ftlm::parallel::MAX_THREADS;
 use ftlm::regressors::Record;
 use ftlm::simulate::{equation_error, respond};
-use ftlm::threads::MAX_THREADS;
 use proptest::prelude::*;
 
 use crate::common::{bits, cases, check, equation, record, relative_distance, with_signal, Random};

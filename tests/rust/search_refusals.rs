@@ -11,8 +11,8 @@ use ftlm::order_search::grid::{Lattice, LawEquation, LawLattice, TermAxis};
 use ftlm::order_search::options::{Estimator, Options};
 use ftlm::order_search::result::{Counts, Failure, Part, Row, Verdict};
 use ftlm::order_search::stage_join::{self, Span, Stage};
+use ftlm::parallel::{pool, MAX_THREADS};
 use ftlm::regressors::{Bank, Index, Key, Record};
-use ftlm::threads::{pool, MAX_THREADS};
 
 use crate::common::Random;
 

@@ -5,19 +5,18 @@ use std::f64::consts::PI;
 use ftlm::equation::{self, Initial};
 use ftlm::error::{Error, Result};
 use ftlm::estimation::joint_fit::initial_guesses::{power_frequency, Lattices};
-use ftlm::estimation::joint_fit::order::Order;
 use ftlm::estimation::joint_fit::parameter_set::Free;
-use ftlm::estimation::joint_fit::structure::{Coefficient, Equation, Hints, Input, Structure, Term};
+use ftlm::estimation::joint_fit::structure::{Coefficient, Equation, Hints, Input, Order, Structure, Term};
 use ftlm::estimation::joint_fit::{Recordings, Runner, Sampled, Sampling, Signal, Source};
 use ftlm::estimation::output_error::{Experiment, FreeInput, InputLaw};
 use ftlm::order_search::batches::search;
 use ftlm::order_search::control::Control;
 use ftlm::order_search::grid::{Lattice, TermAxis};
 use ftlm::order_search::options::Options;
+use ftlm::parallel::Stop;
 use ftlm::regressors::{Record, BANK_LIMIT};
 use ftlm::signal::block_pulse::{delayed, point_samples, Intersample};
 use ftlm::simulate::respond;
-use ftlm::stop::Stop;
 
 use crate::common::{bits, check, deviation, Random};
 

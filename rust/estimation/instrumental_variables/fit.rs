@@ -1,7 +1,7 @@
 //! Equations refined from several starts, each by its own filter and then all of them together.
 //!
 //! All equations given are simulated together, from the signals that none of them has as its output; where those are
-//! measured outputs too, a clean substitute for them is asked for ([`super::projection::project`] makes one).
+//! measured outputs too, a clean substitute for them is asked for ([`super::prefilter::project`] makes one).
 
 use super::coupled;
 use super::prefilter::{damped_inverse, low_pass, power_frequency, unit};
@@ -67,7 +67,7 @@ pub struct Fit {
 /// use ftlm::estimation::instrumental_variables as iv;
 /// use ftlm::regressors::Record;
 /// use ftlm::simulate;
-/// use ftlm::stop::Stop;
+/// use ftlm::parallel::Stop;
 /// let terms = vec![Term { signal: 0, order: 0.5 }, Term { signal: 1, order: 0.0 }];
 /// let plant = Equation::new(Structure { output: 0, order: 1.5, terms }, vec![-4.0, 2.0])?;
 /// let input: Vec<f64> = (0..400).map(|k| if k % 100 < 50 { 1.0 } else { -1.0 }).collect();

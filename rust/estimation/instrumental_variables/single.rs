@@ -7,11 +7,11 @@ use super::prefilter::damped_inverse;
 use super::solution::{dot, long_run, orthonormal, unmoved, Instruments, Settings, Solution};
 use crate::equation::Structure;
 use crate::error::Result;
-use crate::fractional::excess;
+use crate::fractional::kernels;
 use crate::linalg::small::Scaled;
+use crate::parallel::Stop;
 use crate::regressors::Record;
 use crate::series::{multiply, Buffers, Kernel, SumOfProducts};
-use crate::stop::Stop;
 
 /// What a step reads of one record for one equation: spectra good for products of two series of m terms.
 pub struct Source<'a> {
@@ -62,7 +62,7 @@ impl<'a> Shelf<'a> {
     pub(super) fn new(record: &'a Record, structure: &Structure, exponents: &[f64]) -> Self {
         let term = |k: usize| {
             let (signal, eta) = (structure.terms[k].signal, structure.integration(k));
-            let kernel = excess::kernel(eta, record.m(), record.step());
+            let kernel = kernels::kernel(eta, record.m(), record.step());
             let spectrum = Kernel::new(&kernel);
             let measured = Kernel::new(&record.integral(signal, eta));
             Shelved { signal, eta, kernel, spectrum, measured }

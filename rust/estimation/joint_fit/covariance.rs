@@ -1,11 +1,10 @@
 //! The covariance that a joint fit's residuals leave.
 
-use super::attempt::Attempt;
 use super::objective::Grid;
+use super::problem::Attempt;
 use crate::error::{check_finite, check_length, Error, Result};
 use crate::linalg::dense;
-use crate::signal::colour::{coloured, covariances, weighted};
-use crate::signal::statistics::{inner, is_white, robust_deviation, sum, BEND, LAGS};
+use crate::signal::statistics::{coloured, covariances, inner, is_white, robust_deviation, sum, weighted, BEND, LAGS};
 
 /// Lags of the residuals' autocovariance that the robust covariance takes in, as a power of the sample count.
 const LAG_POWER: f64 = 1.0 / 3.0;

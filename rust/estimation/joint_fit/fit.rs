@@ -1,19 +1,17 @@
 //! One call from a structure, its runs and settings to a fit: starts, their race, weights, grids, the limit and its covariance.
 
-use super::attempt::{Attempt, Place};
 use super::multistart::{finalists, race, Course, Starts};
 use super::objective::{Grid, Weights, FINEST};
 use super::parameter_set::Free;
+use super::problem::{Attempt, Place, Runner};
 use super::progress::{Listener, Pace};
-use super::reweighting::Loss;
-use super::runner::Runner;
-use super::settled::{settled, LAST_LAP};
+use super::reweighting::{settled, Loss, LAST_LAP};
 use super::source::{Recordings, Sampling};
 use super::stability_preference::{steadied, Growth};
 use super::step_refinement::{refined, Finished, Optimum};
 use crate::error::{Error, Result};
+use crate::parallel::Stop;
 use crate::signal::statistics::{mean, median, robust_deviation};
-use crate::stop::Stop;
 
 /// Share of a fit's course at whose end the race is, and of what is left of that what each of its sweeps takes.
 const RACED: f64 = 0.5;
@@ -177,16 +175,15 @@ impl<'a> Sought<'a> {
 /// ```
 /// # fn main() -> ftlm::error::Result<()> {
 /// use ftlm::equation::Initial;
-/// use ftlm::estimation::joint_fit::structure::{Coefficient, Equation, Structure, Term};
+/// use ftlm::estimation::joint_fit::structure::{Coefficient, Equation, Order, Structure, Term};
 /// use ftlm::estimation::joint_fit::parameter_set::Free;
-/// use ftlm::estimation::joint_fit::order::Order;
 /// use ftlm::estimation::joint_fit::initial_guesses::Lattices;
 /// use ftlm::estimation::joint_fit::fit;
 /// use ftlm::estimation::joint_fit::reweighting::Loss;
 /// use ftlm::estimation::joint_fit::fit::{Outset, Settings, Size, Sought};
 /// use ftlm::estimation::joint_fit::source::{Sampled, Signal};
 /// use ftlm::signal::block_pulse::Intersample;
-/// use ftlm::stop::Stop;
+/// use ftlm::parallel::Stop;
 /// // y of D y = −2 y + 3 u in exact steps, and D^alpha y = a y + b u sought.
 /// let (step, mut y) = (0.05, vec![0.0]);
 /// let u: Vec<f64> = (0..200).map(|k| if k % 40 < 20 { 1.0 } else { -1.0 }).collect();

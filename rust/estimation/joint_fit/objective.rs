@@ -2,13 +2,12 @@
 
 use std::sync::Arc;
 
-use super::attempt::{Attempt, Place};
-use super::problem::Problem;
+use super::problem::{Attempt, Place, Problem};
 use super::source::{Sampling, Source};
 use crate::error::{check_length, Error, Result};
 use crate::estimation::output_error::{Experiment, Settings};
+use crate::parallel::Stop;
 use crate::signal::statistics::{mean, robust_deviation, root_mean_square};
-use crate::stop::Stop;
 
 /// A descent ends where a whole step would lower the cost by a smaller share than this.
 pub const TOLERANCE: f64 = 1e-9;
@@ -133,8 +132,8 @@ impl<'a> Grid<'a> {
 
     /// The unit of time of the runs.
     #[must_use]
-    pub fn clock(&self) -> super::clock::Clock {
-        super::clock::Clock::of(self.problem, &self.source.spans())
+    pub fn clock(&self) -> super::parameter_set::Clock {
+        super::parameter_set::Clock::of(self.problem, &self.source.spans())
     }
 
     /// Levenberg–Marquardt from a place.

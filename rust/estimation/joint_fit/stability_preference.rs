@@ -6,11 +6,10 @@
 
 use std::collections::BTreeMap;
 
-use super::attempt::Attempt;
 use super::multistart::{held as known_orders, Held};
 use super::objective::Grid;
 use super::parameter_set::Free;
-use super::runner::Runner;
+use super::problem::{Attempt, Runner};
 use super::structure::Coefficient;
 use crate::error::{Error, Result};
 use crate::signal::statistics::mean;
@@ -155,7 +154,7 @@ fn own_places(free: &Free) -> Vec<usize> {
     (0..free.coefficients.len()).filter(|&k| own.contains_key(&free.coefficients[k])).collect()
 }
 
-fn elsewhere(runner: &Runner, place: super::attempt::Place, words: &str) -> Runner {
+fn elsewhere(runner: &Runner, place: super::problem::Place, words: &str) -> Runner {
     let origin = format!("{}, {words}", runner.origin);
     Runner { origin, attempt: Attempt { place, ..runner.attempt.clone() }, ..runner.clone() }
 }

@@ -1,11 +1,10 @@
 //! Halving the step until that moves the estimate by little of its standard error.
 
-use super::attempt::{Attempt, Place};
-use super::clock::Clock;
 use super::covariance::covariance;
 use super::objective::{Grid, Weights, FINEST};
-use super::reweighting::{Loss, Robust};
-use super::settled::settled;
+use super::parameter_set::Clock;
+use super::problem::{Attempt, Place};
+use super::reweighting::{settled, Loss, Robust};
 use crate::error::{Error, Result};
 use crate::estimation::output_error::Status;
 use crate::signal::statistics::inner;

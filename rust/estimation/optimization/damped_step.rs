@@ -1,7 +1,20 @@
 //! The linear problem at a point of a search, and its steps: damped, within bounds, with a learnt curvature or without.
+//!
+//! What a sum of squares must say of itself to be minimised.
+//!
+//! What Gauss–Newton leaves out of the curvature of a sum of squares: Σ e ∇²e, learnt from the steps that were taken.
+//!
+//! Where a model leaves out a part of a machine its residuals stay large, and along a valley their own curvature is as
+//! large as that of the columns: Gauss–Newton then creeps. The secant updates of Dennis, Gay & Welsch (NL2SOL,
+//! doi:10.1145/355958.355965) cost no evaluation, and are used only where they foretell the cost better.
+//!
+//! Leaps along the bottom of a curved valley, where steps that lower the cost are short beside the way that is left.
+//!
+//! Numbers that data hardly tell apart make a valley that bends: steps follow its bottom one short chord after another, all
+//! in one direction. What they came to together is repeated a few times over in one leap, from the end of which ordinary
+//! steps lead down to the bottom again; where they do not soon end below the point that was left, the search goes on there.
 
-use super::curvature::Curvature;
-use super::problem::Problem;
+use crate::error::Result;
 use crate::linalg::dense;
 use crate::linalg::orthogonal::norm;
 use crate::linalg::small::{self, back_substitute};
@@ -223,4 +236,225 @@ fn damped_step(r: &[f64], held: &[bool], projected: usize, damping: f64) -> Vec<
     let mut step = vec![0.0; k];
     free.iter().zip(back_substitute(&q, stride, &rhs)).for_each(|(&j, s)| step[j] = s);
     step
+}
+
+/// A sum of squares to minimise.
+pub trait Problem {
+    /// What the residuals depend on.
+    type Point: Clone;
+    /// Residuals at a point, with whatever their derivatives there need.
+    type Evaluation;
+
+    /// Evaluates a point. [`crate::error::Error::Diverged`] and [`crate::error::Error::LeadingZero`] mean that a step went too far: it is shortened.
+    ///
+    /// # Errors
+    /// Any other error ends the search.
+    fn evaluate(&self, point: &Self::Point) -> Result<Self::Evaluation>;
+
+    /// The residuals of an evaluation.
+    fn residuals<'a>(&self, evaluation: &'a Self::Evaluation) -> &'a [f64];
+
+    /// Derivatives of the residuals with respect to every parameter, one column each.
+    ///
+    /// # Errors
+    /// As [`Problem::evaluate`]; [`crate::error::Error::Diverged`] counts as a step too far.
+    fn jacobian(&self, point: &Self::Point, evaluation: &Self::Evaluation) -> Result<Vec<Vec<f64>>>;
+
+    /// The point moved by steps in the parameters' coordinates, within its bounds, and the largest relative move.
+    fn moved(&self, point: &Self::Point, steps: &[f64]) -> (Self::Point, f64);
+
+    /// The point to which an evaluation belongs, where it solved for parameters in which the residuals are linear.
+    fn settled(&self, _evaluation: &Self::Evaluation, point: Self::Point) -> Self::Point {
+        point
+    }
+
+    /// Whether every evaluation solves for a parameter: its steps need no damping.
+    fn projected(&self, _parameter: usize) -> bool {
+        false
+    }
+
+    /// Derivative of a parameter with respect to the coordinate in which it is stepped.
+    fn stretch(&self, _point: &Self::Point, _parameter: usize) -> f64 {
+        1.0
+    }
+
+    /// Other parameters that move with a parameter's coordinate, and how much.
+    fn carried(&self, _point: &Self::Point, _parameter: usize) -> Vec<(usize, f64)> {
+        Vec::new()
+    }
+
+    /// How far a parameter may move down and up in its coordinate before it stands on a bound.
+    fn room(&self, _point: &Self::Point, _parameter: usize) -> (f64, f64) {
+        (f64::INFINITY, f64::INFINITY)
+    }
+
+    /// Whether the cost may have corners along a parameter: a minimum there has no slope.
+    fn kinked(&self, _point: &Self::Point, _parameter: usize) -> bool {
+        false
+    }
+
+    /// Norm of what the residuals are differences of, which bounds their rounding.
+    fn size(&self, _evaluation: &Self::Evaluation) -> f64 {
+        0.0
+    }
+
+    /// Whether a point may be trusted: from one that may, no step leads to one that may not.
+    fn trusted(&self, _point: &Self::Point) -> bool {
+        true
+    }
+
+    /// Whether a search may leap along valleys: not where many starts are to find an optimum each, which a leap may pass.
+    fn leaps(&self) -> bool {
+        true
+    }
+}
+/// A model must be better by this factor at the last step to be taken for the next one.
+const BETTER: f64 = 1.5;
+/// Predictions closer to the truth than this share of the fall are both right.
+const RIGHT: f64 = 0.1;
+
+/// The learnt matrix, in the coordinates of the steps, and whether it is used.
+pub(crate) struct Curvature {
+    count: usize,
+    matrix: Vec<f64>,
+    learnt: bool,
+    pub(crate) used: bool,
+}
+
+impl Curvature {
+    /// Nothing known of so many parameters.
+    pub(crate) fn new(count: usize) -> Self {
+        Self { count, matrix: vec![0.0; count * count], learnt: false, used: false }
+    }
+
+    /// Whether it is of so many parameters.
+    pub(crate) fn is_for(&self, count: usize) -> bool {
+        self.count == count
+    }
+
+    /// An element of the matrix.
+    pub(crate) fn at(&self, i: usize, j: usize) -> f64 {
+        self.matrix[i * self.count + j]
+    }
+
+    fn times(&self, step: &[f64]) -> Vec<f64> {
+        self.matrix.chunks_exact(self.count.max(1)).map(|row| row.iter().zip(step).map(|(a, s)| a * s).sum()).collect()
+    }
+
+    /// Its share of the second-order change of twice the cost along a step.
+    pub(crate) fn along(&self, step: &[f64]) -> f64 {
+        self.times(step).iter().zip(step).map(|(a, s)| a * s).sum()
+    }
+
+    /// Compares what was foretold without the matrix, and with it, with the fall of the cost.
+    pub(crate) fn judge(&mut self, without: f64, with: f64, fall: f64) {
+        let (missed, missed_with) = ((without - fall).abs(), (with - fall).abs());
+        if self.used {
+            self.used = missed_with <= BETTER * missed;
+        } else {
+            self.used = self.learnt && missed > RIGHT * fall.abs() && BETTER * missed_with < missed;
+        }
+    }
+
+    /// Learns from a step after which the gradient had changed by `change`, of which `columns` is what the columns say.
+    pub(crate) fn learn(&mut self, step: &[f64], change: &[f64], columns: &[f64]) {
+        let dot = |a: &[f64], b: &[f64]| a.iter().zip(b).map(|(x, y)| x * y).sum::<f64>();
+        let wanted: Vec<f64> = change.iter().zip(columns).map(|(y, c)| y - c).collect();
+        let scale = dot(change, step);
+        let size = dot(step, step).sqrt() * dot(change, change).sqrt();
+        if !(scale.is_finite() && scale.abs() > 1e-6 * size && size > 0.0) {
+            return;
+        }
+        // What was learnt elsewhere counts no more than what is seen here.
+        let before = self.along(step);
+        let sizing = if before == 0.0 { 1.0 } else { (dot(step, &wanted) / before).abs().min(1.0) };
+        self.matrix.iter_mut().for_each(|v| *v *= sizing);
+        let missing: Vec<f64> = wanted.iter().zip(self.times(step)).map(|(w, s)| w - s).collect();
+        let twice = dot(&missing, step) / (scale * scale);
+        for i in 0..self.count {
+            for j in 0..self.count {
+                self.matrix[i * self.count + j] +=
+                    (missing[i] * change[j] + change[i] * missing[j]) / scale - twice * change[i] * change[j];
+            }
+        }
+        self.learnt = self.matrix.iter().all(|v| v.is_finite());
+        if !self.learnt {
+            *self = Self::new(self.count);
+        }
+    }
+}
+/// Steps on which a leap is founded.
+const STEPS: usize = 4;
+/// Of the length of these steps the share that their sum has at least: else they lead nowhere together.
+const STRAIGHT: f64 = 0.8;
+/// Share of the cost that a step lowers at most: who gets on needs no leap.
+const CREEPS: f64 = 1e-3;
+/// Evaluations within which a leap must come to something.
+const PATIENCE: usize = 6;
+/// How often the sum of the steps is repeated, at first and at most.
+const REACH: f64 = 2.0;
+const FARTHEST: f64 = 16.0;
+
+/// The last steps of a search, and the point that it left by a leap.
+pub(crate) struct Valley<P> {
+    steps: Vec<Vec<f64>>,
+    reach: f64,
+    /// Where it leapt from, what it cost there, and after how many evaluations.
+    left: Option<(P, f64, usize)>,
+}
+
+impl<P> Valley<P> {
+    /// Nothing known.
+    pub(crate) fn new() -> Self {
+        Self { steps: Vec::new(), reach: REACH, left: None }
+    }
+
+    /// Takes a step, in coordinates, that lowered the cost by a share of it.
+    pub(crate) fn moved(&mut self, step: &[f64], gain: f64) {
+        if gain > CREEPS {
+            self.steps.clear();
+        } else {
+            self.steps.push(step.to_vec());
+        }
+    }
+
+    /// The leap that the last steps ask for, if that many evaluations are left for it.
+    pub(crate) fn leap(&mut self, evaluations: usize) -> Option<Vec<f64>> {
+        if self.left.is_some() || self.steps.len() < STEPS || evaluations <= PATIENCE {
+            return None;
+        }
+        let last = self.steps.split_off(self.steps.len() - STEPS);
+        self.steps.clear();
+        let norm = |v: &[f64]| v.iter().map(|s| s * s).sum::<f64>().sqrt();
+        let sum: Vec<f64> = (0..last[0].len()).map(|i| last.iter().map(|step| step[i]).sum()).collect();
+        let straight = norm(&sum) >= STRAIGHT * last.iter().map(|step| norm(step)).sum::<f64>();
+        straight.then(|| sum.iter().map(|s| self.reach * s).collect())
+    }
+
+    /// The search leapt from this point, at this cost.
+    pub(crate) fn left(&mut self, from: P, cost: f64, evaluations: usize) {
+        self.left = Some((from, cost, evaluations));
+    }
+
+    /// A leap led nowhere.
+    pub(crate) fn fell(&mut self) {
+        self.reach = (0.5 * self.reach).max(1.0);
+        self.steps.clear();
+    }
+
+    /// The point that was left, where the leap from it has come to nothing; a search that ends has no time left.
+    pub(crate) fn outcome(&mut self, cost: f64, evaluations: usize, ends: bool) -> Option<P> {
+        let (from, least, since) = self.left.take()?;
+        if cost < least {
+            self.reach = (2.0 * self.reach).min(FARTHEST);
+            self.steps.clear();
+            return None;
+        }
+        if ends || evaluations >= since + PATIENCE {
+            self.fell();
+            return Some(from);
+        }
+        self.left = Some((from, least, since));
+        None
+    }
 }

@@ -10,11 +10,9 @@
 //! A minimum is where the gradient vanishes, and nothing else is called one: the cosine between the residuals and every
 //! column that is free to move, the relative offset of Dennis & Schnabel (doi:10.1137/1.9781611971200, §7.2) and MINPACK.
 
-pub use super::problem::Problem;
+pub use super::damped_step::Problem;
 
-use super::curvature::Curvature;
-use super::damped_step::{Linear, LEAST_DAMPING};
-use super::valley::Valley;
+use super::damped_step::{Curvature, Linear, Valley, LEAST_DAMPING};
 use crate::error::{check_length, Error, Result};
 
 /// Damping of the first step: near Gauss–Newton's, yet safe where a start is some tens of percent off.
@@ -87,7 +85,7 @@ fn cost(residuals: &[f64]) -> f64 {
 /// ```
 /// use ftlm::error::Result;
 /// use ftlm::estimation::optimization::levenberg_marquardt::{minimise, Settings};
-/// use ftlm::estimation::optimization::problem::Problem;
+/// use ftlm::estimation::optimization::damped_step::Problem;
 ///
 /// /// x² − 2.
 /// struct Root;

@@ -6,9 +6,8 @@ use std::collections::HashMap;
 use std::rc::Rc;
 
 use super::experiment::Experiment;
-use super::operator::{filtered_spectrum, Filter, Operator, Power, FACTORS, KEPT_PULSES};
 use super::parameterization::FreeModel;
-use super::system_inverse::{Means, Solved};
+use super::system_inverse::{filtered_spectrum, Filter, Means, Operator, Power, Solved, FACTORS, KEPT_PULSES};
 use crate::error::Result;
 use crate::regressors::Record;
 use crate::series::Kernel;

@@ -3,10 +3,9 @@
 use std::sync::Arc;
 
 use crate::error::{check_finite, check_length, Error, Result};
-use crate::impulses::is_impulse;
-use crate::regressors::Record;
+use crate::regressors::{is_impulse, Record};
 use crate::series;
-use crate::signal::readings::{Jumps, Readings};
+use crate::signal::block_pulse::{Jumps, Readings};
 
 /// One run to compare with: pulse means on a grid of which every `every`-th edge is a sample.
 #[derive(Debug, Clone)]

@@ -8,7 +8,7 @@ use super::experiment::Experiment;
 use super::parameterization::{FreeModel, Point};
 use crate::equation::Structure;
 use crate::error::Result;
-use crate::fractional::excess::first;
+use crate::fractional::kernels::first;
 use crate::linalg::small;
 
 /// Orders closer than this are the same: the term integrates nothing.

@@ -2,16 +2,14 @@
 
 use std::cell::RefCell;
 
-use super::clock::Clock;
 use super::evaluation_cache::Shelf;
 use super::experiment::Experiment;
-use super::input::FreeInput;
-use super::parameterization::{Coordinate, FreeModel, Point};
+use super::parameterization::{Clock, Coordinate, FreeInput, FreeModel, Point};
 use super::residuals::Evaluation;
 use crate::error::{check_finite, check_length, Error, Result};
+use crate::estimation::optimization::damped_step::Problem;
 use crate::estimation::optimization::levenberg_marquardt::{minimise, Settings, Status};
-use crate::estimation::optimization::problem::Problem;
-use crate::stop::Stop;
+use crate::parallel::Stop;
 
 /// The optimum and what describes it.
 #[derive(Debug, Clone, PartialEq)]

@@ -7,18 +7,13 @@
 //! mean of the pulses on either side of kh, on a grid that may be finer than the samples, plus what the inputs of that
 //! instant feed through. Samples that were not read weigh nothing; samples at times of their own are compared there.
 
-pub(crate) mod clock;
 mod evaluation_cache;
 pub mod experiment;
 mod feedthrough;
 pub mod fit;
-pub mod input;
 mod jacobian;
 mod kink_correction;
-mod linear;
-mod operator;
 pub mod parameterization;
-mod part;
 mod residuals;
 pub mod stability;
 mod system_inverse;
@@ -26,5 +21,4 @@ mod system_inverse;
 pub use crate::estimation::optimization::levenberg_marquardt::{Settings, Status};
 pub use experiment::{Experiment, Instant, OwnTimes};
 pub use fit::{fit, fit_steady, fit_until, Fit};
-pub use input::{FreeInput, InputLaw};
-pub use parameterization::{Coordinate, FreeEquation, FreeModel, Monomial, Point};
+pub use parameterization::{Coordinate, FreeEquation, FreeInput, FreeModel, InputLaw, Monomial, Point};

@@ -1,22 +1,28 @@
 //! The free run of a model at a point, its residuals on every experiment, and the initial terms that are projected out.
+//!
+//! Coefficients in which the residuals are linear: those of what drives, once everything else is given.
+//!
+//! They are solved for at every point of the search (variable projection, Golub & Pereyra, doi:10.1137/0710036), so that
+//! only own terms, orders and inputs' numbers are searched: no sign to guess, no valley between what drives alike.
+//!
+//! What a free run leaves behind for the derivatives of its residuals.
 
 use std::borrow::Cow;
 use std::rc::Rc;
 
 use super::evaluation_cache::Shelf;
 use super::experiment::Experiment;
-use super::feedthrough::{Direct, Early};
+use super::feedthrough::{add_slope, Direct, Early};
 use super::kink_correction::Corners;
-use super::linear::best_moves;
-use super::operator::Operator;
-use super::parameterization::{FreeModel, Point};
-use super::part::Part;
-use super::system_inverse::{Means, Solved};
+use super::parameterization::{Coordinate, FreeModel, Point};
+use super::system_inverse::{Means, Operator, Solved};
 use crate::equation::Structure;
 use crate::error::{Error, Result};
 use crate::estimation::least_squares;
-use crate::fractional::excess::MAX_EXCESS;
-use crate::linalg::orthogonal::extend_orthonormal;
+use crate::fractional::kernels::MAX_EXCESS;
+use crate::linalg::dense;
+use crate::linalg::orthogonal::{extend_orthonormal, norm, project_out};
+use crate::linalg::small::back_substitute;
 use crate::regressors::Record;
 use crate::series::{Buffers, Recursion, SumOfProducts};
 
@@ -325,5 +331,176 @@ fn cut(means: &Means, m: usize) -> Cow<'_, [Vec<f64>]> {
     match means.iter().all(|row| row.len() == m) {
         true => Cow::Borrowed(means),
         false => means.iter().map(|row| row[..m.min(row.len())].to_vec()).collect::<Vec<_>>().into(),
+    }
+}
+
+/// What is not told from the rest by this share of its column stays where it was: there rounding is as large.
+const UNTOLD: f64 = 1e-7;
+
+impl FreeModel {
+    /// Coefficients that stand alone, once, and before nothing but what drives from outside.
+    pub(crate) fn linear(&self) -> Vec<usize> {
+        let stands = |j: usize| {
+            let mut found = false;
+            for (i, equation) in self.equations.iter().enumerate() {
+                for (signal, _, monomial) in &equation.terms {
+                    if monomial.powers.iter().any(|&(k, _)| k == j) {
+                        if monomial.powers != [(j, 1)] || self.unknown(i, *signal).is_some() {
+                            return false;
+                        }
+                        found = true;
+                    }
+                }
+            }
+            found
+        };
+        let moves = |j: usize| matches!(self.coordinates[j], Coordinate::Plain | Coordinate::Logarithm);
+        (0..self.coordinates.len()).filter(|&j| moves(j) && stands(j)).collect()
+    }
+
+    /// What one more of each coefficient does that stands before what drives.
+    pub(crate) fn driven_by(
+        &self,
+        experiment: &Experiment,
+        shelf: &mut Shelf,
+        part: &Part,
+        point: &Point,
+        coefficients: &[usize],
+    ) -> Result<Vec<Driven>> {
+        if coefficients.is_empty() {
+            return Ok(Vec::new());
+        }
+        let (record, n) = (&experiment.record, self.equations.len());
+        let mut driven = Vec::with_capacity(coefficients.len());
+        part.solved.inverse()?.each(
+            (n, record.m()),
+            coefficients.len(),
+            |place, rights| {
+                for (i, equation) in self.equations.iter().enumerate() {
+                    for (k, (signal, _, monomial)) in equation.terms.iter().enumerate() {
+                        let weight = monomial.slope(&point.coefficients, coefficients[place]);
+                        if weight != 0.0 {
+                            let eta = part.operators[i][k].eta();
+                            let series = || Cow::Borrowed(self.drives(record, (*signal, eta), &part.acted));
+                            rights.add(i, weight, (&part.operators[i][k], false), series, || {
+                                shelf.driver(self, experiment, (*signal, eta), &part.acted)
+                            });
+                        }
+                    }
+                }
+                Ok(())
+            },
+            |place, means| {
+                let parameter = point.orders.len() + coefficients[place];
+                let means = means.unwrap_or_else(|| vec![vec![0.0; record.m()]; n]);
+                let found = part.moved_by(parameter, means, (self, experiment, point))?;
+                if let Some(index) = found.samples.iter().position(|v| !v.is_finite()) {
+                    return Err(Error::Diverged { what: "free run".into(), index });
+                }
+                driven.push(found);
+                Ok(())
+            },
+        )?;
+        Ok(driven)
+    }
+}
+
+/// How far linear coefficients move to where the residuals of all experiments are least, each experiment's initial terms
+/// projected out.
+pub(crate) fn best_moves(sides: &[(&[f64], &Part)]) -> Result<Vec<f64>> {
+    let count = sides.first().map_or(0, |(_, part)| part.driven.len());
+    let mut columns: Vec<Vec<f64>> = vec![Vec::new(); count + 1];
+    for (residuals, run) in sides {
+        for (column, part) in columns.iter_mut().zip(run.driven.iter().map(|d| &d.samples[..]).chain([*residuals])) {
+            let first = column.len();
+            column.extend_from_slice(part);
+            project_out(&run.basis, &mut column[first..]);
+        }
+    }
+    let mut scales = Vec::with_capacity(count);
+    for (place, column) in columns.iter_mut().enumerate() {
+        let size = norm(column);
+        if place < count {
+            let scale = if size > 0.0 && size.is_finite() { 1.0 / size } else { 0.0 };
+            column.iter_mut().for_each(|v| *v *= scale);
+            scales.push(scale);
+        }
+        let rows = column.len();
+        column.resize(rows + count, 0.0);
+        if place < count {
+            column[rows + place] = UNTOLD;
+        }
+    }
+    let r = dense::triangular_factor(&columns);
+    let stride = count + 1;
+    let rhs: Vec<f64> = (0..count).map(|i| r[i * stride + count]).collect();
+    let moves: Vec<f64> = back_substitute(&r, stride, &rhs).iter().zip(&scales).map(|(s, scale)| s * scale).collect();
+    match moves.iter().position(|v| !v.is_finite()) {
+        Some(index) => Err(Error::Diverged { what: "linear coefficient".into(), index }),
+        None => Ok(moves),
+    }
+}
+
+/// What one experiment leaves behind for its sensitivities.
+pub(crate) struct Part {
+    /// What solves the equations.
+    pub(crate) solved: Rc<Solved>,
+    /// Of each term of each equation.
+    pub(crate) operators: Vec<Vec<Rc<Operator>>>,
+    /// Simulated pulse means, initial terms included.
+    pub(crate) response: Vec<Vec<f64>>,
+    /// Orthonormal basis of the sampled responses to the initial terms.
+    pub(crate) basis: Vec<Vec<f64>>,
+    /// What each coefficient does that the residuals are linear in.
+    pub(crate) driven: Vec<Driven>,
+    /// Pulse means of each input with a free number once it acts, and their derivative with respect to it.
+    pub(crate) acted: Vec<(Vec<f64>, Vec<f64>)>,
+    /// What feeds through at once.
+    pub(crate) direct: Option<Direct>,
+    /// What pulses see too early.
+    pub(crate) early: Early,
+    /// Corners near samples that were read at times of their own.
+    pub(crate) corners: Option<Corners>,
+}
+
+impl Part {
+    /// What one more of a parameter does to weighted samples, from what it does to pulse means. Orders come first among
+    /// the parameters, coefficients next, numbers of inputs last.
+    pub(crate) fn moved_by(
+        &self,
+        parameter: usize,
+        means: Vec<Vec<f64>>,
+        (model, experiment, point): (&FreeModel, &Experiment, &Point),
+    ) -> Result<Driven> {
+        let mut samples = experiment.sampled(&means);
+        self.early.correct_slope(model, experiment, point, parameter, &mut samples)?;
+        if let Some(direct) = &self.direct {
+            add_slope(model, experiment, direct, point, parameter, &mut samples);
+        }
+        if let Some(corners) = &self.corners {
+            corners.add_slope(model, experiment, self.direct.as_ref(), point, parameter, &mut samples);
+        }
+        Ok(Driven { samples, means })
+    }
+}
+
+/// What a coefficient of 1 more does to an experiment.
+pub(crate) struct Driven {
+    /// To its weighted samples.
+    pub(crate) samples: Vec<f64>,
+    /// To the pulse means of each output; empty once it was moved.
+    pub(crate) means: Vec<Vec<f64>>,
+}
+
+impl Driven {
+    /// Moves the coefficient: residuals and pulse means follow.
+    pub(crate) fn moved(&mut self, by: f64, residuals: &mut [f64], response: &mut [Vec<f64>]) {
+        if by != 0.0 {
+            residuals.iter_mut().zip(&self.samples).for_each(|(e, v)| *e -= by * v);
+            for (total, more) in response.iter_mut().zip(&self.means) {
+                total.iter_mut().zip(more).for_each(|(y, v)| *y += by * v);
+            }
+        }
+        self.means = Vec::new();
     }
 }

@@ -9,12 +9,10 @@ use crate::order_search::branch_and_bound::{screen_slab, Boxes, LEAST};
 use crate::order_search::candidate::problem::Scratch;
 use crate::order_search::candidate_index::Catalogue;
 use crate::order_search::control::{Checkpoint, Control, Place};
-use crate::order_search::grid::slab::Slab;
-use crate::order_search::grid::spread::visit;
-use crate::order_search::grid::traversal::Cursor;
+use crate::order_search::grid::traversal::{visit, Cursor, Slab};
 use crate::order_search::result::{Failure, Kept, Part, Row, Verdict, LISTED};
 use crate::order_search::screening::{by_guess, screen, Open};
-use crate::threads::PerThread;
+use crate::parallel::PerThread;
 
 /// Pulses of all candidates followed between two checkpoints: a tenth of a second or so of one core.
 const PIECE: usize = 1 << 21;
@@ -294,9 +292,9 @@ mod tests {
     use super::*;
     use crate::order_search::grid::{Lattice, TermAxis};
     use crate::order_search::options::Options;
+    use crate::parallel::pool;
+    use crate::parallel::Stop;
     use crate::regressors::Record;
-    use crate::stop::Stop;
-    use crate::threads::pool;
 
     #[test]
     fn boxes_are_used_where_they_exclude_candidates_and_nowhere_else() -> Result<()> {

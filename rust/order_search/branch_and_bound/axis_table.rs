@@ -5,7 +5,7 @@
 //! the largest second difference between: f_i − l_i = −Σ_j G_ij Δ²f_j with 0 ≤ G and Σ_j G_ij = (i − lo)(hi − i)/2.
 
 use crate::order_search::candidate::normal_equations::Normal;
-use crate::order_search::dual_bound::probes::{Probes, NONE};
+use crate::order_search::dual_bound::test_vectors::{Probes, NONE};
 use crate::simd::WIDTH;
 
 /// One value for each of [`WIDTH`] test vectors.

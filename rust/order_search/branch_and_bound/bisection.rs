@@ -6,21 +6,18 @@ use std::ops::Range;
 use crate::error::Result;
 use crate::linalg::small;
 use crate::order_search::branch_and_bound::axis_table::{Others, Side};
-use crate::order_search::branch_and_bound::box_bound::{Common, Slab, Stretch, MOST_OTHERS};
-use crate::order_search::branch_and_bound::strip::Strip;
+use crate::order_search::branch_and_bound::box_bound::{Common, Slab, Stretch, Strip, MOST_OTHERS};
 use crate::order_search::candidate::problem::Problem;
 use crate::order_search::candidate_index::Catalogue;
 use crate::order_search::dual_bound::lower_bound::Bound;
-use crate::order_search::dual_bound::probes::{Probes, NONE};
-use crate::order_search::grid::slab;
-use crate::order_search::grid::traversal::Cursor;
+use crate::order_search::dual_bound::test_vectors::{Probes, NONE};
+use crate::order_search::grid::traversal::{self, Cursor};
 use crate::order_search::grid::Lattice;
 use crate::order_search::options::{Criterion, Estimator, Norm, Options};
 use crate::order_search::screening::{Open, Screen};
+use crate::parallel::{pool, Stop};
 use crate::regressors::Record;
 use crate::simd::{self, WIDTH};
-use crate::stop::Stop;
-use crate::threads::pool;
 
 /// Fewest candidates of a slab for which its tables pay.
 pub(crate) const LEAST: u64 = 4096;
@@ -91,7 +88,7 @@ fn probes(problem: &Problem) -> Option<&[Probes]> {
 pub(crate) fn screen_slab(
     catalogue: &Catalogue<'_>,
     boxes: &Boxes,
-    slab: &slab::Slab,
+    slab: &traversal::Slab,
     (lo, hi): (u64, u64),
     limit: f64,
 ) -> Option<(Vec<Open>, Vec<u64>, u64)> {
@@ -102,7 +99,7 @@ pub(crate) fn screen_slab(
 struct Walk<'a> {
     catalogue: &'a Catalogue<'a>,
     boxes: &'a Boxes,
-    slab: &'a slab::Slab,
+    slab: &'a traversal::Slab,
     lo: u64,
     hi: u64,
     limit: f64,
@@ -179,13 +176,13 @@ impl simd::Kernel for Walk<'_> {
 
 /// Column of every term at the first candidate of a slab.
 #[inline(always)]
-fn columns(catalogue: &Catalogue<'_>, slab: &slab::Slab) -> Vec<usize> {
+fn columns(catalogue: &Catalogue<'_>, slab: &traversal::Slab) -> Vec<usize> {
     slab.digits.iter().enumerate().map(|(term, &digit)| catalogue.columns(slab.block, term)[digit]).collect()
 }
 
 /// Columns of the terms whose orders do not vary, and the inverse of their correlations.
 #[inline(always)]
-fn others(catalogue: &Catalogue<'_>, slab: &slab::Slab, columns: &[usize]) -> Option<(Vec<usize>, Vec<f64>)> {
+fn others(catalogue: &Catalogue<'_>, slab: &traversal::Slab, columns: &[usize]) -> Option<(Vec<usize>, Vec<f64>)> {
     let others: Vec<usize> =
         (0..columns.len()).filter(|&t| t != slab.outer && t != slab.inner).map(|t| columns[t]).collect();
     let normal = catalogue.problem.equations.whole()?;
@@ -198,7 +195,7 @@ fn others(catalogue: &Catalogue<'_>, slab: &slab::Slab, columns: &[usize]) -> Op
 fn ready<'a>(
     catalogue: &Catalogue<'_>,
     boxes: &'a Boxes,
-    slab: &slab::Slab,
+    slab: &traversal::Slab,
     others: &'a Others<'a>,
     rows: Range<usize>,
 ) -> Option<Slab<'a>> {
@@ -321,7 +318,7 @@ fn with_slab<T>(
     lattice: &Lattice,
     (criterion, norm): (Criterion, Norm),
     index: u64,
-    work: impl FnOnce(&Catalogue<'_>, &Boxes, &slab::Slab) -> Option<Vec<T>> + Send,
+    work: impl FnOnce(&Catalogue<'_>, &Boxes, &traversal::Slab) -> Option<Vec<T>> + Send,
 ) -> Result<Vec<T>>
 where
     T: Send,
@@ -351,7 +348,7 @@ mod tests {
     use crate::error::Error;
     use crate::order_search::branch_and_bound::axis_table::Wide;
     use crate::order_search::branch_and_bound::box_bound::{Cell, Held};
-    use crate::order_search::dual_bound::probes::Probes;
+    use crate::order_search::dual_bound::test_vectors::Probes;
     use crate::order_search::grid::TermAxis;
 
     /// Two hubs and a link under steps, on which orders near one another and far apart are tried.

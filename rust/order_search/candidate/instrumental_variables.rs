@@ -4,10 +4,9 @@
 use crate::error::{Error, Result};
 use crate::estimation::instrumental_variables::{low_pass, power_frequency, refine, Scratch, Settings, Source};
 use crate::order_search::result::Failure;
-use crate::parallel;
+use crate::parallel::{self, Stop};
 use crate::regressors::{Bank, Index, Record};
 use crate::series::Kernel;
-use crate::stop::Stop;
 
 /// Low-pass behind which the first coefficients are estimated, in units of the output's own band.
 const START_BAND: f64 = 2.0;

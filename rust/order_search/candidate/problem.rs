@@ -3,12 +3,11 @@
 use crate::equation::{Initial, Structure};
 use crate::error::{check_finite, Error, Result};
 use crate::estimation::multi_innovation::Rows;
-use crate::fractional::haar;
-use crate::order_search::candidate::columns_part::Columns;
+use crate::fractional::operational_matrices;
+use crate::order_search::candidate::columns::Columns;
 use crate::order_search::candidate::instrumental_variables::{start_bank, Refiner};
-use crate::order_search::candidate::normal_equations::{plain_gram, weigh, Normal, NormalEquations, Solve};
+use crate::order_search::candidate::normal_equations::{plain_gram, weigh, Normal, NormalEquations, Solve, Squares};
 use crate::order_search::candidate::simulation::March;
-use crate::order_search::candidate::squares::Squares;
 use crate::order_search::control::Control;
 use crate::order_search::dual_bound::infeasibility::Reach;
 use crate::order_search::dual_bound::linearized_vectors::{Held, Tangent, Tangents};
@@ -17,9 +16,9 @@ use crate::order_search::dual_bound::tailored_vectors::{Adapted, Fitted, Memory}
 use crate::order_search::dual_bound::unstable_zeros::Roots;
 use crate::order_search::options::{Criterion, Estimator, Options};
 use crate::order_search::result::{Failure, Row, Verdict};
+use crate::parallel::Stop;
 use crate::regressors::{Bank, Index, Key, Record};
 use crate::simd::{self, WIDTH};
-use crate::stop::Stop;
 
 /// Transforms that following one candidate is worth; making test vectors must stay below a fraction of all that.
 const TRANSFORMS: u64 = 6;
@@ -176,7 +175,7 @@ impl Problem {
         check_finite("fixed coefficients", &fixed.iter().flatten().copied().collect::<Vec<_>>())?;
         if matches!(options.estimator, Estimator::MultiInnovation(innovation) if innovation.rows == Rows::Haar) {
             for record in records {
-                haar::check_power_of_two(record.m())?;
+                operational_matrices::check_power_of_two(record.m())?;
             }
         }
         let width = index.keys().len();

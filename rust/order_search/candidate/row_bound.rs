@@ -1,8 +1,8 @@
 //! Lower bounds of the squared equation error along a stretch of candidates that differ in one term: this term comes last
 //! in the factorisation of the products, and the factor of the others is shared.
 
-use crate::order_search::candidate::columns_part::{part_of, Columns};
-use crate::order_search::candidate::squares::Squares;
+use crate::order_search::candidate::columns::{part_of, Columns};
+use crate::order_search::candidate::normal_equations::Squares;
 use crate::simd::Lanes;
 
 /// Most terms but the one that changes.
@@ -205,7 +205,7 @@ mod tests {
     use super::*;
     use crate::estimation::least_squares;
     use crate::linalg::dense;
-    use crate::stop::Stop;
+    use crate::parallel::Stop;
 
     /// Numbers in [−1, 1), always the same ones.
     fn noise(state: &mut u64, count: usize) -> Vec<f64> {

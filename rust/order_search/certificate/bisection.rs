@@ -6,12 +6,11 @@ use rayon::prelude::*;
 
 use crate::error::{Error, Result};
 use crate::order_search::certificate::cell_bound::{about, check, Bounded};
-use crate::order_search::certificate::gram_tables::{width, Cell, Tables, DEEPEST};
-use crate::order_search::certificate::region::Region;
+use crate::order_search::certificate::gram_tables::{width, Cell, Region, Tables, DEEPEST};
 use crate::order_search::certificate::regressor_expansion::MOST;
 use crate::order_search::control::Control;
+use crate::parallel::pool;
 use crate::regressors::Record;
-use crate::threads::pool;
 
 /// Cells that a thread bounds at a time, and those of which it is known at a time what they came to.
 const CHUNK: usize = 256;
@@ -68,7 +67,7 @@ pub struct Certificate {
 ///
 /// ```
 /// # use ftlm::order_search::certificate::bisection::{certify, Asked};
-/// # use ftlm::order_search::certificate::region::{Range, Region};
+/// # use ftlm::order_search::certificate::gram_tables::{Range, Region};
 /// # use ftlm::order_search::control::Control;
 /// # use ftlm::regressors::Record;
 /// # let input: Vec<f64> = (0..64).map(|k| if k % 16 < 8 { 1.0 } else { -1.0 }).collect();

@@ -13,8 +13,8 @@ use crate::error::{check_length, Error, Result};
 use crate::linalg::dense::inner_products;
 use crate::order_search::certificate::regressor_expansion::{series, unit, Curve, ALL, MOST};
 use crate::order_search::certificate::subspace_bound::Span;
+use crate::parallel::Stop;
 use crate::regressors::Record;
-use crate::stop::Stop;
 
 type Row = [f64; MOST];
 

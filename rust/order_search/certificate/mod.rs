@@ -8,10 +8,9 @@
 mod bisection;
 mod cell_bound;
 mod gram_tables;
-mod region;
 mod regressor_expansion;
 mod subspace_bound;
 
 pub use bisection::{certify, Asked, Certificate};
 pub use cell_bound::cell_bounds;
-pub use region::{Range, Region};
+pub use gram_tables::{Range, Region};

@@ -6,9 +6,9 @@
 //! terms grow with η from t = 1 on.
 
 use crate::error::{Error, Result};
+use crate::parallel::Stop;
 use crate::regressors::Record;
 use crate::series::{Buffers, Kernel};
-use crate::stop::Stop;
 
 /// Most terms of an equation.
 pub(super) const MOST: usize = 6;

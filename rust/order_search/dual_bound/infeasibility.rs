@@ -9,8 +9,7 @@
 //! positive definite, no coefficients meet them all.
 
 use crate::linalg::small::packed;
-use crate::order_search::dual_bound::probes::{Probes, NONE};
-use crate::order_search::dual_bound::test_vectors::Wide;
+use crate::order_search::dual_bound::test_vectors::{Probes, Wide, NONE};
 use crate::simd::WIDTH;
 
 /// Steps in which weights of test vectors are sought that exclude a candidate; measured on Plant A's lattice, where three

@@ -9,8 +9,8 @@ use std::collections::BTreeMap;
 
 use crate::equation::Equation;
 use crate::error::{check_length, Error, Result};
-use crate::order_search::dual_bound::losses::{modulus, Losses};
-use crate::order_search::dual_bound::probes::NONE;
+use crate::order_search::dual_bound::tailored_vectors::{modulus, Losses};
+use crate::order_search::dual_bound::test_vectors::NONE;
 use crate::order_search::options::Norm;
 use crate::regressors::{Bank, Index, Key, Record};
 use crate::series::{divide, reciprocal, Buffers, Kernel, SumOfProducts};

@@ -10,13 +10,12 @@
 use crate::equation::{Equation, Structure};
 use crate::error::{check_length, Result};
 use crate::order_search::dual_bound::infeasibility::Reach;
-use crate::order_search::dual_bound::probes::Probes;
 use crate::order_search::dual_bound::tailored_vectors::{Adapted, Memory};
-use crate::order_search::dual_bound::test_vectors::POOL;
+use crate::order_search::dual_bound::test_vectors::{Probes, POOL};
 use crate::order_search::options::Norm;
+use crate::parallel::Stop;
 use crate::regressors::{Bank, Index, Key, Record};
 use crate::simd::WIDTH;
-use crate::stop::Stop;
 
 /// What each test vector of the pool proves of an equation's output error at rest: lower bounds of Σ|y − ŷ| or
 /// Σ(y − ŷ)².

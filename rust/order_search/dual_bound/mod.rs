@@ -2,11 +2,9 @@
 
 pub(crate) mod infeasibility;
 pub(crate) mod linearized_vectors;
-mod losses;
 pub mod lower_bound;
-pub(crate) mod probes;
 pub(crate) mod tailored_vectors;
-mod test_vectors;
+pub(crate) mod test_vectors;
 pub(crate) mod unstable_zeros;
 
 pub use linearized_vectors::excluded_along;

@@ -3,17 +3,18 @@
 //! For that candidate ⟨t, w⟩/‖Dᵀt‖ is its score itself; for any other one the bound holds as for every test vector. Dᵀt
 //! is formed in full here, so that neither coefficients that are huge and of opposite sign nor noise that all candidates
 //! share loosen it. Records are one vector after the other: one bound for the error on all of them.
+//!
+//! What rounding may do to inner products with test vectors made for candidates, and to their norms.
 
 use rayon::prelude::*;
 
 use crate::linalg::dense;
-use crate::order_search::dual_bound::losses::Losses;
-use crate::order_search::dual_bound::probes::NONE;
+use crate::order_search::dual_bound::test_vectors::NONE;
 use crate::order_search::options::Norm;
+use crate::parallel::Stop;
 use crate::regressors::Bank;
 use crate::series::{divide, Buffers, Kernel};
 use crate::simd::{self, WIDTH};
-use crate::stop::Stop;
 
 /// Values that are summed before a look at the limit.
 const STRETCH: usize = 8 * WIDTH;
@@ -327,4 +328,57 @@ fn samples(bank: &Bank) -> usize {
 
 fn own(bank: &Bank) -> Vec<usize> {
     (0..bank.len()).filter(|&p| !bank.kernel(p).is_empty()).collect()
+}
+
+/// Over all records together.
+pub(super) struct Losses {
+    pub(super) norm: Norm,
+    /// What rounding may add to |⟨t, w⟩| per unit of a column's coefficient, and for the target, where no |t| exceeds 1.
+    pub(super) rounding: Vec<f64>,
+    pub(super) target_rounding: f64,
+    /// Sum of the moduli of an own column's kernel, times [`Self::size`]; 0 of another.
+    pub(super) lengths: Vec<f64>,
+    /// Largest dual norm of a vector none of whose values exceeds 1.
+    pub(super) size: f64,
+    /// What rounding may add to a sum of as many terms as there are samples, per unit.
+    pub(super) unit: f64,
+}
+
+impl Losses {
+    #[allow(clippy::cast_precision_loss)]
+    pub(super) fn new(banks: &[Bank], targets: &[Vec<f64>], norm: Norm) -> Self {
+        let width = banks.first().map_or(0, Bank::len);
+        let all: usize = targets.iter().map(Vec::len).sum();
+        let unit = 16.0 * f64::EPSILON * all as f64;
+        let (mut rounding, mut lengths) = (vec![0.0; width], vec![0.0_f64; width]);
+        let size = match norm {
+            Norm::L1 => 1.0,
+            Norm::L2 => (all as f64).sqrt(),
+        };
+        for (bank, target) in banks.iter().zip(targets) {
+            let target = modulus(target);
+            for p in 0..width {
+                let length = modulus(bank.kernel(p));
+                rounding[p] += unit * (modulus(bank.column(p)) + length * target);
+                lengths[p] = lengths[p].max(length * size);
+            }
+        }
+        let target_rounding = 2.0 * unit * targets.iter().map(|y| modulus(y)).sum::<f64>();
+        Self { norm, rounding, target_rounding, lengths, size, unit }
+    }
+
+    /// What a norm must exceed for a raw score to exceed this limit; a hair more, for the rounding of the score itself.
+    #[inline(always)]
+    pub(super) fn limit(&self, raw: f64) -> f64 {
+        (1.0 + self.unit)
+            * match self.norm {
+                Norm::L1 => raw,
+                Norm::L2 => raw.sqrt(),
+            }
+    }
+}
+
+/// Σ |x|.
+pub(super) fn modulus(x: &[f64]) -> f64 {
+    x.iter().map(|v| v.abs()).sum()
 }

@@ -11,11 +11,11 @@ use rayon::prelude::*;
 use crate::equation::Equation;
 use crate::error::{check_length, Result};
 use crate::linalg::dense;
-use crate::order_search::dual_bound::losses::modulus;
+use crate::order_search::dual_bound::tailored_vectors::modulus;
 use crate::order_search::options::Norm;
+use crate::parallel::Stop;
 use crate::regressors::{Bank, Index, Key, Record};
 use crate::simd::WIDTH;
-use crate::stop::Stop;
 
 /// Decay rates of the paths, per record: a path bounds the half disc of three times its rate to the right of it. Growth
 /// that a record does not show makes no free run large; faster growth than the last is stopped early by any run.

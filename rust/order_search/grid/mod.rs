@@ -3,10 +3,7 @@
 
 pub mod independent;
 pub mod order_law;
-pub(crate) mod slab;
-pub(crate) mod spread;
 pub(crate) mod traversal;
-mod tuples;
 
 pub use independent::{Lattice, TermAxis, MAX_CANDIDATES};
 pub use order_law::{LawEquation, LawLattice, MAX_TUPLES};

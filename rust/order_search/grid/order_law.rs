@@ -2,7 +2,7 @@
 
 use crate::equation::{alpha_fits, order_fits, tidy, AffineOrder, Structure, Term, ORDER_GRAIN};
 use crate::error::{check_finite, Error, Result};
-use crate::fractional::excess::MAX_EXCESS;
+use crate::fractional::kernels::MAX_EXCESS;
 
 /// Most tuples of free orders of a stage; what a search costs follows from the distinct orders of its equations.
 pub const MAX_TUPLES: u128 = 5_000_000_000;

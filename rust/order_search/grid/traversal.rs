@@ -1,8 +1,11 @@
 //! A walk through the candidates of a lattice in the order of their indices, from any index on.
+//!
+//! Slabs of a lattice: runs of indices over which two orders alone vary, each through all of its values.
+//!
+//! Orders of visiting that spread any first part of them over the whole range.
 
 use crate::equation::{Structure, Term};
-use crate::order_search::grid::independent::Lattice;
-use crate::order_search::grid::tuples::{Bits, STRIDE};
+use crate::order_search::grid::independent::{Bits, Lattice, STRIDE};
 
 impl Lattice {
     /// Orders of a candidate: its structure; an index beyond the last is the last.
@@ -214,5 +217,94 @@ impl<'a> Cursor<'a> {
             }
         }
         Structure { output: self.lattice.output(), order: self.lattice.blocks[self.block].alpha, terms }
+    }
+}
+
+/// Candidates `lo … hi − 1`: for each row, an order of one term, a run of orders of another.
+#[derive(Debug, Clone)]
+pub(crate) struct Slab {
+    pub(crate) lo: u64,
+    pub(crate) hi: u64,
+    /// Number of the block, and position of every term's order in its axis at `lo`.
+    pub(crate) block: usize,
+    pub(crate) digits: Vec<usize>,
+    /// The term whose order changes from row to row, and its orders.
+    pub(crate) outer: usize,
+    pub(crate) rows: Vec<usize>,
+    /// The term whose order runs along a row, the first of its orders and their number.
+    pub(crate) inner: usize,
+    pub(crate) first: usize,
+    pub(crate) len: usize,
+}
+
+impl Lattice {
+    /// First value in range of a term's axis in a block.
+    pub(crate) fn first(&self, block: usize, term: usize) -> usize {
+        let place = self.groups.iter().zip(&self.blocks[block].slices);
+        let mut all = place.flat_map(|(group, slice)| group.terms.iter().zip(&slice.first));
+        all.find(|(t, _)| **t == term).map_or(0, |(_, first)| *first)
+    }
+
+    /// Most candidates of a slab of the same block.
+    pub(crate) fn largest(&self, slab: &Slab) -> u64 {
+        let whole = self.groups.iter().find(|group| group.terms.contains(&slab.outer));
+        let axis = whole.map_or(0, |group| group.axes[group.last()].len() - self.first(slab.block, slab.outer));
+        (axis * slab.len) as u64
+    }
+
+    /// The slab that holds a candidate; none where the signal that runs fastest has several terms, or where no other
+    /// signal has orders to vary.
+    pub(crate) fn slab(&self, index: u64) -> Option<Slab> {
+        let cursor = Cursor::at(self, index);
+        let block = &self.blocks[cursor.block()];
+        let mut varying = (0..self.groups.len()).rev().filter(|&g| block.slices[g].count > 1);
+        let (inner, outer) = (varying.next()?, varying.next()?);
+        let (fast, slow) = (&self.groups[inner], &self.groups[outer]);
+        if fast.terms.len() != 1 {
+            return None;
+        }
+        let first = block.slices[inner].first[0];
+        let len = fast.axes[0].len() - first;
+        let rows = cursor.completions(outer);
+        let mut digits = vec![0; self.width()];
+        cursor.each(0, |term, digit| digits[term] = digit);
+        let (u, v) = (slow.terms[slow.last()], fast.terms[0]);
+        let before = rows.iter().position(|&row| row == digits[u])? * len + (digits[v] - first);
+        let lo = index - before as u64;
+        digits[u] = rows[0];
+        digits[v] = first;
+        let hi = lo + (rows.len() * len) as u64;
+        Some(Slab { lo, hi, block: cursor.block(), digits, outer: u, rows, inner: v, first, len })
+    }
+}
+/// Fractional part of the golden section: multiples of it spread evenly.
+const GOLDEN: f64 = 0.618_033_988_75;
+
+/// A place in [0, 1) of every index; neighbours lie far apart.
+#[allow(clippy::cast_precision_loss)]
+pub(crate) fn spread(index: u64) -> f64 {
+    (index as f64 * GOLDEN).fract()
+}
+
+/// Visits 0 … count−1 once each, spread over the whole range from the start.
+pub(crate) fn visit(count: u64) -> impl Fn(u64) -> u64 {
+    // The golden section spreads any prefix evenly; the next stride coprime with the count visits all.
+    #[allow(clippy::cast_possible_truncation, clippy::cast_sign_loss, clippy::cast_precision_loss)]
+    let mut stride = ((count as f64 * GOLDEN) as u64).max(1);
+    while gcd(stride, count) != 1 {
+        stride += 1;
+    }
+    move |i| {
+        #[allow(clippy::cast_possible_truncation)]
+        let index = (u128::from(i) * u128::from(stride) % u128::from(count)) as u64;
+        index
+    }
+}
+
+fn gcd(a: u64, b: u64) -> u64 {
+    if b == 0 {
+        a
+    } else {
+        gcd(b, a % b)
     }
 }

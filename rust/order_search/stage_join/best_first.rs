@@ -10,19 +10,16 @@ use rayon::prelude::*;
 
 use crate::equation::Structure;
 use crate::error::{check_length, Error, Result};
-use crate::order_search::budget::Budget;
 use crate::order_search::candidate::columns::Needed;
 use crate::order_search::candidate::problem::{Problem, Scratch};
 use crate::order_search::control::{another, Control};
 use crate::order_search::dual_bound::lower_bound::Bound;
 use crate::order_search::grid::order_law::LawLattice;
-use crate::order_search::options::{Norm, Options};
+use crate::order_search::options::{Budget, Norm, Options};
 use crate::order_search::result::{Counts, Failure, Row, Verdict};
-use crate::order_search::stage_join::join::Join;
-use crate::order_search::stage_join::known::{spans, Class, Entries, Entry, Span, OPEN};
-use crate::order_search::stage_join::orders::Candidates;
+use crate::order_search::stage_join::join::{spans, Candidates, Class, Entries, Entry, Join, Span, OPEN};
+use crate::parallel::{pool, PerThread};
 use crate::regressors::Record;
-use crate::threads::{pool, PerThread};
 
 /// An equation's candidates are first followed up to this multiple of its best score.
 const FIRST_LIMIT: f64 = 4.0;

@@ -6,6 +6,12 @@
 //! and (b, addend from a) fit together exactly where each names the other's addend. Rows of both halves meet in the
 //! bucket of the two addends; within a bucket every pair is a tuple, and every tuple is one pair of one bucket. The
 //! product of the axes is never gone through.
+//!
+//! What is known of the candidates of each equation: a score, or a bound below it.
+//!
+//! The distinct orders that an order law gives one equation: the candidates of a stage, by number.
+//!
+//! What free orders add to the order laws of some equations: the addends by which the halves of a join meet.
 
 use std::collections::hash_map::Entry as Slot;
 use std::collections::HashMap;
@@ -13,12 +19,11 @@ use std::ops::Range;
 
 use rayon::prelude::*;
 
+use crate::equation::{grains, tidy, Structure, Term};
 use crate::error::{Error, Result};
 use crate::order_search::control::Control;
-use crate::order_search::grid::order_law::LawLattice;
-use crate::order_search::stage_join::known::{Class, Entries, Entry};
-use crate::order_search::stage_join::orders::{number, Candidates};
-use crate::order_search::stage_join::sums::{Sums, LOOK};
+use crate::order_search::grid::order_law::{LawEquation, LawLattice};
+use crate::order_search::result::Failure;
 
 /// A row of one half of the join: a choice of its own free orders, and the addend of the other half's.
 #[derive(Debug, Clone, Copy)]
@@ -253,5 +258,271 @@ fn combination(
             half.combinations.extend_from_slice(ids);
             Ok(*slot.insert(next))
         }
+    }
+}
+
+/// What is known of one equation's candidate: its scaled score, or a bound below it.
+#[derive(Debug, Clone, Copy)]
+pub(super) struct Entry {
+    pub(super) value: f64,
+    pub(super) class: Class,
+}
+
+/// What became of a candidate, or of several together: the first failure, else the largest.
+#[derive(Debug, Clone, Copy, PartialEq, Eq, PartialOrd, Ord)]
+pub(super) enum Class {
+    Exact,
+    /// A bound without a run is all that is known.
+    Bounded,
+    /// Left at a partial sum, or not looked at.
+    Open,
+    Failed(Failure),
+}
+
+impl Class {
+    pub(super) fn failed(self) -> bool {
+        matches!(self, Self::Failed(_))
+    }
+
+    pub(super) fn with(self, later: Self) -> Self {
+        if self.failed() {
+            self
+        } else {
+            self.max(later)
+        }
+    }
+}
+
+/// Of a candidate that was not looked at.
+pub(super) const OPEN: Entry = Entry { value: 0.0, class: Class::Open };
+
+/// What is known of every candidate of every equation.
+pub(super) type Entries = Vec<Vec<Entry>>;
+
+/// Candidates `first … last − 1` of one equation, to be followed up to one limit of its scaled score.
+#[derive(Debug, Clone, Copy, PartialEq)]
+pub struct Span {
+    /// Equation.
+    pub equation: usize,
+    /// See above.
+    pub first: usize,
+    /// See above.
+    pub last: usize,
+    /// See above.
+    pub limit: f64,
+}
+
+/// Candidates of an equation with the limit of each, in stretches that share one.
+pub(super) fn spans(equation: usize, wanted: impl Iterator<Item = (usize, f64)>) -> Vec<Span> {
+    let mut spans: Vec<Span> = Vec::new();
+    for (id, limit) in wanted {
+        match spans.last_mut() {
+            Some(span) if span.last == id && span.limit.to_bits() == limit.to_bits() => span.last = id + 1,
+            _ => spans.push(Span { equation, first: id, last: id + 1, limit }),
+        }
+    }
+    spans
+}
+
+/// Distinct orders of one equation.
+pub(super) struct Candidates {
+    output: usize,
+    signals: Vec<usize>,
+    /// α and the terms' orders, one candidate after the other.
+    orders: Vec<f64>,
+    ids: HashMap<Box<[i64]>, u32>,
+}
+
+impl Candidates {
+    pub(super) fn new(equation: &LawEquation) -> Self {
+        let signals = equation.terms.iter().map(|t| t.0).collect();
+        Self { output: equation.output, signals, orders: Vec::new(), ids: HashMap::new() }
+    }
+
+    pub(super) fn len(&self) -> usize {
+        self.ids.len()
+    }
+
+    /// Number of the candidate with these orders, added at the end if new.
+    pub(super) fn id(&mut self, orders: &[f64], key: &mut Vec<i64>) -> Result<u32> {
+        key.clear();
+        key.extend(orders.iter().map(|&v| grains(v)));
+        if let Some(&id) = self.ids.get(key.as_slice()) {
+            return Ok(id);
+        }
+        let id = number(self.ids.len())?;
+        self.ids.insert(key.as_slice().into(), id);
+        self.orders.extend_from_slice(orders);
+        Ok(id)
+    }
+
+    pub(super) fn structure(&self, id: usize) -> Structure {
+        let width = self.signals.len() + 1;
+        let orders = &self.orders[id * width..(id + 1) * width];
+        let terms = self.signals.iter().zip(&orders[1..]).map(|(&signal, &order)| Term { signal, order }).collect();
+        Structure { output: self.output, order: orders[0], terms }
+    }
+}
+
+/// A count as a number of 32 bits, which is what tables hold.
+pub(super) fn number(count: usize) -> Result<u32> {
+    u32::try_from(count).map_err(|_| Error::Internal { what: "more than 2^32 distinct orders".into() })
+}
+
+/// Rows of a layout between two looks at whether it is to stop.
+pub(super) const LOOK: usize = 4096;
+
+/// Vectors of sums, each once.
+#[derive(Debug)]
+pub(super) struct Distinct {
+    width: usize,
+    count: usize,
+    values: Vec<f64>,
+    ids: HashMap<Box<[i64]>, u32>,
+}
+
+impl Drop for Distinct {
+    /// Millions of keys take longer to give back than Ctrl-C may take, so nobody waits for it.
+    fn drop(&mut self) {
+        if self.count > 8 * LOOK {
+            let ids = std::mem::take(&mut self.ids);
+            // Where no thread can be had they are given back here.
+            drop(std::thread::Builder::new().spawn(move || drop(ids)));
+        }
+    }
+}
+
+impl Distinct {
+    fn of(width: usize) -> Self {
+        Self { width, count: 0, values: Vec::new(), ids: HashMap::new() }
+    }
+
+    /// Sums are of multiples of the grain by short weights: a thousandth of it tells them apart and forgives rounding.
+    #[allow(clippy::cast_possible_truncation)]
+    fn key(sums: &[f64]) -> Box<[i64]> {
+        sums.iter().map(|v| (v * 1e12).round() as i64).collect()
+    }
+
+    fn insert(&mut self, sums: &[f64]) {
+        #[allow(clippy::cast_possible_truncation)]
+        let next = self.count as u32;
+        if let Slot::Vacant(slot) = self.ids.entry(Self::key(sums)) {
+            slot.insert(next);
+            self.values.extend_from_slice(sums);
+            self.count += 1;
+        }
+    }
+
+    pub(super) fn len(&self) -> usize {
+        self.count
+    }
+
+    pub(super) fn find(&self, sums: &[f64]) -> Option<u32> {
+        self.ids.get(&Self::key(sums)).copied()
+    }
+
+    pub(super) fn each(&self) -> impl Iterator<Item = &[f64]> {
+        (0..self.count).map(|i| &self.values[i * self.width..(i + 1) * self.width])
+    }
+}
+
+/// The order laws of some equations of a stage, whose free orders come in two parts.
+pub(super) struct Sums {
+    equations: Range<usize>,
+    constants: Vec<f64>,
+    /// Weights of each free order.
+    weights: Vec<Vec<f64>>,
+}
+
+impl Sums {
+    pub(super) fn new(lattice: &LawLattice, equations: Range<usize>) -> Self {
+        let laws = || lattice.equations()[equations.clone()].iter().flat_map(LawEquation::laws);
+        let constants = laws().map(|law| law.constant).collect();
+        let weights = (0..lattice.axes().len())
+            .map(|axis| laws().map(|law| law.weights.get(axis).copied().unwrap_or(0.0)).collect())
+            .collect();
+        Self { constants, weights, equations }
+    }
+
+    /// What these free orders add to the laws: distinct sums, or none where there are more than the limit.
+    ///
+    /// # Errors
+    /// [`crate::error::Error::Interrupted`].
+    pub(super) fn image(
+        &self,
+        lattice: &LawLattice,
+        axes: &[usize],
+        limit: usize,
+        control: &Control,
+    ) -> Result<Option<Distinct>> {
+        let width = self.constants.len();
+        let mut found = Distinct::of(width);
+        found.insert(&vec![0.0; width]);
+        for &axis in axes {
+            let mut next = Distinct::of(width);
+            for sums in found.each() {
+                for (i, value) in lattice.axes()[axis].iter().enumerate() {
+                    if i % LOOK == 0 {
+                        control.check_stop()?;
+                    }
+                    let sums: Vec<f64> = sums.iter().zip(&self.weights[axis]).map(|(s, w)| s + w * value).collect();
+                    next.insert(&sums);
+                }
+                if next.len() > limit {
+                    return Ok(None);
+                }
+            }
+            found = next;
+        }
+        Ok(Some(found))
+    }
+
+    /// Calls `take` for every choice of these free orders with its part of a tuple's index, its sums in these laws
+    /// (constants included) and its sums in the others (without).
+    ///
+    /// # Errors
+    /// The first of `take`.
+    pub(super) fn each(
+        &self,
+        lattice: &LawLattice,
+        axes: &[usize],
+        others: &Self,
+        mut take: impl FnMut(u64, &[f64], &[f64]) -> Result<()>,
+    ) -> Result<()> {
+        let strides: Vec<u64> =
+            axes.iter().map(|&axis| lattice.axes()[axis + 1..].iter().map(|a| a.len() as u64).product()).collect();
+        let mut digits = vec![0usize; axes.len()];
+        let (mut sums, mut theirs) = (Vec::new(), Vec::new());
+        loop {
+            let value = |i: usize| lattice.axes()[axes[i]][digits[i]];
+            let add = |base: &[f64], weights: &[Vec<f64>], out: &mut Vec<f64>| {
+                out.clear();
+                out.extend_from_slice(base);
+                for (i, &axis) in axes.iter().enumerate() {
+                    out.iter_mut().zip(&weights[axis]).for_each(|(s, w)| *s += w * value(i));
+                }
+            };
+            add(&self.constants, &self.weights, &mut sums);
+            add(&vec![0.0; others.constants.len()], &others.weights, &mut theirs);
+            let index = digits.iter().zip(&strides).map(|(&digit, stride)| digit as u64 * stride).sum();
+            take(index, &sums, &theirs)?;
+            let Some(i) = (0..axes.len()).rev().find(|&i| digits[i] + 1 < lattice.axes()[axes[i]].len()) else {
+                return Ok(());
+            };
+            digits[i] += 1;
+            digits[i + 1..].fill(0);
+        }
+    }
+
+    /// The orders of these equations from own sums and an addend; tells whether they make equations.
+    pub(super) fn orders(&self, lattice: &LawLattice, sums: &[f64], addend: &[f64], orders: &mut Vec<f64>) -> bool {
+        orders.clear();
+        orders.extend(sums.iter().zip(addend).map(|(s, a)| tidy(s + a)));
+        let mut rest = &orders[..];
+        lattice.equations()[self.equations.clone()].iter().all(|equation| {
+            let (mine, others) = rest.split_at(equation.terms.len() + 1);
+            rest = others;
+            lattice.fits(equation, mine)
+        })
     }
 }

@@ -2,10 +2,7 @@
 
 mod best_first;
 mod join;
-mod known;
-mod orders;
-mod sums;
 mod tuples;
 
 pub use best_first::{search, Course, Stage, StageOutcome, StageRow};
-pub use known::Span;
+pub use join::Span;

@@ -6,8 +6,7 @@ use rayon::prelude::*;
 use crate::error::Result;
 use crate::order_search::control::Control;
 use crate::order_search::result::{Counts, Failure, LISTED};
-use crate::order_search::stage_join::join::{Bucket, Join, Part};
-use crate::order_search::stage_join::known::{spans, Class, Entries, Entry, Span};
+use crate::order_search::stage_join::join::{spans, Bucket, Class, Entries, Entry, Join, Part, Span};
 
 /// Sums of scores are compared with this much room: their terms may have been added in another order.
 const ROUNDING: f64 = 1e-12;

@@ -16,10 +16,9 @@ use crate::estimation::joint_fit::parameter_set::Free;
 use crate::estimation::joint_fit::{
     Attempt, Finished, Grid, JointFit, Loss, Outset, Place, Runner, Sampling, Settings, Size, Sought, Weights,
 };
-use crate::python::convert::{matrix, stacked};
+use crate::python::convert::{matrix, stacked, List};
 use crate::python::errors::attached;
 use crate::python::estimation::status;
-use crate::python::lists::List;
 use crate::python::order_search::watch::{served, Stop};
 
 type Table<'py> = Bound<'py, PyArray2<f64>>;
@@ -56,7 +55,7 @@ fn asking<T: Send + 'static>(
     py: Python<'_>,
     runs: RunsArg,
     stop: Option<&Stop>,
-    work: impl FnOnce(&crate::stop::Stop, &Asked<'_, T>) -> Result<T> + Send + 'static,
+    work: impl FnOnce(&crate::parallel::Stop, &Asked<'_, T>) -> Result<T> + Send + 'static,
 ) -> PyResult<T> {
     let (known, answering): (Known, Answering) = Known::of(runs)?;
     served(
@@ -148,7 +147,7 @@ pub fn joint_fit<'py>(
             Outset::Near { values: values.into(), noise: noise.into(), every, raced: raced.unwrap_or_default() }
         }
         (None, Some(values)) => Outset::Given(values.into()),
-        (None, None) => Outset::Starts { known: crate::python::lists::nested(known), raced },
+        (None, None) => Outset::Starts { known: crate::python::convert::nested(known), raced },
     };
     let loss = if huber { Loss::Huber } else { Loss::Squares };
     let settings = Settings { loss, refine, threads };

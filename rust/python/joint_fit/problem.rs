@@ -13,10 +13,9 @@ use crate::estimation::joint_fit::parameter_set::Free;
 use crate::estimation::joint_fit::structure::Law;
 use crate::estimation::joint_fit::{Clock, Place};
 use crate::estimation::output_error::Settings;
-use crate::python::convert::{copied, rows, stacked, vector};
+use crate::python::convert::{copied, nested, rows, stacked, vector, List};
 use crate::python::errors::{attached, detached};
 use crate::python::estimation::{evaluated, experiment, status, ExperimentArg};
-use crate::python::lists::{nested, List};
 use crate::python::order_search::watch::{leavable, Stop};
 
 type Array<'py> = Bound<'py, PyArray1<f64>>;

@@ -4,11 +4,9 @@ use numpy::{PyArray1, PyArray2, PyReadonlyArray1, PyReadonlyArray2};
 use pyo3::prelude::*;
 
 use crate::estimation::joint_fit::covariance as spread;
-use crate::python::convert::{copied, matrix, rows, vector};
+use crate::python::convert::{copied, matrix, rows, vector, List};
 use crate::python::errors::attached;
-use crate::python::lists::List;
 use crate::python::order_search::watch::leavable;
-use crate::signal::colour;
 use crate::signal::statistics;
 
 type Array<'py> = Bound<'py, PyArray1<f64>>;
@@ -74,7 +72,7 @@ pub fn coloured<'py>(
     let series = all_copied("series", &series)?;
     let points = series.iter().map(Vec::len).sum::<usize>().saturating_mul(most.max(1));
     let (filter, power) = leavable(py, points, None, move |_| {
-        Ok(colour::coloured(&series.iter().map(Vec::as_slice).collect::<Vec<_>>(), most))
+        Ok(statistics::coloured(&series.iter().map(Vec::as_slice).collect::<Vec<_>>(), most))
     })?;
     Ok((PyArray1::from_vec(py, filter), power))
 }
@@ -92,7 +90,7 @@ pub fn colour_covariances<'py>(
     let found = leavable(py, count, None, move |_| {
         // A circle of many times as many points holds them.
         crate::error::check_points("points for autocovariances", count.saturating_mul(16))?;
-        Ok(colour::covariances(&through, power, count))
+        Ok(statistics::covariances(&through, power, count))
     })?;
     Ok(PyArray1::from_vec(py, found))
 }

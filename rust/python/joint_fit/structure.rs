@@ -3,11 +3,9 @@
 use pyo3::prelude::*;
 
 use crate::error::Error;
-use crate::estimation::joint_fit::order::Order;
-use crate::estimation::joint_fit::structure::{Coefficient, Equation, Hints, Input, Law, Rubs, Structure, Term};
-use crate::python::convert::{initial, InitialArg};
+use crate::estimation::joint_fit::structure::{Coefficient, Equation, Hints, Input, Law, Order, Rubs, Structure, Term};
+use crate::python::convert::{initial, InitialArg, List};
 use crate::python::estimation::free_inputs;
-use crate::python::lists::List;
 
 /// (constant, weight of each free order by name).
 type OrderArg = (f64, List<(String, f64)>);

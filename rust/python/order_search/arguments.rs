@@ -13,8 +13,7 @@ use crate::order_search::grid::order_law::{LawEquation, LawLattice};
 use crate::order_search::options::{Criterion, Estimator, Norm, Options};
 use crate::order_search::result::{Counts, Failure, Part, Row, Verdict};
 use crate::order_search::stage_join::Span;
-use crate::python::convert::{initial, records, InitialArg, RecordArg};
-use crate::python::lists::{lists, nested, List};
+use crate::python::convert::{initial, lists, nested, records, InitialArg, List, RecordArg};
 use crate::regressors::Record;
 
 /// Change below which a candidate's instrumental variables stand still: far below what moves a rank.

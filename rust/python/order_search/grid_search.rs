@@ -1,7 +1,14 @@
 //! Searches over a lattice: at once, or in rounds that are done here or elsewhere.
+//!
+//! Certificates of equation errors over whole intervals of orders.
+//!
+//! Errors of candidates given as points, for a genetic algorithm.
+//!
+//! What tests turn and provoke: the instructions that kernels run with, and panics.
 
 use std::borrow::Cow;
 
+use numpy::{PyArray1, PyReadonlyArray2};
 use pyo3::prelude::*;
 use pyo3::types::PyDict;
 
@@ -9,14 +16,17 @@ use super::arguments::{
     checkpoint, counted, named, part, part_of, CheckpointArg, Given, OrdersArg, PartArg, SettingsArg,
 };
 use super::watch::{saved, watched};
+use crate::error::{check_length, Error};
 use crate::order_search::batches;
+use crate::order_search::certificate::{self, Asked, Range, Region};
 use crate::order_search::control::another;
+use crate::order_search::given_points::{Point, Points as PointsOf};
 use crate::order_search::grid::independent::Lattice;
+use crate::order_search::options::Norm;
 use crate::order_search::result::{Counts, Outcome, Part, Row};
-use crate::python::convert::{InitialArg, RecordArg};
+use crate::parallel::pool;
+use crate::python::convert::{records, rows, InitialArg, List, RecordArg};
 use crate::python::errors::detached;
-use crate::python::lists::List;
-use crate::threads::pool;
 
 #[pyfunction]
 #[allow(clippy::needless_pass_by_value)]
@@ -191,4 +201,103 @@ impl OrderSearch {
         })?;
         Ok(part_of(found))
     }
+}
+
+/// (output, interval of alpha, [(signal, lowest, highest), …], apart).
+type RegionTuple = (usize, (f64, f64), List<(usize, f64, f64)>, f64);
+
+/// (within, largest, cells, threads, bytes of memory).
+type AskedTuple = (f64, f64, u64, usize, u64);
+
+#[pyfunction]
+#[allow(clippy::needless_pass_by_value)]
+pub fn certify<'py>(
+    py: Python<'py>,
+    runs: List<RecordArg<'py>>,
+    region: RegionTuple,
+    asked: AskedTuple,
+    progress: Option<Py<PyAny>>,
+) -> PyResult<Bound<'py, PyDict>> {
+    let records = records(&runs)?;
+    let (output, alpha, terms, apart) = region;
+    let terms = terms.iter().map(|&(signal, lowest, highest)| Range { signal, lowest, highest }).collect();
+    let region = Region { output, alpha, terms, apart };
+    let (within, largest, cells, threads, memory) = asked;
+    let asked = Asked { within, largest, cells, threads, memory };
+    let found = watched(py, progress.as_ref(), |control| certificate::certify(&records, &region, &asked, control))?;
+    let dict = PyDict::new(py);
+    dict.set_item("at_least", found.at_least)?;
+    dict.set_item("best", found.best)?;
+    dict.set_item("alpha", found.order)?;
+    dict.set_item("orders", found.orders)?;
+    dict.set_item("cells", found.cells)?;
+    dict.set_item("open", found.open)?;
+    Ok(dict)
+}
+
+/// Errors of candidates at orders and coefficients of their own.
+#[pyclass(module = "ftlm._core")]
+pub struct Points {
+    inner: PointsOf,
+    width: usize,
+}
+
+#[pymethods]
+impl Points {
+    #[new]
+    #[allow(clippy::needless_pass_by_value)]
+    fn new(
+        py: Python<'_>,
+        runs: List<RecordArg<'_>>,
+        output: usize,
+        signals: List<usize>,
+        inputs: List<bool>,
+        squares: bool,
+    ) -> PyResult<Self> {
+        let width = signals.len();
+        let norm = if squares { Norm::L2 } else { Norm::L1 };
+        let (records, signals, inputs) = (records(&runs)?, signals.into(), inputs.into());
+        Ok(Self { inner: detached(py, || PointsOf::new(records, output, signals, inputs, norm))?, width })
+    }
+
+    /// Errors of candidates given as rows (alpha, orders, coefficients); infinite beyond the limit.
+    #[allow(clippy::needless_pass_by_value)]
+    fn scores<'py>(
+        &mut self,
+        py: Python<'py>,
+        candidates: PyReadonlyArray2<'py, f64>,
+        limit: f64,
+        threads: usize,
+    ) -> PyResult<Bound<'py, PyArray1<f64>>> {
+        let (rows, Self { inner, width }) = (rows(&candidates)?, self);
+        let found = watched(py, None, |control| {
+            let point = |row: Vec<f64>| {
+                check_length("a candidate", 1 + 2 * *width, row.len())?;
+                let (orders, coefficients) = row[1..].split_at(*width);
+                Ok(Point { order: row[0], orders: orders.to_vec(), coefficients: coefficients.to_vec() })
+            };
+            let points = rows.into_iter().map(point).collect::<Result<Vec<_>, Error>>()?;
+            inner.scores(&points, limit, threads, control)
+        })?;
+        Ok(PyArray1::from_vec(py, found))
+    }
+}
+
+/// Panics where it is told to, so that a test can see what becomes of a panic: in a call, in the thread that a search
+/// runs on, or in one of its workers.
+#[pyfunction]
+#[allow(clippy::panic)]
+pub fn panic_on_purpose(py: Python<'_>, place: &str) -> PyResult<()> {
+    let fault = || std::panic::panic_any("on purpose");
+    match place {
+        "call" => detached(py, fault),
+        "search" => watched(py, None, |_| fault()),
+        _ => watched(py, None, |_| pool(2)?.install(|| rayon::join(fault, || ()).0)),
+    }
+}
+
+/// Whether kernels run as they are compiled for the oldest machine.
+#[pyfunction]
+pub fn portable(on: bool) {
+    crate::simd::portable(on);
 }

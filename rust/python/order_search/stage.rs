@@ -12,10 +12,9 @@ use crate::error::Error;
 use crate::order_search::grid::order_law::LawLattice;
 use crate::order_search::result::Counts;
 use crate::order_search::stage_join::{self, Course, Stage, StageOutcome, StageRow};
-use crate::python::convert::{InitialArg, RecordArg};
+use crate::parallel::pool;
+use crate::python::convert::{nested, InitialArg, List, RecordArg};
 use crate::python::errors::detached;
-use crate::python::lists::{nested, List};
-use crate::threads::pool;
 
 #[pyfunction]
 #[allow(clippy::needless_pass_by_value, clippy::too_many_arguments)]

@@ -9,8 +9,8 @@ use pyo3::prelude::*;
 use super::arguments::checkpoint_of;
 use crate::error::Error;
 use crate::order_search::control::Control;
+use crate::parallel;
 use crate::python::errors::{attached, caught, detached};
-use crate::stop;
 
 /// How often Python is asked for signals: well under the half second after which Ctrl-C must have ended a search.
 const LOOK: Duration = Duration::from_millis(50);
@@ -80,7 +80,7 @@ const SHORT: usize = 1 << 17;
 /// A flag that ends what was given it: [`leavable`] work on other threads than the one that Ctrl-C interrupts.
 #[pyclass(module = "ftlm._core", frozen)]
 #[derive(Clone, Default)]
-pub struct Stop(stop::Stop);
+pub struct Stop(parallel::Stop);
 
 #[pymethods]
 impl Stop {
@@ -111,7 +111,7 @@ pub fn leavable<T: Send + 'static>(
     py: Python<'_>,
     points: usize,
     flag: Option<&Stop>,
-    work: impl FnOnce(&stop::Stop) -> Result<T, Error> + Send + 'static,
+    work: impl FnOnce(&parallel::Stop) -> Result<T, Error> + Send + 'static,
 ) -> PyResult<T> {
     let stop = flag.cloned().unwrap_or_default().0;
     if points < SHORT {
@@ -170,7 +170,7 @@ pub fn served<T: Send + 'static, Q: Send + 'static, A: Send + 'static>(
     py: Python<'_>,
     flag: Option<&Stop>,
     answer: impl Fn(Python<'_>, Q) -> PyResult<A> + Send + Sync,
-    work: impl FnOnce(&stop::Stop, &Desk<Q, A, T>) -> Result<T, Error> + Send + 'static,
+    work: impl FnOnce(&parallel::Stop, &Desk<Q, A, T>) -> Result<T, Error> + Send + 'static,
 ) -> PyResult<T> {
     let stop = flag.cloned().unwrap_or_default().0;
     py.detach(|| {

@@ -6,12 +6,11 @@
 
 use std::collections::BTreeMap;
 
-use super::lattices::runner;
-use super::order_grid::{check_linear, known, named_coefficients, side_by_side, Coarse, Row};
+use super::order_grid::{check_linear, known, named_coefficients, runner, side_by_side, Coarse, Row};
 use crate::equation::{Initial, Structure as Bare, Term as BareTerm};
 use crate::error::Result;
 use crate::estimation::joint_fit::parameter_set::Free;
-use crate::estimation::joint_fit::runner::Runner;
+use crate::estimation::joint_fit::problem::Runner;
 use crate::estimation::joint_fit::structure::{Equation, Structure, Term};
 use crate::estimation::resonance_scan::projected;
 use crate::signal::statistics::median;

@@ -6,10 +6,10 @@ use std::sync::mpsc::channel;
 use crate::error::{Error, Result};
 use crate::estimation::joint_fit::objective::{Grid, TOLERANCE};
 use crate::estimation::joint_fit::parameter_set::Free;
+use crate::estimation::joint_fit::problem::Runner;
 use crate::estimation::joint_fit::progress::Listener;
-use crate::estimation::joint_fit::runner::Runner;
 use crate::estimation::output_error::{Experiment, Settings};
-use crate::stop::Stop;
+use crate::parallel::Stop;
 
 /// Evaluations of every coarse fit, then of those that are ahead: one in [`RUNNERS`], but not fewer than [`FEWEST`].
 pub(super) const FIRST_LAP: usize = 15;
@@ -212,7 +212,7 @@ pub fn distinct(runners: &[Runner], same: impl Fn(&Runner, &Runner) -> bool) -> 
 #[cfg(test)]
 mod tests {
     use super::*;
-    use crate::estimation::joint_fit::attempt::{Attempt, Place};
+    use crate::estimation::joint_fit::problem::{Attempt, Place};
     use crate::estimation::output_error::Point;
 
     fn ended(level: f64, order: f64) -> Runner {

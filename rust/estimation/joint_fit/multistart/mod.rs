@@ -4,21 +4,11 @@
 //! inside a problem, whose optima it reaches, too: a term less ([`Simpler`]), an order less ([`LowerOrder`]), orders known
 //! ([`Held`]) or whole ([`Whole`]).
 
-mod behind;
-mod bodies;
 mod coarse_grid;
 mod halving;
-mod known;
-mod lower;
 mod nested_models;
 mod search;
-mod thinned;
-mod whole;
 
-pub use bodies::on_coarse_grids;
 pub use halving::{distinct, finalists, in_reach, same_optimum, same_place};
-pub use known::{held, Held};
-pub use lower::{lower_order, LowerOrder};
-pub use nested_models::{simpler, unlike, Simpler};
-pub use search::{race, Course, Starts};
-pub use whole::{whole, Whole};
+pub use nested_models::{held, lower_order, simpler, unlike, whole, Held, LowerOrder, Simpler, Whole};
+pub use search::{on_coarse_grids, race, Course, Starts};

@@ -1,26 +1,24 @@
 //! The race itself: who runs how far, and the problems inside a problem.
+//!
+//! Those that are behind: who is still on the way goes on.
+//!
+//! Starts of bodies with friction on coarse grids.
 
-use super::behind::{on_the_way, stirred};
-use super::coarse_grid::fine_enough;
+use super::coarse_grid::{fine_enough, thinned};
 use super::halving::{
     distinct, finalists, in_reach, same_optimum, same_place, sorted, Laps, CONTENDER, FEWEST, FINALISTS, FIRST_LAP,
     GLANCE, RUNNERS, SECOND_LAP,
 };
-use super::known::{held, Held};
-use super::lower::{lower_order, LowerOrder};
-use super::nested_models::{simpler, unlike, Simpler};
-use super::thinned::thinned;
-use super::whole::{whole, Whole};
+use super::nested_models::{held, lower_order, simpler, unlike, whole, Held, LowerOrder, Simpler, Whole};
 use crate::equation::Initial;
 use crate::error::{Error, Kind, Result};
-use crate::estimation::joint_fit::clock::Clock;
 use crate::estimation::joint_fit::objective::{Grid, Weights, FINEST};
-use crate::estimation::joint_fit::parameter_set::Free;
+use crate::estimation::joint_fit::parameter_set::{Clock, Free};
+use crate::estimation::joint_fit::problem::Runner;
 use crate::estimation::joint_fit::progress::Listener;
-use crate::estimation::joint_fit::runner::Runner;
 use crate::estimation::joint_fit::source::Recordings;
 use crate::estimation::joint_fit::structure::{Equation, Structure};
-use crate::stop::Stop;
+use crate::parallel::Stop;
 
 /// All get as many evaluations as those ahead where the best is above the noise by this factor; of those further behind than
 /// contenders are, by no more than the second factor, who falls by a share in a few evaluations.
@@ -323,4 +321,62 @@ fn with_history(free: &Free, course: Course<'_>) -> Result<Vec<Runner>> {
     let mut ahead = ranked(&coarse, None, laps.run(free, &coarse, &going, FIRST_LAP)?)?;
     ahead.extend(rest.into_iter().map(|i| reached[i].clone()));
     Ok(distinct(&ahead, same_optimum))
+}
+
+/// Behind the first, a start goes on while a lap lowers its cost by this share: what has come to rest overtakes nobody.
+const ON_THE_WAY: f64 = 0.05;
+/// Of those further behind than contenders are, who falls by a share in a few evaluations.
+const STIR: usize = 5;
+const STIRS: f64 = 0.1;
+
+/// Where those behind end, each for as long as it is getting on, but no longer than a second lap.
+pub(super) fn on_the_way(laps: Laps<'_>, free: &Free, coarse: &Grid<'_>, behind: &[Runner]) -> Result<Vec<Runner>> {
+    let (mut ended, mut going) = (Vec::new(), behind.to_vec());
+    for _ in 0..SECOND_LAP / FIRST_LAP {
+        let mut further = Vec::new();
+        for (runner, at) in going.iter().zip(laps.each(free, coarse, &going, FIRST_LAP)?) {
+            let Some(at) = at else { continue };
+            let gets_on = at.level() < (1.0 - ON_THE_WAY) * runner.level();
+            if gets_on { &mut further } else { &mut ended }.push(at);
+        }
+        going = further;
+    }
+    ended.extend(going);
+    Ok(ended)
+}
+
+/// Where those no further behind are after a few evaluations that lower their cost by a share; and the others.
+pub(super) fn stirred(
+    laps: Laps<'_>,
+    free: &Free,
+    coarse: &Grid<'_>,
+    lost: &[Runner],
+    farthest: f64,
+) -> Result<(Vec<Runner>, Vec<Runner>)> {
+    let (near, mut still): (Vec<Runner>, Vec<Runner>) = lost.iter().cloned().partition(|r| r.level() <= farthest);
+    let mut moving = Vec::new();
+    let ends = laps.each(free, coarse, &near, STIR)?;
+    for (runner, at) in near.into_iter().zip(ends) {
+        match at.filter(|at| at.level() < (1.0 - STIRS) * runner.level()) {
+            Some(at) => moving.push(at),
+            None => still.push(runner),
+        }
+    }
+    Ok((moving, still))
+}
+
+/// Where starts get on coarse grids, best first.
+///
+/// # Errors
+/// Those of the source, [`crate::error::Error::Interrupted`].
+pub fn on_coarse_grids(free: &Free, coarse: &Grid<'_>, starts: &[Runner], threads: usize) -> Result<Vec<Runner>> {
+    let laps = Laps { starts: starts.len(), threads, told: None };
+    let mut coarse = coarse.clone();
+    let mut ended = laps.run(free, &coarse, starts, FIRST_LAP)?;
+    while coarse.sampling.every < FINEST && ended.is_empty() {
+        coarse = coarse.finer()?;
+        ended = laps.run(free, &coarse, starts, FIRST_LAP)?;
+    }
+    ended.truncate(2 * FINALISTS);
+    laps.run(free, &coarse, &ended, SECOND_LAP)
 }
