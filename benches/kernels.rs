@@ -5,14 +5,16 @@ use std::time::Duration;
 
 use criterion::{criterion_group, criterion_main, BatchSize, BenchmarkId, Criterion, SamplingMode, Throughput};
 use ftlm::equation::{Equation, Initial, Structure, Term};
-use ftlm::kernels::{block_pulse_kernel, kernel_with_derivative};
+use ftlm::fractional::kernels::{block_pulse_kernel, kernel_with_derivative};
+use ftlm::fractional::operational_matrices;
+use ftlm::order_search::batches::search;
+use ftlm::order_search::control::Control;
+use ftlm::order_search::grid::{Lattice, TermAxis};
+use ftlm::order_search::options::{Criterion as Criterium, Estimator, Norm, Options};
 use ftlm::regressors::Record;
-use ftlm::search::control::Control;
-use ftlm::search::lattice::{Lattice, TermAxis};
-use ftlm::search::options::{Criterion as Criterium, Estimator, Norm, Options};
-use ftlm::search::rounds::search;
 use ftlm::series::{self, Buffers, Kernel};
-use ftlm::{haar, metrics, operational, simulate};
+use ftlm::signal::metrics;
+use ftlm::simulate;
 
 /// 2048 pulses is a record of the paper; the longer ones show the growth.
 const LENGTHS: [usize; 3] = [1 << 11, 1 << 14, 1 << 17];
@@ -75,7 +77,7 @@ fn haar_transform(c: &mut Criterion) {
         let signal = noise(m, 3);
         group.throughput(Throughput::Elements(m as u64));
         group.bench_with_input(BenchmarkId::new("transform", m), &m, |b, _| {
-            b.iter_batched_ref(|| signal.clone(), |x| haar::transform(x), BatchSize::LargeInput);
+            b.iter_batched_ref(|| signal.clone(), |x| operational_matrices::transform(x), BatchSize::LargeInput);
         });
     }
     group.finish();
@@ -100,8 +102,10 @@ fn correlations(c: &mut Criterion) {
 fn operational_matrices(c: &mut Criterion) {
     let mut group = c.benchmark_group("operational matrix of 2048");
     group.sample_size(10);
-    group.bench_function("fast", |b| b.iter(|| operational::operational_matrix(black_box(0.85), 2048, 1e-3)));
-    group.bench_function("dense", |b| b.iter(|| operational::operational_matrix_dense(black_box(0.85), 2048, 1e-3)));
+    group.bench_function("fast", |b| b.iter(|| operational_matrices::operational_matrix(black_box(0.85), 2048, 1e-3)));
+    group.bench_function("dense", |b| {
+        b.iter(|| operational_matrices::operational_matrix_dense(black_box(0.85), 2048, 1e-3))
+    });
     group.finish();
 }
 

@@ -9,26 +9,27 @@ use std::hint::black_box;
 use std::time::Instant;
 
 use ftlm::equation::{Equation, Initial, Structure, Term};
-use ftlm::estimate::joint::free::{
-    Coefficient, Equation as FreeEquation, Free, Order, Structure as FreeStructure, Term as FreeTerm,
+use ftlm::estimation::joint_fit::fit;
+use ftlm::estimation::joint_fit::initial_guesses::Lattices;
+use ftlm::estimation::joint_fit::parameter_set::Free;
+use ftlm::estimation::joint_fit::structure::{
+    Coefficient, Equation as FreeEquation, Order, Structure as FreeStructure, Term as FreeTerm,
 };
-use ftlm::estimate::joint::starts::Lattices;
-use ftlm::estimate::joint::{fit, Loss, Outset, Sampled, Settings, Signal, Size, Sought};
-use ftlm::estimate::least_squares;
+use ftlm::estimation::joint_fit::{Loss, Outset, Sampled, Settings, Signal, Size, Sought};
+use ftlm::estimation::least_squares;
 use ftlm::fft::{self, Bin, Workspace};
-use ftlm::kernels::block_pulse_kernel;
-use ftlm::means::Intersample;
-use ftlm::operational::{block_pulse_matrix, operational_matrix, operational_matrix_dense};
+use ftlm::fractional::kernels::block_pulse_kernel;
+use ftlm::fractional::operational_matrices::{block_pulse_matrix, operational_matrix, operational_matrix_dense};
+use ftlm::order_search::batches::{search, Search};
+use ftlm::order_search::certificate::{certify, Asked, Range, Region};
+use ftlm::order_search::control::Control;
+use ftlm::order_search::grid::{Lattice, TermAxis};
+use ftlm::order_search::options::{Criterion, Estimator, Norm, Options};
+use ftlm::parallel::{pool, Stop};
 use ftlm::regressors::Record;
-use ftlm::search::certificate::{certify, Asked, Range, Region};
-use ftlm::search::control::Control;
-use ftlm::search::lattice::{Lattice, TermAxis};
-use ftlm::search::options::{Criterion, Estimator, Norm, Options};
-use ftlm::search::rounds::{search, Search};
-use ftlm::search::threads::pool;
 use ftlm::series::{self, Buffers, Division, Kernel};
+use ftlm::signal::block_pulse::Intersample;
 use ftlm::simulate;
-use ftlm::stop::Stop;
 
 /// Processor seconds of this thread where the system tells them; right to a few milliseconds.
 fn processor() -> Option<f64> {

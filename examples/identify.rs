@@ -3,15 +3,15 @@
 
 use ftlm::equation::{AffineOrder, Equation, Initial, Structure, Term};
 use ftlm::error::Result;
-use ftlm::estimate::output_error::{
+use ftlm::estimation::output_error::{
     fit, Coordinate, Experiment, FreeEquation, FreeModel, Monomial, Point, Settings, Status,
 };
-use ftlm::means::point_samples;
+use ftlm::order_search::batches::search;
+use ftlm::order_search::control::Control;
+use ftlm::order_search::grid::{Lattice, TermAxis};
+use ftlm::order_search::options::{Criterion, Estimator, Norm, Options};
 use ftlm::regressors::Record;
-use ftlm::search::control::Control;
-use ftlm::search::lattice::{Lattice, TermAxis};
-use ftlm::search::options::{Criterion, Estimator, Norm, Options};
-use ftlm::search::rounds::search;
+use ftlm::signal::block_pulse::point_samples;
 use ftlm::simulate;
 
 /// Pulses of the run, and their width \[s\].

@@ -8,10 +8,11 @@ use std::cell::RefCell;
 use std::collections::BTreeMap;
 use std::sync::Arc;
 
-pub use realfft::num_complex::Complex;
 use realfft::{ComplexToReal, RealFftPlanner, RealToComplex};
 
-use crate::shared::Shared;
+pub use realfft::num_complex::Complex;
+
+use crate::parallel::Shared;
 
 /// One complex number of a spectrum.
 pub type Bin = Complex<f64>;

@@ -2,23 +2,21 @@
 //!
 //! The modules in the order in which a measurement passes them:
 //!
-//! 1. [`means`]: point samples become means over block pulses; [`readings`]: and means samples at times of their own;
-//! 2. [`kernels`], [`excess`], [`fractional`], [`series`], [`haar`], [`operational`]: fractional integrals as truncated power series
-//!    in the one-step delay, and the operational matrices of the literature beside them ([`fft`] and [`dense`] serve
-//!    them);
-//! 3. [`equation`], [`regularity`]: terms, orders, order laws, sensor filters; whether equations tell their outputs
-//!    apart;
+//! 1. [`signal`]: point samples become means over block pulses, and means samples at times of their own;
+//! 2. [`fractional`], [`series`]: fractional integrals as truncated power series in the one-step delay, and the
+//!    operational matrices of the literature beside them ([`fft`], [`linalg`] and [`simd`] serve them);
+//! 3. [`equation`]: terms, orders, order laws, sensor filters; whether equations tell their outputs apart;
 //! 4. [`regressors`]: a record and an equation become regressors I^{α−ν} s;
-//! 5. [`estimate`]: coefficients at given orders by least squares, multi-innovation least squares and instrumental
-//!    variables; orders and coefficients together by joint output error ([`small`] and [`memory`] serve them);
-//!    [`friction`]: free runs of a body that may stick, and their output error;
-//! 6. [`search`]: the orders themselves, exhaustively over a lattice;
-//! 7. [`simulate`], [`metrics`]: free runs, the two errors, and what they amount to; [`statistics`], [`colour`]: what the
-//!    residuals say.
+//! 5. [`estimation`]: coefficients at given orders by least squares, multi-innovation least squares and instrumental
+//!    variables; orders and coefficients together by joint output error; [`friction`]: free runs of a body that
+//!    may stick, and their output error;
+//! 6. [`order_search`]: the orders themselves, exhaustively over a lattice;
+//! 7. [`simulate`], [`signal::metrics`]: free runs, the two errors, and what they amount to; [`signal::statistics`]:
+//!    what the residuals say.
 //!
 //! ```
 //! use ftlm::equation::{Equation, Initial, Structure, Term};
-//! use ftlm::estimate::least_squares;
+//! use ftlm::estimation::least_squares;
 //! use ftlm::regressors::Record;
 //! use ftlm::simulate;
 //!
@@ -48,42 +46,25 @@
 #![cfg_attr(docsrs, feature(doc_cfg))]
 
 pub mod error;
-pub mod means;
-pub mod readings;
-pub mod stop;
+pub mod parallel;
 
-pub mod excess;
+pub mod fft;
+pub mod linalg;
+pub mod simd;
+
+pub mod signal;
+
 pub mod fractional;
-pub mod haar;
-pub mod kernels;
-pub mod operational;
 pub mod series;
 
-mod abreast;
-pub mod dense;
-pub mod fft;
-pub mod lanes;
-mod orthogonal;
-mod powers;
-mod shared;
-
-mod driven;
 pub mod equation;
-mod impulses;
 pub mod regressors;
-pub mod regularity;
-
-pub mod estimate;
-pub mod friction;
-pub mod memory;
-pub mod small;
-
-pub mod search;
-
-pub mod colour;
-pub mod metrics;
+mod series_system;
 pub mod simulate;
-pub mod statistics;
+
+pub mod estimation;
+pub mod friction;
+pub mod order_search;
 
 #[cfg(feature = "rig")]
 pub mod rig;

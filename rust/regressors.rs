@@ -1,15 +1,18 @@
 //! Records and equations become one bank of distinct regressors I^η s, shared by all candidates of a search.
+//!
+//! What the sensor filter of an output still held when a run began: its answers to an impulse and to derivatives of one.
+//!
+//! They are written as powers of t below zero, −1, −2, …, among the initial terms of an equation. They move nothing, and are
+//! added to the output that came through the sensor. Only where the whole equation is put through the filter afterwards, with
+//! an output that was not measured through it, do they drive the equation like others: what drives then held them.
 
 use std::collections::{BTreeMap, BTreeSet, HashMap};
 
-use crate::abreast;
 use crate::equation::{grains, tidy};
 use crate::error::{check_finite, check_length, check_step, Error, Result};
-use crate::excess::kernel;
-use crate::impulses::is_impulse;
-use crate::kernels::{power_means, power_pulses};
+use crate::fractional::kernels::{kernel, power_means, power_pulses};
+use crate::parallel::{self, Stop};
 use crate::series::{self, Buffers, Kernel};
-use crate::stop::Stop;
 
 /// Largest bank that is made for itself, and what a search takes in all where no other limit is given, in bytes.
 pub const BANK_LIMIT: u64 = 2 << 30;
@@ -459,14 +462,14 @@ impl Bank {
             orders.values().filter(|made| made.order != 0).flat_map(|made| &made.columns).map(|(s, _)| *s).collect();
         let signals = integrated.into_iter().collect();
         let spectrum = |(): &mut (), signal: usize| (signal, Kernel::new(record.signal(signal)));
-        let spectra: BTreeMap<usize, Kernel> = abreast::map(signals, || (), spectrum).into_iter().collect();
-        abreast::map(orders.into_values().collect(), Buffers::default, |buffers, made| {
+        let spectra: BTreeMap<usize, Kernel> = parallel::map(signals, || (), spectrum).into_iter().collect();
+        parallel::map(orders.into_values().collect(), Buffers::default, |buffers, made| {
             if !stop.is_set() {
                 made.write(record, &spectra, buffers);
             }
         });
         stop.check()?;
-        abreast::map(
+        parallel::map(
             initial,
             || (),
             |(), (exponent, column)| {
@@ -509,5 +512,26 @@ impl Bank {
     #[must_use]
     pub fn is_empty(&self) -> bool {
         self.own.is_empty()
+    }
+}
+
+/// Whether an exponent stands for an impulse or a derivative of one.
+pub(crate) fn is_impulse(exponent: f64) -> bool {
+    exponent <= -1.0 && exponent.fract() == 0.0
+}
+
+/// Initial terms that move something, and impulses, by equation.
+#[allow(clippy::type_complexity)]
+pub(crate) fn parted(powers: &[Vec<(f64, f64)>]) -> (Vec<Vec<(f64, f64)>>, Vec<Vec<(f64, f64)>>) {
+    powers.iter().map(|own| own.iter().partition(|(e, _)| !is_impulse(*e))).unzip()
+}
+
+/// Adds impulses and their derivatives to pulse means of outputs.
+pub(crate) fn add_impulses(outputs: &mut [Vec<f64>], impulses: &[Vec<(f64, f64)>], step: f64) {
+    for (output, own) in outputs.iter_mut().zip(impulses) {
+        for &(exponent, value) in own.iter().filter(|(_, value)| *value != 0.0) {
+            let means = power_means(exponent, output.len(), step);
+            output.iter_mut().zip(means).for_each(|(s, v)| *s += value * v);
+        }
     }
 }

@@ -1,14 +1,12 @@
 //! Response of an equation and of a coupled model, the two errors of a model, and the explicit Euler baseline.
 
-use crate::driven::System;
-use crate::equation::{Equation, Initial, Structure, ORDER_GRAIN};
+use crate::equation::{check_regular, Equation, Initial, Structure, ORDER_GRAIN};
 use crate::error::{check_finite, check_length, check_step, Error, Result};
-use crate::estimate::least_squares;
-use crate::excess::kernel;
-use crate::impulses::is_impulse;
-use crate::regressors::Record;
-use crate::regularity::check_regular;
+use crate::estimation::least_squares;
+use crate::fractional::kernels::kernel;
+use crate::regressors::{is_impulse, Record};
 use crate::series;
+use crate::series_system::System;
 
 /// A response with the initial terms that were fitted to the measured outputs.
 #[derive(Debug, Clone, PartialEq)]
@@ -109,7 +107,9 @@ pub fn inverse(equations: &[Equation], record: &Record) -> Result<Vec<Vec<Vec<f6
 /// As [`respond`]; [`Error::Structure`] for an equation that is not there.
 ///
 /// ```
-/// # use ftlm::{equation::{Equation, Structure, Term}, regressors::Record, simulate};
+/// # use ftlm::equation::{Equation, Structure, Term};
+/// # use ftlm::regressors::Record;
+/// # use ftlm::simulate;
 /// # fn main() -> ftlm::error::Result<()> {
 /// // D y = -2 y from y(0) = 1, and from a constant on its right-hand side, which is t^1.
 /// let structure = Structure { output: 0, order: 1.0, terms: vec![Term { signal: 0, order: 0.0 }] };

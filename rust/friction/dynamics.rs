@@ -5,22 +5,19 @@
 //! velocities obey the same equations, all that drives them differentiated once, and so do their values at the edges of
 //! the pulses: what drives them is there what its pulses add up to, exactly for what is constant within each, and they
 //! themselves are lines between edges, whose integrals have the kernels of pulse means
-//! ([`crate::kernels::block_pulse_kernel`]). So a body feels at once what carries it, friction of the pulse included.
+//! ([`crate::fractional::kernels::block_pulse_kernel`]). So a body feels at once what carries it, friction of the pulse
+//! included.
 
-use super::integrals::{product, Driver, Integrated};
+use super::contact::{is_p_matrix, March, Rubbing, Trace};
+use super::convolution::{product, Driver, Heads, Integrated};
+use super::initial_state::{Forcing, Link};
 use super::law::Law;
-use super::march::{March, Trace};
-use super::online::Heads;
-use super::pulses::{is_p_matrix, Rubbing};
-use super::states::{Forcing, Link};
-use crate::equation::{Equation, Initial, ORDER_GRAIN};
+use crate::equation::{check_regular, Equation, Initial, ORDER_GRAIN};
 use crate::error::{check_finite, check_length, Error, Result};
-use crate::excess::{kernel_and_slope, MAX_EXCESS};
-use crate::impulses::{add_impulses, parted};
-use crate::regressors::Record;
-use crate::regularity::check_regular;
+use crate::fractional::kernels::{kernel_and_slope, MAX_EXCESS};
+use crate::linalg::small;
+use crate::regressors::{add_impulses, parted, Record};
 use crate::series::{self, Kernel, Solver};
-use crate::small;
 
 /// Equations that follow each other's outputs, some of them with friction of their own output's velocity.
 #[derive(Debug, Clone, PartialEq)]
@@ -158,7 +155,8 @@ impl Body {
     ///
     /// ```
     /// use ftlm::equation::{Equation, Structure, Term};
-    /// use ftlm::friction::{Body, Law};
+    /// use ftlm::friction::dynamics::Body;
+    /// use ftlm::friction::law::Law;
     /// use ftlm::regressors::Record;
     /// # fn main() -> ftlm::error::Result<()> {
     /// // A block slides at 1 m/s on friction of 2 m/s²: it stops after half a second, 0.25 m on, and stays.

@@ -2,10 +2,11 @@
 
 use super::model::{Evaluation, FrictionModel, Point};
 use crate::error::{check_finite, check_length, Result};
-use crate::estimate::output_error::levenberg_marquardt::{minimise, Problem, Settings, Status};
-use crate::estimate::output_error::Experiment;
-use crate::orthogonal::extend_orthonormal;
-use crate::stop::Stop;
+use crate::estimation::optimization::damped_step::Problem;
+use crate::estimation::optimization::levenberg_marquardt::{minimise, Settings, Status};
+use crate::estimation::output_error::Experiment;
+use crate::linalg::orthogonal::extend_orthonormal;
+use crate::parallel::Stop;
 
 /// Where a fit starts.
 #[derive(Debug, Clone, Default, PartialEq)]

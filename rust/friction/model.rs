@@ -1,14 +1,13 @@
 //! Bodies with friction whose orders and coefficients are free: residuals on every experiment, and their derivatives.
 
+use super::convolution::{product, Integrated};
 use super::dynamics::{at_rest, Body, Operators, Run};
-use super::integrals::{product, Integrated};
+use super::initial_state::{together, Forcing, State};
 use super::law::Law;
-use super::states::{together, Forcing, State};
 use crate::equation::{Equation, Initial, Structure, Term};
 use crate::error::{check_length, Error, Result};
-use crate::estimate::output_error::{Coordinate, Experiment, FreeEquation, FreeInput, InputLaw, Monomial};
-use crate::impulses::{add_impulses, parted};
-use crate::regressors::Record;
+use crate::estimation::output_error::{Coordinate, Experiment, FreeEquation, FreeInput, InputLaw, Monomial};
+use crate::regressors::{add_impulses, parted, Record};
 use crate::series::Kernel;
 
 /// Friction each of whose numbers may be free: a multiple of one coefficient.

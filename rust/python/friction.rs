@@ -4,18 +4,17 @@ use numpy::{PyArray1, PyArray2};
 use pyo3::prelude::*;
 use pyo3::types::PyDict;
 
-use super::arrays::{initial, record, stacked, structure, InitialArg, RecordArg, StructureArg};
-use super::estimate::{
+use super::convert::{initial, nested, record, stacked, structure, InitialArg, List, RecordArg, StructureArg};
+use super::estimation::{
     coordinates, evaluated, experiment, free_equation, free_inputs, status, ExperimentArg, FreeEquationArg,
     FreeInputArg, MonomialArg,
 };
-use super::lists::{nested, List};
-use super::search::watch::{leavable, Stop};
 use crate::equation::Equation;
-use crate::estimate::output_error as joint;
+use crate::estimation::output_error as joint;
+use crate::friction::contact::Trace;
 use crate::friction::law::Phase;
-use crate::friction::march::Trace;
 use crate::friction::{self, Body, FreeLaw, FrictionModel, Law, Start};
+use crate::python::order_search::watch::{leavable, Stop};
 
 #[pyfunction]
 #[allow(clippy::needless_pass_by_value)]

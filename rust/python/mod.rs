@@ -1,16 +1,14 @@
 //! Bindings: the only users of pyo3 and numpy. Arrays are checked here once, then trusted; Python is detached in every
 //! call that computes.
 
-mod arrays;
-mod dense;
+mod convert;
 mod errors;
-mod estimate;
+mod estimation;
 mod friction;
-mod joint;
-mod lists;
+mod joint_fit;
 mod operators;
-mod search;
-mod simulate;
+mod order_search;
+mod simulation;
 mod virtual_arm;
 
 use pyo3::prelude::*;
@@ -21,53 +19,53 @@ mod _core {
     use super::*;
 
     #[pymodule_export]
-    use super::operators::{
+    use crate::python::operators::{
         block_pulse_kernel, block_pulse_matrix, delayed, filter_series, fractional_derivative, fractional_integral,
         grunwald_letnikov_weights, haar_inverse, haar_matrix, haar_transform, operational_matrix, point_samples,
         pulse_means, series_divide, series_multiply,
     };
 
     #[pymodule_export]
-    use super::dense::{singular, triangle};
+    use crate::python::operators::{singular, triangle};
 
     #[pymodule_export]
-    use super::estimate::{
+    use crate::python::estimation::{
         grows, instrumental_variables, least_squares, multi_innovation, output_error, projected_errors, Streaming,
     };
 
     #[pymodule_export]
-    use super::friction::{friction_error, friction_respond};
+    use crate::python::friction::{friction_error, friction_respond};
 
     #[pymodule_export]
-    use super::joint::{
+    use crate::python::joint_fit::{
         autocovariances, chi_squared, colour_covariances, coloured, covariance_of, fit_covariance, is_white, joint_fit,
         joint_grids, joint_race, long_run, JointClock, JointProblem, JointRace,
     };
 
     #[pymodule_export]
-    use super::simulate::{
+    use crate::python::simulation::{
         corners, correlation, equation_error, explicit_euler, metrics, nyquist_margin, read_at, respond,
         respond_and_units, respond_with_initial, trace_errors,
     };
 
     #[pymodule_export]
-    use super::search::{
+    use crate::python::order_search::{
         certify, lattice_size, panic_on_purpose, portable, search, search_join, search_plan, search_stage, OrderSearch,
         Points, StageSearch,
     };
 
     #[pymodule_export]
-    use super::search::watch::Stop;
+    use crate::python::order_search::watch::Stop;
 
     #[pymodule_export]
-    use super::virtual_arm::{fractional_memory, Guard, VirtualArm};
+    use crate::python::virtual_arm::{fractional_memory, Guard, VirtualArm};
 
     #[pymodule_init]
     fn init(module: &Bound<'_, PyModule>) -> PyResult<()> {
         // NumPy's interface and the one that counts borrows are found when they are first used, and would panic where a
         // Ctrl-C arrives just then.
         module.py().import("numpy")?;
-        super::errors::attached(|| {
+        crate::python::errors::attached(|| {
             drop(numpy::PyArrayMethods::readonly(&numpy::PyArray1::<f64>::zeros(module.py(), 0, false)));
             Ok(())
         })?;

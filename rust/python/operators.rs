@@ -1,18 +1,21 @@
 //! Kernels, transforms, matrices, fractional integrals and derivatives, pulse means.
+//!
+//! Factors of tall matrices, given by their columns as rows of an array.
 
 use numpy::{PyArray1, PyArray2, PyReadonlyArray1, PyReadonlyArray2};
 use pyo3::prelude::*;
 
-use super::arrays::{columns, copied, matrix, rows, stacked, vector};
+use super::convert::{columns, copied, matrix, rows, stacked, vector, List};
 use super::errors::detached;
-use super::lists::List;
-use super::search::watch::leavable;
 use crate::equation::Filter;
 use crate::error::{check_dense, check_finite, check_length, check_points, check_step, Error};
-use crate::fractional::{self, Derivative, IntegralRule};
-use crate::kernels;
-use crate::means::{self, Intersample};
-use crate::{haar, operational, series};
+use crate::fractional::integral::{self, Derivative, IntegralRule};
+use crate::fractional::kernels;
+use crate::fractional::operational_matrices;
+use crate::linalg::dense;
+use crate::python::order_search::watch::leavable;
+use crate::series;
+use crate::signal::block_pulse::{self, Intersample};
 
 type Array<'py> = Bound<'py, PyArray1<f64>>;
 type Matrix<'py> = Bound<'py, PyArray2<f64>>;
@@ -48,12 +51,12 @@ pub fn grunwald_letnikov_weights(py: Python<'_>, order: f64, m: usize) -> PyResu
 
 #[pyfunction]
 pub fn haar_transform<'py>(py: Python<'py>, x: PyReadonlyArray2<'py, f64>) -> PyResult<Matrix<'py>> {
-    transformed(py, &x, haar::transform)
+    transformed(py, &x, operational_matrices::transform)
 }
 
 #[pyfunction]
 pub fn haar_inverse<'py>(py: Python<'py>, x: PyReadonlyArray2<'py, f64>) -> PyResult<Matrix<'py>> {
-    transformed(py, &x, haar::inverse)
+    transformed(py, &x, operational_matrices::inverse)
 }
 
 fn transformed<'py>(
@@ -76,7 +79,7 @@ fn transformed<'py>(
 pub fn haar_matrix(py: Python<'_>, m: usize) -> PyResult<Matrix<'_>> {
     let values = detached(py, || {
         check_dense(m)?;
-        haar::matrix(m)
+        operational_matrices::matrix(m)
     })?;
     matrix(py, values, m)
 }
@@ -85,7 +88,7 @@ pub fn haar_matrix(py: Python<'_>, m: usize) -> PyResult<Matrix<'_>> {
 pub fn block_pulse_matrix(py: Python<'_>, order: f64, m: usize, step: f64) -> PyResult<Matrix<'_>> {
     let values = detached(py, || {
         check_dense(m)?;
-        operational::block_pulse_matrix(order, m, step)
+        operational_matrices::block_pulse_matrix(order, m, step)
     })?;
     matrix(py, values, m)
 }
@@ -96,9 +99,9 @@ pub fn operational_matrix(py: Python<'_>, order: f64, m: usize, step: f64, dense
     let values = detached(py, || {
         check_dense(m)?;
         if dense {
-            operational::operational_matrix_dense(order, m, step)
+            operational_matrices::operational_matrix_dense(order, m, step)
         } else {
-            operational::operational_matrix(order, m, step)
+            operational_matrices::operational_matrix(order, m, step)
         }
     })?;
     matrix(py, values, m)
@@ -160,7 +163,7 @@ pub fn fractional_integral<'py>(
     let out = leavable(py, points, None, move |stop| {
         let integral = |row: &Vec<f64>| {
             stop.check()?;
-            fractional::fractional_integral(row, order, step, rule)
+            integral::fractional_integral(row, order, step, rule)
         };
         all.iter().map(integral).collect()
     })?;
@@ -188,7 +191,7 @@ pub fn fractional_derivative<'py>(
         check_length("initial", all.len(), starts.len())?;
         let derivative = |(row, start): (&Vec<f64>, &Vec<f64>)| {
             stop.check()?;
-            fractional::fractional_derivative(row, order, step, definition, start)
+            integral::fractional_derivative(row, order, step, definition, start)
         };
         all.iter().zip(&starts).map(derivative).collect()
     })?;
@@ -209,13 +212,13 @@ pub fn pulse_means<'py>(
 ) -> PyResult<Array<'py>> {
     let samples = vector("samples", &samples)?;
     let between = if hold { Intersample::Hold } else { Intersample::Linear };
-    Ok(PyArray1::from_vec(py, detached(py, || means::pulse_means(&samples, m, between))?))
+    Ok(PyArray1::from_vec(py, detached(py, || block_pulse::pulse_means(&samples, m, between))?))
 }
 
 #[pyfunction]
 pub fn point_samples<'py>(py: Python<'py>, means: PyReadonlyArray1<'py, f64>) -> PyResult<Array<'py>> {
     let values = copied("means", &means)?;
-    Ok(PyArray1::from_vec(py, detached(py, || Ok(means::point_samples(&values)))?))
+    Ok(PyArray1::from_vec(py, detached(py, || Ok(block_pulse::point_samples(&values)))?))
 }
 
 #[pyfunction]
@@ -226,7 +229,7 @@ pub fn delayed<'py>(
     before: f64,
 ) -> PyResult<Array<'py>> {
     let samples = vector("samples", &samples)?;
-    Ok(PyArray1::from_vec(py, detached(py, || means::delayed(&samples, delay, before))?))
+    Ok(PyArray1::from_vec(py, detached(py, || block_pulse::delayed(&samples, delay, before))?))
 }
 
 #[pyfunction]
@@ -239,4 +242,36 @@ pub fn filter_series(
 ) -> PyResult<Array<'_>> {
     let filter = Filter { numerator: numerator.into(), denominator: denominator.into() };
     Ok(PyArray1::from_vec(py, detached(py, || filter.series(m, step))?))
+}
+
+fn finite(array: &PyReadonlyArray2<'_, f64>) -> PyResult<Vec<Vec<f64>>> {
+    let given = rows(array)?;
+    for column in &given {
+        check_finite("a column", column)?;
+    }
+    Ok(given)
+}
+
+#[pyfunction]
+pub fn triangle<'py>(py: Python<'py>, given: PyReadonlyArray2<'py, f64>) -> PyResult<Matrix<'py>> {
+    let tall = finite(&given)?;
+    let count = tall.len();
+    let factor = leavable(py, columns(&given), None, move |_| Ok(dense::triangular_factor(&tall)))?;
+    matrix(py, factor, count)
+}
+
+#[pyfunction]
+#[allow(clippy::type_complexity)]
+pub fn singular<'py>(
+    py: Python<'py>,
+    given: PyReadonlyArray2<'py, f64>,
+) -> PyResult<(Matrix<'py>, Bound<'py, PyArray1<f64>>, Matrix<'py>)> {
+    let tall = finite(&given)?;
+    let found = leavable(py, columns(&given), None, move |_| {
+        dense::singular(&tall).ok_or_else(|| Error::Structure {
+            what: "singular values are not found".into(),
+            remedy: "scale the columns".into(),
+        })
+    })?;
+    Ok((stacked(py, &found.left)?, PyArray1::from_vec(py, found.sizes), stacked(py, &found.right)?))
 }

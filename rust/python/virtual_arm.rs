@@ -3,13 +3,12 @@
 use numpy::{PyArray1, PyArray2, PyReadonlyArray1, PyReadonlyArray2, PyUntypedArrayMethods};
 use pyo3::prelude::*;
 
-use super::arrays::{equations, stacked, vector, EquationArg};
+use super::convert::{equations, stacked, vector, EquationArg, List};
 use super::errors::{attached, detached};
-use super::lists::List;
 use crate::error::{check_length, Error};
-use crate::memory::integral_by_memory;
-use crate::rig::arm::{Arm, Parameters, SIGNALS};
-use crate::rig::guard::{self, Fault};
+use crate::fractional::exponential_sum::integral_by_memory;
+use crate::rig::arm_model::{Arm, Parameters, SIGNALS};
+use crate::rig::safety_guard::{self, Fault};
 use crate::rig::virtual_arm::{Injection, Pace, Plant, Reading, Sensors};
 
 /// Columns of a row: written currents, four angles, two measured currents, delay.
@@ -37,7 +36,7 @@ struct GuardSettings {
     filter: Option<(f64, f64)>,
 }
 
-impl From<GuardSettings> for guard::Settings {
+impl From<GuardSettings> for safety_guard::Settings {
     fn from(s: GuardSettings) -> Self {
         Self {
             step: s.step,
@@ -64,14 +63,14 @@ impl From<GuardSettings> for guard::Settings {
 /// Limits, conversions and latched faults of one run; see the module `guard` of the core.
 #[pyclass(module = "ftlm._core")]
 pub struct Guard {
-    inner: guard::Guard,
+    inner: safety_guard::Guard,
 }
 
 #[pymethods]
 impl Guard {
     #[new]
     fn new(settings: GuardSettings) -> PyResult<Self> {
-        attached(|| Ok(Self { inner: guard::Guard::new(settings.into())? }))
+        attached(|| Ok(Self { inner: safety_guard::Guard::new(settings.into())? }))
     }
 
     fn rest(&mut self, analog: [f64; 4], counts: [i32; 2], switches: [i8; 4]) -> PyResult<()> {

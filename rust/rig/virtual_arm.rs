@@ -2,7 +2,7 @@
 
 use std::time::{Duration, Instant};
 
-use super::arm::Arm;
+use super::arm_model::Arm;
 use crate::error::{check_finite, check_step, Error, Result};
 
 /// What the arm's sensors and converters make of it.

@@ -2,8 +2,8 @@
 //!
 //! A causal operator on pulse means is a polynomial in the delay z cut off at z^m; the fractional integral F^η is one of
 //! them. All such operators commute. Products ([`product`]) are convolutions by FFT, quotients ([`division`]) forward
-//! substitution in blocks joined by FFT products; [`system`] solves several unknown series at once. Where all orders are
-//! whole, [`recursion`] does the same by running sums.
+//! substitution in blocks joined by FFT products; [`solve`] solves several unknown series at once. Where all orders are
+//! whole, [`mod@running_sums`] does the same by running sums.
 //!
 //! ```
 //! # fn main() -> ftlm::error::Result<()> {
@@ -20,12 +20,10 @@ pub mod division;
 #[cfg(feature = "oracles")]
 pub mod naive;
 pub mod product;
-pub mod recursion;
-pub mod system;
+pub mod running_sums;
 
-pub use division::{Division, BLOCK};
+pub use division::{divide, reciprocal, solve, Division, Solver, BLOCK};
 #[cfg(feature = "oracles")]
 pub use naive::{divide_naive, multiply_naive};
 pub use product::{multiply, Buffers, Kernel, SumOfProducts};
-pub use recursion::{running_sums, Recursion, Source, ABREAST, MAX_SUMS};
-pub use system::{divide, reciprocal, solve, Solver};
+pub use running_sums::{running_sums, Recursion, Source, ABREAST, MAX_SUMS};

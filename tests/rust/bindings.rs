@@ -39,10 +39,11 @@ fn entries(text: &str) -> Vec<(String, String)> {
 fn every_entry_goes_through_a_wrapper() {
     let folder = PathBuf::from(env!("CARGO_MANIFEST_DIR")).join("rust/python");
     let mut count = 0;
-    let searches = ["search/orders.rs", "search/stage.rs", "search/points.rs"];
-    for file in ["estimate.rs", "operators.rs", "simulate.rs", "virtual_arm.rs"].into_iter().chain(searches) {
+    let searches = ["order_search/grid_search.rs", "order_search/stage.rs"];
+    for file in ["estimation.rs", "operators.rs", "simulation.rs", "virtual_arm.rs"].into_iter().chain(searches) {
         let text = std::fs::read_to_string(folder.join(file)).unwrap();
-        for (name, body) in entries(&text) {
+        // One entry sets a flag, for tests, and computes nothing.
+        for (name, body) in entries(&text).into_iter().filter(|(name, _)| name != "portable") {
             let ways = ["detached(py", "attached(", "transformed(py", "watched(py", "saved(py", "leavable(py"];
             assert!(ways.iter().any(|way| body.contains(way)), "{file}: {name} computes outside the wrappers");
             count += 1;
@@ -54,7 +55,7 @@ fn every_entry_goes_through_a_wrapper() {
 #[test]
 fn nothing_but_the_wrappers_lets_go_of_python_or_catches_panics() {
     let folder = PathBuf::from(env!("CARGO_MANIFEST_DIR")).join("rust/python");
-    for file in ["arrays.rs", "estimate.rs", "lists.rs", "mod.rs", "operators.rs", "simulate.rs", "virtual_arm.rs"] {
+    for file in ["convert.rs", "estimation.rs", "mod.rs", "operators.rs", "simulation.rs", "virtual_arm.rs"] {
         let text = std::fs::read_to_string(folder.join(file)).unwrap();
         assert!(!text.contains(".detach(") && !text.contains("catch_unwind"), "{file}");
     }

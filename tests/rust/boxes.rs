@@ -1,13 +1,13 @@
 //! Boxes of orders: no box's bound exceeds a score of its candidates, and boxes change no table.
 
 use ftlm::equation::{Equation, Initial};
+use ftlm::order_search::batches::search;
+use ftlm::order_search::branch_and_bound::{box_bounds, left_open, Boxed};
+use ftlm::order_search::control::Control;
+use ftlm::order_search::dual_bound::lower_bounds;
+use ftlm::order_search::grid::{Lattice, TermAxis};
+use ftlm::order_search::options::{Criterion, Norm, Options};
 use ftlm::regressors::Record;
-use ftlm::search::bound::lower_bounds;
-use ftlm::search::boxes::{box_bounds, left_open, Boxed};
-use ftlm::search::control::Control;
-use ftlm::search::lattice::{Lattice, TermAxis};
-use ftlm::search::options::{Criterion, Norm, Options};
-use ftlm::search::rounds::search;
 use ftlm::simulate::respond;
 
 use crate::common::{equation, record, with_signal, Random};

@@ -2,9 +2,9 @@
 //! do better than what is proved.
 
 use ftlm::equation::Equation;
+use ftlm::order_search::certificate::{cell_bounds, certify, Asked, Certificate, Range, Region};
+use ftlm::order_search::control::Control;
 use ftlm::regressors::Record;
-use ftlm::search::certificate::{cell_bounds, certify, Asked, Certificate, Range, Region};
-use ftlm::search::control::Control;
 use ftlm::simulate::respond;
 
 use crate::common::{equation, record, with_signal, Random};

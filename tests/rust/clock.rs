@@ -1,8 +1,8 @@
 //! Numbers in the unit of the runs' own: every product before a term is the power of time that its orders make it.
 
 use ftlm::equation::{AffineOrder, Initial};
-use ftlm::estimate::joint::{Clock, Problem};
-use ftlm::estimate::output_error::{Coordinate, FreeEquation, FreeModel, Monomial};
+use ftlm::estimation::joint_fit::{Clock, Problem};
+use ftlm::estimation::output_error::{Coordinate, FreeEquation, FreeModel, Monomial};
 
 use crate::common::check;
 

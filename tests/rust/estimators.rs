@@ -3,13 +3,15 @@
 
 use ftlm::equation::{Initial, Structure};
 use ftlm::error::Error;
-use ftlm::estimate::least_squares::{self, Regression};
-use ftlm::estimate::multi_innovation::{closed_form, recursion, Innovation, Rows};
-use ftlm::lanes::{self, WIDTH};
+use ftlm::estimation::least_squares::{self, Regression};
+use ftlm::estimation::multi_innovation::{closed_form, recursion, Innovation, Rows};
+use ftlm::fractional::operational_matrices;
+use ftlm::linalg::small::{self, packed};
+use ftlm::parallel::pool;
 use ftlm::regressors::{Bank, Index, Key, Record, BANK_LIMIT};
-use ftlm::search::threads::pool;
-use ftlm::small::{self, packed};
-use ftlm::{haar, series, simulate};
+use ftlm::series;
+use ftlm::simd::{self, WIDTH};
+use ftlm::simulate;
 use proptest::prelude::*;
 
 use crate::common::{
@@ -214,7 +216,7 @@ fn least_squares_is_the_same_in_haar_coordinates() {
         let time = least_squares::fit(std::slice::from_ref(&record), &model.structure, &FREE, &Initial::Rest).unwrap();
         let mut regression = Regression::new(&[record], &model.structure, &FREE, &Initial::Rest).unwrap();
         for series in regression.columns.iter_mut().chain([&mut regression.target]) {
-            haar::transform(series).unwrap();
+            operational_matrices::transform(series).unwrap();
         }
         let (coefficients, _) = least_squares::solve(&regression.columns, &regression.target, 4).unwrap();
         check("Haar against block pulses", relative_distance(&coefficients, &time.coefficients), 1e-11);
@@ -271,7 +273,7 @@ fn the_recursion_is_the_published_one() {
             let mut regression = Regression::new(records, &model.structure, &FREE, &Initial::Rest).unwrap();
             if rows == Rows::Haar {
                 for series in regression.columns.iter_mut().chain([&mut regression.target]) {
-                    haar::transform(series).unwrap();
+                    operational_matrices::transform(series).unwrap();
                 }
             }
             let oracle = published(&regression.columns, &regression.target, length, 10.0);
@@ -334,7 +336,7 @@ fn every_row_weighs_as_often_as_it_is_used() {
             let mut regression = Regression::new(records, &model.structure, &FREE, &Initial::Rest).unwrap();
             if rows == Rows::Haar {
                 for series in regression.columns.iter_mut().chain([&mut regression.target]) {
-                    haar::transform(series).unwrap();
+                    operational_matrices::transform(series).unwrap();
                 }
             }
             let weighted =
@@ -401,7 +403,7 @@ fn banks_hold_the_integrals() {
         }
         assert!(relative_distance(bank.column(steep), &record.integral(2, -0.3)) < 1e-14);
         assert_eq!(bank.column(plain), record.signal(0));
-        assert_eq!(bank.kernel(shared[0]), ftlm::kernels::block_pulse_kernel(0.55, 200, 0.02));
+        assert_eq!(bank.kernel(shared[0]), ftlm::fractional::kernels::block_pulse_kernel(0.55, 200, 0.02));
         assert_eq!((bank.kernel(plain)[0], bank.kernel(plain)[1]), (1.0, 0.0));
         assert!([5, 6, 7].iter().all(|&p| bank.kernel(p).is_empty()));
         for threads in [1, 3] {
@@ -414,7 +416,7 @@ fn banks_hold_the_integrals() {
         assert_eq!(bank.column(1), record.signal(1));
         assert_eq!(bank.column(2), record.initial_term(0.9));
         assert!(relative_distance(bank.column(3), &record.integral(2, 1.35)) < 1e-14);
-        assert_eq!(bank.kernel(0), ftlm::kernels::block_pulse_kernel(0.9, 200, 0.02));
+        assert_eq!(bank.kernel(0), ftlm::fractional::kernels::block_pulse_kernel(0.9, 200, 0.02));
         assert!([1, 2, 3].iter().all(|&p| bank.kernel(p).is_empty()));
     }
 }
@@ -499,7 +501,7 @@ fn dependent_columns_of_a_gram_matrix() {
 
 struct Wide<'a>(&'a mut [[f64; WIDTH]], &'a mut [[f64; WIDTH]], usize);
 
-impl lanes::Kernel for Wide<'_> {
+impl simd::Kernel for Wide<'_> {
     type Output = [bool; WIDTH];
 
     #[inline(always)]
@@ -510,12 +512,12 @@ impl lanes::Kernel for Wide<'_> {
 
 struct Dot<'a>(&'a [f64], &'a [f64]);
 
-impl lanes::Kernel for Dot<'_> {
+impl simd::Kernel for Dot<'_> {
     type Output = f64;
 
     #[inline(always)]
     fn run(self) -> f64 {
-        lanes::dot(self.0, self.1)
+        simd::dot(self.0, self.1)
     }
 }
 
@@ -544,7 +546,7 @@ fn lanes_do_not_know_each_other_nor_the_instructions_they_run_on() {
         let (mut a, mut x) = pack(&straight);
         let flags = small::solve_lanes(&mut a, &mut x, k.min(2));
         let (mut a, mut y) = pack(&straight);
-        let widest = lanes::widest(Wide(&mut a, &mut y, k.min(2)));
+        let widest = simd::widest(Wide(&mut a, &mut y, k.min(2)));
         let (mut a, mut z) = pack(&turned);
         let backwards = small::solve_lanes(&mut a, &mut z, k.min(2));
         assert_eq!(flags, widest);
@@ -563,8 +565,8 @@ fn lanes_do_not_know_each_other_nor_the_instructions_they_run_on() {
         }
     }
     let (a, b) = (random.signal(1003), random.signal(1003));
-    assert_eq!(lanes::dot(&a, &b).to_bits(), lanes::widest(Dot(&a, &b)).to_bits());
-    check("dot product", (lanes::dot(&a, &b) - a.iter().zip(&b).map(|(x, y)| x * y).sum::<f64>()).abs(), 1e-13);
+    assert_eq!(simd::dot(&a, &b).to_bits(), simd::widest(Dot(&a, &b)).to_bits());
+    check("dot product", (simd::dot(&a, &b) - a.iter().zip(&b).map(|(x, y)| x * y).sum::<f64>()).abs(), 1e-13);
 }
 
 #[test]

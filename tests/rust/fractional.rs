@@ -1,9 +1,9 @@
 //! Fractional integrals, derivatives and responses: their orders of convergence against closed forms.
 
 use ftlm::error::Error;
-use ftlm::fractional::{fractional_derivative, fractional_integral, Derivative, IntegralRule};
-use ftlm::kernels::power_means;
-use ftlm::means::point_samples;
+use ftlm::fractional::integral::{fractional_derivative, fractional_integral, Derivative, IntegralRule};
+use ftlm::fractional::kernels::power_means;
+use ftlm::signal::block_pulse::point_samples;
 use ftlm::simulate;
 use proptest::prelude::*;
 use serde_json::Value;

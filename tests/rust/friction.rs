@@ -1,15 +1,15 @@
 //! Bodies that stick: their march against a plain one, all combinations of two, closed forms, derivatives against differences, refusals.
 
-use crate::common::Random;
 use ftlm::equation::{AffineOrder, Equation, Initial, Structure, Term};
 use ftlm::error::Error;
-use ftlm::estimate::output_error::{Coordinate, Experiment, FreeEquation, Monomial, Settings};
+use ftlm::estimation::output_error::{Coordinate, Experiment, FreeEquation, Monomial, Settings};
+use ftlm::friction::contact::{is_p_matrix, March, Rubbing, Trace};
+use ftlm::friction::convolution::{Heads, Online};
 use ftlm::friction::law::{Moves, Phase};
-use ftlm::friction::march::{March, Trace};
-use ftlm::friction::online::{Heads, Online};
-use ftlm::friction::pulses::{is_p_matrix, Rubbing};
 use ftlm::friction::{fit, Body, FreeLaw, FrictionModel, Law, Start};
 use ftlm::regressors::Record;
+
+use crate::common::Random;
 
 fn body(order: f64, friction: f64) -> Body {
     let terms = vec![Term { signal: 0, order: 1.0 }, Term { signal: 1, order: 0.0 }];
@@ -162,7 +162,7 @@ fn its_numbers_are_found_again() -> Result<(), Error> {
     let record = Record::new(0.02, vec![vec![0.0; m], force(m)], None)?;
     let truth = body(1.9, 0.8);
     let output = truth.run(&record, &[vec![]])?.outputs.swap_remove(0);
-    let experiment = Experiment::new(record, 1, vec![ftlm::means::point_samples(&output)], vec![1.0])?;
+    let experiment = Experiment::new(record, 1, vec![ftlm::signal::block_pulse::point_samples(&output)], vec![1.0])?;
     let order = |constant: f64, weight: f64| AffineOrder { constant, weights: vec![weight] };
     let free = |i: usize, factor: f64| Monomial { factor, powers: vec![(i, 1)] };
     let model = FrictionModel {

@@ -1,10 +1,11 @@
 //! Haar coordinates and operational matrices: orthogonality, and the fast paths against the dense ones.
 
 use ftlm::error::Error;
-use ftlm::kernels::block_pulse_kernel;
-use ftlm::search::threads::pool;
-use ftlm::stop::Stop;
-use ftlm::{dense, haar, operational, series};
+use ftlm::fractional::kernels::block_pulse_kernel;
+use ftlm::fractional::operational_matrices;
+use ftlm::linalg::dense;
+use ftlm::parallel::{pool, Stop};
+use ftlm::series;
 use proptest::prelude::*;
 
 use crate::common::{cases, check, distance, largest, norm, toeplitz, Random};
@@ -12,7 +13,7 @@ use crate::common::{cases, check, distance, largest, norm, toeplitz, Random};
 #[test]
 fn the_haar_matrix_is_orthogonal() {
     for m in [1, 2, 4, 8, 64, 256, 512] {
-        let phi = haar::matrix(m).unwrap();
+        let phi = operational_matrices::matrix(m).unwrap();
         let mut worst = 0.0_f64;
         for i in 0..m {
             for j in 0..=i {
@@ -28,21 +29,21 @@ fn the_haar_matrix_is_orthogonal() {
 fn the_haar_matrix_of_four_is_the_printed_one() {
     let r = 0.5_f64.sqrt();
     let printed = [0.5, 0.5, 0.5, 0.5, 0.5, 0.5, -0.5, -0.5, r, -r, 0.0, 0.0, 0.0, 0.0, r, -r];
-    assert!(distance(&haar::matrix(4).unwrap(), &printed) < 1e-15);
-    assert_eq!(haar::matrix(1).unwrap(), [1.0]);
+    assert!(distance(&operational_matrices::matrix(4).unwrap(), &printed) < 1e-15);
+    assert_eq!(operational_matrices::matrix(1).unwrap(), [1.0]);
 }
 
 #[test]
 fn the_fast_transform_is_the_matrix() {
     let mut random = Random::new(20);
     for m in [1, 2, 4, 16, 128, 1024] {
-        let phi = haar::matrix(m).unwrap();
+        let phi = operational_matrices::matrix(m).unwrap();
         let f = random.signal(m);
         let mut fast = f.clone();
-        haar::transform(&mut fast).unwrap();
+        operational_matrices::transform(&mut fast).unwrap();
         assert!(distance(&fast, &dense::multiply(&phi, &f, m, m, 1)) < 1e-14 * norm(&f));
         let mut back = fast.clone();
-        haar::inverse(&mut back).unwrap();
+        operational_matrices::inverse(&mut back).unwrap();
         assert!(distance(&back, &dense::multiply(&fast, &phi, 1, m, m)) < 1e-14 * norm(&f));
         assert!(distance(&back, &f) < 1e-14 * norm(&f));
     }
@@ -53,21 +54,21 @@ fn lengths_that_are_no_power_of_two_are_named_with_their_neighbours() {
     for (m, below, above) in [(12, 8, 16), (2047, 1024, 2048), (2049, 2048, 4096), (3, 2, 4)] {
         let error = Error::NotPowerOfTwo { m, below, above };
         let mut x = vec![1.0; m];
-        assert_eq!(haar::transform(&mut x), Err(error.clone()));
-        assert_eq!(haar::inverse(&mut x), Err(error.clone()));
+        assert_eq!(operational_matrices::transform(&mut x), Err(error.clone()));
+        assert_eq!(operational_matrices::inverse(&mut x), Err(error.clone()));
         assert!(x.iter().all(|&v| v == 1.0), "a refused signal is left as it was");
-        assert_eq!(haar::matrix(m), Err(error.clone()));
-        assert_eq!(operational::operational_matrix(0.5, m, 0.1), Err(error.clone()));
-        assert_eq!(operational::operational_matrix_dense(0.5, m, 0.1), Err(error));
+        assert_eq!(operational_matrices::matrix(m), Err(error.clone()));
+        assert_eq!(operational_matrices::operational_matrix(0.5, m, 0.1), Err(error.clone()));
+        assert_eq!(operational_matrices::operational_matrix_dense(0.5, m, 0.1), Err(error));
     }
-    let message = haar::check_power_of_two(12).unwrap_err().to_string();
+    let message = operational_matrices::check_power_of_two(12).unwrap_err().to_string();
     assert_eq!(
         message,
         "Haar coordinates need m to be a power of two, not 12; take m = 8 or 16, or block-pulse (time) coordinates"
     );
     // Nothing has no neighbours to be named.
-    assert!(matches!(haar::check_power_of_two(0), Err(Error::Length { expected: 1, found: 0, .. })));
-    assert!(haar::transform(&mut []).is_err());
+    assert!(matches!(operational_matrices::check_power_of_two(0), Err(Error::Length { expected: 1, found: 0, .. })));
+    assert!(operational_matrices::transform(&mut []).is_err());
 }
 
 #[test]
@@ -75,7 +76,7 @@ fn the_matrix_of_block_pulses_is_the_kernel() {
     let mut random = Random::new(21);
     let (m, step) = (100, 0.05);
     for eta in [0.0, 0.4, 1.0, 1.7, 3.0] {
-        let f = operational::block_pulse_matrix(eta, m, step).unwrap();
+        let f = operational_matrices::block_pulse_matrix(eta, m, step).unwrap();
         let transposed = toeplitz(&block_pulse_kernel(eta, m, step));
         let mut worst = 0.0_f64;
         for i in 0..m {
@@ -96,8 +97,8 @@ fn the_fast_operational_matrix_is_the_dense_one() {
     let mut worst = 0.0_f64;
     for m in [1, 2, 4, 32, 64, 256, 512] {
         for eta in [0.0, 0.15, 0.5, 1.0, 1.85, 2.2, 3.0] {
-            let fast = operational::operational_matrix(eta, m, 1.0 / m as f64).unwrap();
-            let dense = operational::operational_matrix_dense(eta, m, 1.0 / m as f64).unwrap();
+            let fast = operational_matrices::operational_matrix(eta, m, 1.0 / m as f64).unwrap();
+            let dense = operational_matrices::operational_matrix_dense(eta, m, 1.0 / m as f64).unwrap();
             worst = worst.max(distance(&fast, &dense) / largest(&dense));
         }
     }
@@ -108,16 +109,16 @@ fn the_fast_operational_matrix_is_the_dense_one() {
 fn the_operational_matrix_integrates_haar_coefficients() {
     // P of order 1 over unit time as the literature prints it, for two wavelets.
     let printed = [0.5, -0.25, 0.25, 0.0];
-    assert!(distance(&operational::operational_matrix(1.0, 2, 0.5).unwrap(), &printed) < 1e-15);
+    assert!(distance(&operational_matrices::operational_matrix(1.0, 2, 0.5).unwrap(), &printed) < 1e-15);
     let mut random = Random::new(22);
     let (m, step, eta) = (256, 0.02, 0.85);
     let f = random.signal(m);
     let mut coefficients = f.clone();
-    haar::transform(&mut coefficients).unwrap();
-    let p = operational::operational_matrix(eta, m, step).unwrap();
+    operational_matrices::transform(&mut coefficients).unwrap();
+    let p = operational_matrices::operational_matrix(eta, m, step).unwrap();
     let by_matrix = dense::multiply(&coefficients, &p, 1, m, m);
     let mut by_series = series::multiply(&block_pulse_kernel(eta, m, step), &f, m);
-    haar::transform(&mut by_series).unwrap();
+    operational_matrices::transform(&mut by_series).unwrap();
     check("P on coefficients against F on means", distance(&by_matrix, &by_series) / largest(&by_series), 1e-13);
 }
 
@@ -125,9 +126,9 @@ fn the_operational_matrix_integrates_haar_coefficients() {
 fn operational_matrices_refuse_bad_arguments() {
     for (eta, step) in [(-0.1, 0.1), (10.1, 0.1), (f64::NAN, 0.1), (0.5, 0.0), (0.5, -1.0), (0.5, f64::INFINITY)] {
         for made in [
-            operational::block_pulse_matrix(eta, 8, step),
-            operational::operational_matrix(eta, 8, step),
-            operational::operational_matrix_dense(eta, 8, step),
+            operational_matrices::block_pulse_matrix(eta, 8, step),
+            operational_matrices::operational_matrix(eta, 8, step),
+            operational_matrices::operational_matrix_dense(eta, 8, step),
         ] {
             assert!(matches!(made, Err(Error::OutOfRange { .. })), "eta {eta}, step {step}");
         }
@@ -240,8 +241,8 @@ proptest! {
         let (mut f, mut g) = (random.signal(m), random.signal(m));
         let before: f64 = f.iter().zip(&g).map(|(a, b)| a * b).sum();
         let size = norm(&f) * norm(&g);
-        haar::transform(&mut f).unwrap();
-        haar::transform(&mut g).unwrap();
+        operational_matrices::transform(&mut f).unwrap();
+        operational_matrices::transform(&mut g).unwrap();
         let after: f64 = f.iter().zip(&g).map(|(a, b)| a * b).sum();
         prop_assert!((after - before).abs() <= 1e-14 * size);
     }

@@ -2,19 +2,20 @@
 
 use ftlm::equation::{Equation, Filter, Initial};
 use ftlm::error::Error;
-use ftlm::estimate::iv::{
+use ftlm::estimation::instrumental_variables::{
     damped_inverse, fit, low_pass, power_frequency, project, refine, step, with_projections, Scratch, Settings, Source,
 };
-use ftlm::estimate::least_squares;
-use ftlm::kernels::block_pulse_kernel;
+use ftlm::estimation::least_squares;
+use ftlm::fractional::kernels::block_pulse_kernel;
+use ftlm::linalg::small;
+use ftlm::order_search::batches::search;
+use ftlm::order_search::control::Control;
+use ftlm::order_search::grid::{Lattice, TermAxis};
+use ftlm::order_search::options::{Criterion, Estimator, Norm, Options};
+use ftlm::parallel::Stop;
 use ftlm::regressors::Record;
-use ftlm::search::control::Control;
-use ftlm::search::lattice::{Lattice, TermAxis};
-use ftlm::search::options::{Criterion, Estimator, Norm, Options};
-use ftlm::search::rounds::search;
 use ftlm::series::{divide_naive, multiply_naive, Kernel};
-use ftlm::stop::Stop;
-use ftlm::{simulate, small};
+use ftlm::simulate;
 
 use crate::common::{
     check, dense_solve, deviation, distance, equation, largest, norm, record, relative_distance, with_signal, Random,

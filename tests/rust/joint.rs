@@ -1,9 +1,9 @@
 //! Instrumental variables of coupled equations: one step against dense algebra, where they stand still, their spread.
 
 use ftlm::equation::{Equation, Initial};
-use ftlm::estimate::iv::joint::Problem;
-use ftlm::estimate::iv::{fit, project, Settings};
-use ftlm::kernels::block_pulse_kernel;
+use ftlm::estimation::instrumental_variables::coupled::Problem;
+use ftlm::estimation::instrumental_variables::{fit, project, Settings};
+use ftlm::fractional::kernels::block_pulse_kernel;
 use ftlm::regressors::Record;
 use ftlm::simulate;
 

@@ -1,15 +1,15 @@
 //! The end of a joint fit: against figures of an independent implementation in NumPy, other starts that take over, and stops.
 
-use ftlm::colour;
 use ftlm::equation::{AffineOrder, Initial};
 use ftlm::error::Error;
-use ftlm::estimate::joint::covariance::long_run;
-use ftlm::estimate::joint::{
+use ftlm::estimation::joint_fit::covariance::long_run;
+use ftlm::estimation::joint_fit::{
     freed, refined, settled, Grid, Loss, Optimum, Place, Problem, Sampled, Sampling, Signal, Source, Weights,
 };
-use ftlm::estimate::output_error::{Coordinate, FreeEquation, FreeModel, Monomial, Point};
-use ftlm::means::Intersample;
-use ftlm::stop::Stop;
+use ftlm::estimation::output_error::{Coordinate, FreeEquation, FreeModel, Monomial, Point};
+use ftlm::parallel::Stop;
+use ftlm::signal::block_pulse::Intersample;
+use ftlm::signal::statistics;
 use serde_json::Value;
 
 use crate::common::{check, list, number, numbers, reference, Random};
@@ -101,12 +101,12 @@ fn the_end_of_a_fit_is_that_of_another_implementation() {
         // The colour of what is left, and what sums of it scatter by.
         let series: Vec<Vec<f64>> = found.residuals.iter().map(|run| run[0].clone()).collect();
         let rows: Vec<&[f64]> = series.iter().map(Vec::as_slice).collect();
-        let (filter, power) = colour::coloured(&rows, 6);
+        let (filter, power) = statistics::coloured(&rows, 6);
         close(&format!("{name}: filter"), &filter, &numbers(&case["filter"]), 1e-7);
         close(&format!("{name}: power"), &[power], &[number(&case["power"])], 1e-8);
         close(
             &format!("{name}: covariances"),
-            &colour::covariances(&filter, power, 8),
+            &statistics::covariances(&filter, power, 8),
             &numbers(&case["covariances"]),
             1e-7,
         );

@@ -1,6 +1,6 @@
 //! Kernels of I^η and of ∂/∂η, the digamma function, Grünwald–Letnikov weights and means of powers, against mpmath.
 
-use ftlm::kernels::{
+use ftlm::fractional::kernels::{
     block_pulse_kernel, block_pulse_kernel_derivative, digamma, grunwald_letnikov_weights, power_means,
     power_means_slope, second_difference,
 };

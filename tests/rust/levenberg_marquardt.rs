@@ -1,7 +1,8 @@
 //! Levenberg–Marquardt by itself: problems whose minimum is known in closed form, and one that no step can lower.
 
 use ftlm::error::{Error, Result};
-use ftlm::estimate::output_error::levenberg_marquardt::{minimise, Problem, Settings, Status};
+use ftlm::estimation::optimization::damped_step::Problem;
+use ftlm::estimation::optimization::levenberg_marquardt::{minimise, Settings, Status};
 
 use crate::common::{check, dense_solve, distance, Random};
 

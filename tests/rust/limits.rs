@@ -2,12 +2,12 @@
 
 use ftlm::equation::{AffineOrder, Initial};
 use ftlm::error::Error;
-use ftlm::estimate::output_error::{
+use ftlm::estimation::output_error::{
     self, Coordinate, Experiment, FreeEquation, FreeInput, FreeModel, InputLaw, Instant, Monomial, Point, Settings,
 };
 use ftlm::friction::{self, FreeLaw, FrictionModel, Law, Start};
-use ftlm::means::point_samples;
 use ftlm::regressors::Record;
+use ftlm::signal::block_pulse::point_samples;
 
 use crate::common::{norm, relative_distance, Random};
 

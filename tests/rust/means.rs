@@ -1,7 +1,7 @@
 //! From samples to pulse means: exact integration under both inter-sample behaviours, delays, and back to samples.
 
 use ftlm::error::Error;
-use ftlm::means::{delayed, point_samples, pulse_means, Intersample};
+use ftlm::signal::block_pulse::{delayed, point_samples, pulse_means, Intersample};
 use proptest::prelude::*;
 
 use crate::common::{cases, check, check_between, distance, orders, Random};

@@ -1,7 +1,7 @@
 //! The four figures of a response, and the errors that computations name.
 
 use ftlm::error::{check_finite, check_length, check_step, Error, Kind};
-use ftlm::metrics::{correlation, covariances, covariances_naive, metrics};
+use ftlm::signal::metrics::{correlation, covariances, covariances_naive, metrics};
 
 #[test]
 fn the_four_figures_of_a_small_case() {

@@ -2,13 +2,14 @@
 
 use ftlm::equation::{AffineOrder, Initial};
 use ftlm::error::Error;
-use ftlm::estimate::output_error::{
+use ftlm::estimation::output_error::{
     fit, Coordinate, Experiment, Fit, FreeEquation, FreeInput, FreeModel, InputLaw, Instant, Monomial, Point, Settings,
     Status,
 };
-use ftlm::means::{delayed, point_samples};
 use ftlm::regressors::Record;
-use ftlm::{series, simulate};
+use ftlm::series;
+use ftlm::signal::block_pulse::{delayed, point_samples};
+use ftlm::simulate;
 
 use crate::common::{
     check, check_between, dense_solve, deviation, equation, norm, record, relative_distance, with_signal, Random,

@@ -1,7 +1,7 @@
 //! The synthetic stages with known truth: their coupled responses, and how those converge with the step.
 
 use ftlm::equation::Equation;
-use ftlm::means::{point_samples, pulse_means, Intersample};
+use ftlm::signal::block_pulse::{point_samples, pulse_means, Intersample};
 use ftlm::simulate::{nyquist_margin, respond};
 use serde_json::Value;
 

@@ -1,8 +1,8 @@
 //! Candidates given as points: against the naive division, early leaving, threads, and orders that make no equation.
 
-use ftlm::search::control::Control;
-use ftlm::search::options::Norm;
-use ftlm::search::points::{score_naive, Point, Points};
+use ftlm::order_search::control::Control;
+use ftlm::order_search::given_points::{score_naive, Point, Points};
+use ftlm::order_search::options::Norm;
 
 use crate::common::{bits, check, record, Random};
 

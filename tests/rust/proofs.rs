@@ -1,12 +1,12 @@
 //! Proofs that candidates cannot win: none reaches beyond the score itself, and none changes a table.
 
 use ftlm::equation::{Equation, Initial};
+use ftlm::order_search::batches::search;
+use ftlm::order_search::control::Control;
+use ftlm::order_search::dual_bound::{excluded_along, excluded_by, excluded_in_turn, explodes};
+use ftlm::order_search::grid::{Lattice, TermAxis};
+use ftlm::order_search::options::{Norm, Options};
 use ftlm::regressors::Record;
-use ftlm::search::bound::{excluded_along, excluded_by, excluded_in_turn, explodes};
-use ftlm::search::control::Control;
-use ftlm::search::lattice::{Lattice, TermAxis};
-use ftlm::search::options::{Norm, Options};
-use ftlm::search::rounds::search;
 use ftlm::simulate::respond;
 
 use crate::common::{equation, record, Random};

@@ -1,9 +1,9 @@
 //! Pulse means to readings at times of their own, with the corners that jumps of held signals leave.
 
 use ftlm::error::Error;
-use ftlm::kernels::block_pulse_kernel;
-use ftlm::readings::Readings;
+use ftlm::fractional::kernels::block_pulse_kernel;
 use ftlm::series;
+use ftlm::signal::block_pulse::Readings;
 use proptest::prelude::*;
 
 use crate::common::{cases, check, Random};

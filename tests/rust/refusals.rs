@@ -2,18 +2,21 @@
 
 use ftlm::equation::{Equation, Filter, Initial, Structure, Term};
 use ftlm::error::{check_dense, check_points, Error, MOST_POINTS};
-use ftlm::estimate::iv;
-use ftlm::estimate::least_squares::{self, Regression};
-use ftlm::estimate::output_error::Experiment;
-use ftlm::estimate::streaming::Streaming;
-use ftlm::kernels::digamma;
-use ftlm::means::{delayed, pulse_means, Intersample};
-use ftlm::memory::{integral_by_memory, Rates};
-use ftlm::rig::arm::{Arm, Parameters};
+use ftlm::estimation::instrumental_variables;
+use ftlm::estimation::least_squares::{self, Regression};
+use ftlm::estimation::output_error::Experiment;
+use ftlm::estimation::streaming::Streaming;
+use ftlm::fft;
+use ftlm::fractional::exponential_sum::{integral_by_memory, Rates};
+use ftlm::fractional::kernels::digamma;
+use ftlm::fractional::operational_matrices;
+use ftlm::linalg::small::{self, Recursion};
+use ftlm::rig::arm_model::{Arm, Parameters};
 use ftlm::rig::virtual_arm::{Injection, Pace, Plant, Sensors};
+use ftlm::series;
+use ftlm::signal::block_pulse::{delayed, pulse_means, Intersample};
+use ftlm::signal::metrics;
 use ftlm::simulate::{self, OutputFilter};
-use ftlm::small::{self, Recursion};
-use ftlm::{fft, haar, metrics, operational, series};
 
 use crate::common::{equation, record, structure};
 
@@ -34,9 +37,9 @@ fn lengths_beyond_memory() {
         refused(check_dense(m));
         refused(pulse_means(&[0.0, 1.0], m, Intersample::Hold));
         refused(Filter { numerator: vec![(1.0, 0.0)], denominator: vec![(1.0, 1.0)] }.series(m, 0.1));
-        refused(haar::matrix(m));
-        refused(operational::block_pulse_matrix(0.5, m, 0.1));
-        refused(operational::operational_matrix(0.5, m, 0.1));
+        refused(operational_matrices::matrix(m));
+        refused(operational_matrices::block_pulse_matrix(0.5, m, 0.1));
+        refused(operational_matrices::operational_matrix(0.5, m, 0.1));
     }
     refused(check_dense(0));
     check_points("m", MOST_POINTS).unwrap();
@@ -87,14 +90,26 @@ fn regressions_that_cannot_be_made() {
     refused(least_squares::fit(&run, &there, &[None], &Initial::Powers(vec![f64::NAN])));
     refused(least_squares::fit(&[], &there, &[None], &Initial::Rest));
     refused(least_squares::solve(&[vec![1.0; 3]], &[1.0; 4], 1));
-    refused(iv::fit(&run, &[], &[], &Initial::Rest, iv::Settings::default()));
+    refused(instrumental_variables::fit(&run, &[], &[], &Initial::Rest, instrumental_variables::Settings::default()));
     for wrong in [
-        iv::Settings { iterations: 1 << 62, ..iv::Settings::default() },
-        iv::Settings { tolerance: f64::NAN, ..iv::Settings::default() },
+        instrumental_variables::Settings { iterations: 1 << 62, ..instrumental_variables::Settings::default() },
+        instrumental_variables::Settings { tolerance: f64::NAN, ..instrumental_variables::Settings::default() },
     ] {
-        refused(iv::fit(&run, &[structure(0, 1.0, &[(1, 0.0)])], &[vec![None]], &Initial::Rest, wrong));
+        refused(instrumental_variables::fit(
+            &run,
+            &[structure(0, 1.0, &[(1, 0.0)])],
+            &[vec![None]],
+            &Initial::Rest,
+            wrong,
+        ));
     }
-    refused(iv::fit(&run, &[structure(0, 1.0, &[(7, 0.0)])], &[vec![None]], &Initial::Rest, iv::Settings::default()));
+    refused(instrumental_variables::fit(
+        &run,
+        &[structure(0, 1.0, &[(7, 0.0)])],
+        &[vec![None]],
+        &Initial::Rest,
+        instrumental_variables::Settings::default(),
+    ));
 }
 
 #[test]

@@ -1,7 +1,7 @@
 //! The rig's guard under a million random commands, and the arm's bounded memory.
 
-use ftlm::memory::{decay, Rates};
-use ftlm::rig::guard::{Fault, Guard, Settings};
+use ftlm::fractional::exponential_sum::{decay, Rates};
+use ftlm::rig::safety_guard::{Fault, Guard, Settings};
 use ftlm::rig::virtual_arm::Reading;
 
 use crate::common::Random;

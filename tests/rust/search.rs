@@ -5,17 +5,17 @@ use std::sync::atomic::Ordering;
 
 use ftlm::equation::{Equation, Initial, Structure};
 use ftlm::error::{Error, Kind};
-use ftlm::estimate::iv::Settings;
-use ftlm::estimate::least_squares::{self, Estimate};
-use ftlm::estimate::multi_innovation::{closed_form, Innovation, Rows};
+use ftlm::estimation::instrumental_variables::Settings;
+use ftlm::estimation::least_squares::{self, Estimate};
+use ftlm::estimation::multi_innovation::{closed_form, Innovation, Rows};
+use ftlm::order_search::batches::search;
+use ftlm::order_search::control::Control;
+use ftlm::order_search::dual_bound::{excluded_by, lower_bounds, out_of_reach};
+use ftlm::order_search::grid::{Lattice, TermAxis, MAX_CANDIDATES};
+use ftlm::order_search::options::{Criterion, Estimator, Norm, Options};
+use ftlm::order_search::result::{Counts, Failure, Outcome};
+use ftlm::parallel::MAX_THREADS;
 use ftlm::regressors::Record;
-use ftlm::search::bound::{excluded_by, lower_bounds, out_of_reach};
-use ftlm::search::control::Control;
-use ftlm::search::lattice::{Lattice, TermAxis, MAX_CANDIDATES};
-use ftlm::search::options::{Criterion, Estimator, Norm, Options};
-use ftlm::search::outcome::{Counts, Failure, Outcome};
-use ftlm::search::rounds::search;
-use ftlm::search::threads::MAX_THREADS;
 use ftlm::simulate::{equation_error, respond};
 use proptest::prelude::*;
 
@@ -827,9 +827,9 @@ proptest! {
 
 #[test]
 fn a_stretch_of_rounds_goes_on_from_any_checkpoint() {
-    use ftlm::search::control::Checkpoint;
-    use ftlm::search::outcome::Part;
-    use ftlm::search::rounds::Search;
+    use ftlm::order_search::batches::Search;
+    use ftlm::order_search::control::Checkpoint;
+    use ftlm::order_search::result::Part;
     use std::borrow::Cow;
     use std::sync::atomic::Ordering::Relaxed;
 

@@ -4,15 +4,15 @@ use std::borrow::Cow;
 
 use ftlm::equation::{AffineOrder, Initial};
 use ftlm::error::{Error, Result};
-use ftlm::estimate::iv::Settings;
+use ftlm::estimation::instrumental_variables::Settings;
+use ftlm::order_search::batches::{rounds, search, waves, Search};
+use ftlm::order_search::control::{Checkpoint, Control, Place};
+use ftlm::order_search::grid::{Lattice, LawEquation, LawLattice, TermAxis};
+use ftlm::order_search::options::{Estimator, Options};
+use ftlm::order_search::result::{Counts, Failure, Part, Row, Verdict};
+use ftlm::order_search::stage_join::{self, Span, Stage};
+use ftlm::parallel::{pool, MAX_THREADS};
 use ftlm::regressors::{Bank, Index, Key, Record};
-use ftlm::search::control::{Checkpoint, Control, Place};
-use ftlm::search::lattice::{Lattice, LawEquation, LawLattice, TermAxis};
-use ftlm::search::options::{Estimator, Options};
-use ftlm::search::outcome::{Counts, Failure, Part, Row, Verdict};
-use ftlm::search::rounds::{rounds, search, waves, Search};
-use ftlm::search::stage::{self, Span, Stage};
-use ftlm::search::threads::{pool, MAX_THREADS};
 
 use crate::common::Random;
 
@@ -126,7 +126,7 @@ fn searches_refuse_records_without_their_signals() {
     stage.terms[1].0 = 2;
     let lattice = LawLattice::new(&[vec![1.0]], &[stage], &[false, false, true]).unwrap();
     let fixed = [vec![None; 2]];
-    let found = stage::search(&[data()], &lattice, &fixed, &[1.0], &Options::default(), &Control::default());
+    let found = stage_join::search(&[data()], &lattice, &fixed, &[1.0], &Options::default(), &Control::default());
     assert!(matches!(found, Err(Error::Structure { .. })));
     let mut index = Index::default();
     index.insert(Key::integral(2, 0.5));

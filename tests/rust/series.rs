@@ -3,7 +3,7 @@
 
 use ftlm::error::Error;
 use ftlm::fft;
-use ftlm::kernels::{block_pulse_kernel, power_means};
+use ftlm::fractional::kernels::{block_pulse_kernel, power_means};
 use ftlm::series::{self, Buffers, Division, Kernel, Recursion, Solver, Source, SumOfProducts, BLOCK, MAX_SUMS};
 use proptest::prelude::*;
 

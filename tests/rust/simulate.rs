@@ -2,8 +2,8 @@
 
 use ftlm::equation::{Equation, Filter, Initial, Structure, Term};
 use ftlm::error::Error;
-use ftlm::estimate::least_squares;
-use ftlm::kernels::block_pulse_kernel;
+use ftlm::estimation::least_squares;
+use ftlm::fractional::kernels::block_pulse_kernel;
 use ftlm::regressors::Record;
 use ftlm::series;
 use ftlm::simulate::{

@@ -5,14 +5,14 @@ use std::sync::atomic::Ordering;
 
 use ftlm::equation::{grains, AffineOrder, Equation, Initial};
 use ftlm::error::Error;
-use ftlm::estimate::least_squares;
-use ftlm::estimate::multi_innovation::{Innovation, Rows};
+use ftlm::estimation::least_squares;
+use ftlm::estimation::multi_innovation::{Innovation, Rows};
+use ftlm::order_search::control::Control;
+use ftlm::order_search::grid::{LawEquation, LawLattice, MAX_TUPLES};
+use ftlm::order_search::options::{Criterion, Estimator, Norm, Options};
+use ftlm::order_search::result::Failure;
+use ftlm::order_search::stage_join::{search, Span, Stage, StageOutcome};
 use ftlm::regressors::Record;
-use ftlm::search::control::Control;
-use ftlm::search::lattice::{LawEquation, LawLattice, MAX_TUPLES};
-use ftlm::search::options::{Criterion, Estimator, Norm, Options};
-use ftlm::search::outcome::Failure;
-use ftlm::search::stage::{search, Span, Stage, StageOutcome};
 use ftlm::simulate::{equation_error, respond};
 
 use crate::common::{bits, check, deviation, equation, record, relative_distance, with_signal, Random};

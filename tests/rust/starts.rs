@@ -4,18 +4,19 @@ use std::f64::consts::PI;
 
 use ftlm::equation::{self, Initial};
 use ftlm::error::{Error, Result};
-use ftlm::estimate::joint::free::{Coefficient, Equation, Free, Hints, Input, Order, Structure, Term};
-use ftlm::estimate::joint::starts::{power_frequency, Lattices};
-use ftlm::estimate::joint::{Recordings, Runner, Sampled, Sampling, Signal, Source};
-use ftlm::estimate::output_error::{Experiment, FreeInput, InputLaw};
-use ftlm::means::{delayed, point_samples, Intersample};
+use ftlm::estimation::joint_fit::initial_guesses::{power_frequency, Lattices};
+use ftlm::estimation::joint_fit::parameter_set::Free;
+use ftlm::estimation::joint_fit::structure::{Coefficient, Equation, Hints, Input, Order, Structure, Term};
+use ftlm::estimation::joint_fit::{Recordings, Runner, Sampled, Sampling, Signal, Source};
+use ftlm::estimation::output_error::{Experiment, FreeInput, InputLaw};
+use ftlm::order_search::batches::search;
+use ftlm::order_search::control::Control;
+use ftlm::order_search::grid::{Lattice, TermAxis};
+use ftlm::order_search::options::Options;
+use ftlm::parallel::Stop;
 use ftlm::regressors::{Record, BANK_LIMIT};
-use ftlm::search::control::Control;
-use ftlm::search::lattice::{Lattice, TermAxis};
-use ftlm::search::options::Options;
-use ftlm::search::rounds::search;
+use ftlm::signal::block_pulse::{delayed, point_samples, Intersample};
 use ftlm::simulate::respond;
-use ftlm::stop::Stop;
 
 use crate::common::{bits, check, deviation, Random};
 

@@ -1,0 +1,278 @@
+//! All equations that drive each other together (Jakeman and Young, Refined instrumental
+//! variable methods of recursive time-series analysis, part II, Int. J. Control 29, 1979, 621-644).
+//!
+//! One equation filtered by its own 1/D̂ is left with the noise of every other measured output in it. Filtered by the
+//! inverse of the whole matrix Â of the equations, the errors of all of them become the noise of the outputs, white and
+//! separate, whose levels weigh the sum. With simulated outputs in its place, the same filter makes the instrument of a
+//! term what a change of its coefficient does to the free run, so where the steps stand still the weighted output error
+//! does, too.
+
+use super::prefilter::grows;
+use super::solution::{
+    dot, equations, initial_terms, long_run, orthonormal, unmoved, Dropped, Instruments, Settings, Solution,
+};
+use crate::equation::Structure;
+use crate::error::Result;
+use crate::linalg::small::Scaled;
+use crate::regressors::Record;
+use crate::series::{Buffers, Kernel};
+use crate::series_system::System;
+
+/// A step that raises the cost is halved, at most so many times in a row.
+const SHORTENED: usize = 8;
+
+/// A rise of the cost that says nothing: the odds of two sets of coefficients differ by a millionth.
+const EQUAL: f64 = 1e-6;
+
+/// What is refined: equations, known coefficients, exponents and omissions of their initial terms.
+pub struct Problem<'a> {
+    /// As measured.
+    pub records: &'a [Record],
+    /// With clean substitutes for measured outputs that no equation has.
+    pub clean: &'a [Record],
+    /// The equations.
+    pub structures: &'a [Structure],
+    /// Known coefficients, per equation.
+    pub fixed: &'a [Vec<Option<f64>>],
+    /// Exponents of initial terms, per equation.
+    pub exponents: &'a [Vec<f64>],
+    /// (record, position) of initial terms left out, per equation.
+    pub dropped: &'a [Dropped],
+}
+
+/// Where the steps ended.
+#[derive(Debug, Clone, PartialEq)]
+pub struct Ended {
+    /// Per equation: coefficients of its terms, then of its initial terms record by record.
+    pub solutions: Vec<Solution>,
+    /// Per equation: covariance of its free coefficients, row-major, robust to coloured residuals.
+    pub covariances: Vec<Vec<f64>>,
+    /// Σ n ln(Σ ε²/n) over outputs: minus twice the logarithm of their likelihood, noise levels unknown.
+    pub cost: f64,
+    /// Steps made.
+    pub iterations: usize,
+    /// Whether the last step moved nothing any more.
+    pub converged: bool,
+}
+
+/// An unknown: equation, and its term or its (record, position) of an initial term.
+#[derive(Debug, Clone, Copy, PartialEq)]
+enum Unknown {
+    Term(usize, usize),
+    Initial(usize, usize, usize),
+}
+
+/// Coefficients of all equations, and their covariances where asked for.
+type Stepped = (Vec<Solution>, Vec<Vec<f64>>);
+
+/// What one set of coefficients does on every record.
+struct Point {
+    /// Free runs, per record and equation.
+    responses: Vec<Vec<Vec<f64>>>,
+    /// Weight 1/σ² of each output.
+    weights: Vec<f64>,
+    cost: f64,
+}
+
+impl Problem<'_> {
+    /// Steps from a start until they stand still; the cost never rises but by rounding.
+    ///
+    /// None where the free run of the start grows out of its output's size: nothing can be filtered by its inverse.
+    /// O(iterations · n · Σ (terms · m log m + n² m log² m)) for n equations.
+    ///
+    /// # Errors
+    /// [`crate::error::Error::Singular`] where the instruments of all equations together do not tell the terms apart.
+    pub fn refine(&self, start: &[Solution], settings: Settings) -> Result<Option<Ended>> {
+        let unknowns = self.unknowns();
+        let mut solutions = start.to_vec();
+        let Some(mut point) = self.point(&solutions)? else { return Ok(None) };
+        let (mut iterations, mut converged) = (0, false);
+        while !converged && iterations < settings.iterations {
+            let Some((next, _)) = self.step(&solutions, &point, &unknowns, false)? else { return Ok(None) };
+            iterations += 1;
+            converged = solutions
+                .iter()
+                .zip(&next)
+                .zip(self.structures)
+                .all(|((a, b), s)| unmoved(a, b, s.terms.len(), settings.tolerance));
+            let mut share = 1.0;
+            let mut taken = false;
+            for _ in 0..SHORTENED {
+                let tried: Vec<Solution> = solutions
+                    .iter()
+                    .zip(&next)
+                    .map(|(a, b)| a.iter().zip(b).map(|(a, b)| a + share * (b - a)).collect())
+                    .collect();
+                match self.point(&tried)? {
+                    Some(found) if found.cost <= point.cost + EQUAL => {
+                        (solutions, point, taken) = (tried, found, true);
+                        break;
+                    }
+                    _ => share *= 0.5,
+                }
+            }
+            if !taken {
+                // No shorter step lowers the cost.
+                break;
+            }
+        }
+        let Some((_, covariances)) = self.step(&solutions, &point, &unknowns, true)? else { return Ok(None) };
+        Ok(Some(Ended { solutions, covariances, cost: point.cost, iterations, converged }))
+    }
+
+    fn unknowns(&self) -> Vec<Unknown> {
+        let mut out = Vec::new();
+        for (i, fixed) in self.fixed.iter().enumerate() {
+            out.extend((0..fixed.len()).filter(|&k| fixed[k].is_none()).map(|k| Unknown::Term(i, k)));
+            for r in 0..self.records.len() {
+                let kept = (0..self.exponents[i].len()).filter(|&e| !self.dropped[i].contains(&(r, e)));
+                out.extend(kept.map(|e| Unknown::Initial(i, r, e)));
+            }
+        }
+        out
+    }
+
+    /// Free runs and their cost; None where one leaves ten times its output's size.
+    #[allow(clippy::cast_precision_loss)]
+    fn point(&self, solutions: &[Solution]) -> Result<Option<Point>> {
+        let equations = equations(self.structures, solutions);
+        let mut responses = Vec::with_capacity(self.records.len());
+        let mut sums = vec![0.0; equations.len()];
+        let mut count = 0;
+        for (r, record) in self.clean.iter().enumerate() {
+            let initial = initial_terms(r, self.structures, self.exponents, solutions);
+            let outputs = System::new(&equations, record)?.respond(&initial)?;
+            for ((response, equation), sum) in outputs.iter().zip(&equations).zip(&mut sums) {
+                let measured = self.records[r].signal(equation.structure.output);
+                let size = measured.iter().fold(f64::MIN_POSITIVE, |a, v| a.max(v.abs()));
+                if response.iter().any(|v| !v.is_finite() || v.abs() > 10.0 * size) {
+                    return Ok(None);
+                }
+                *sum += measured.iter().zip(response).map(|(y, v)| (y - v) * (y - v)).sum::<f64>();
+            }
+            count += record.m();
+            responses.push(outputs);
+        }
+        let n = count as f64;
+        // Exact data leave rounding, which weighs as any noise.
+        let variances: Vec<f64> = sums.iter().map(|s| (s / n).max(f64::MIN_POSITIVE)).collect();
+        let cost = variances.iter().map(|v| n * libm::log(*v)).sum();
+        Ok(Some(Point { responses, weights: variances.iter().map(|v| 1.0 / v).collect(), cost }))
+    }
+
+    /// New coefficients of all equations and, if asked for, the covariances; None where the inverse of the matrix grows.
+    fn step(
+        &self,
+        solutions: &[Solution],
+        point: &Point,
+        unknowns: &[Unknown],
+        with_covariance: bool,
+    ) -> Result<Option<Stepped>> {
+        let (n, k) = (self.structures.len(), unknowns.len());
+        let equations = equations(self.structures, solutions);
+        let mut parts = Vec::with_capacity(self.records.len());
+        let mut instruments = Vec::with_capacity(self.records.len());
+        for (r, record) in self.records.iter().enumerate() {
+            let m = record.m();
+            let inverse = System::new(&equations, record)?.inverse()?;
+            if inverse.iter().flatten().any(|series| grows(series)) {
+                return Ok(None);
+            }
+            let filters: Vec<Vec<Kernel>> =
+                inverse.iter().map(|row| row.iter().map(|series| Kernel::new(series)).collect()).collect();
+            let simulated = (0..record.len()).map(|s| match self.structures.iter().position(|e| e.output == s) {
+                Some(i) => point.responses[r][i].clone(),
+                None => self.clean[r].signal(s).to_vec(),
+            });
+            let simulated = Record::new(record.step(), simulated.collect(), None)?;
+            let mut buffers = Buffers::default();
+            // Of every output, one after the other, in units of its noise.
+            let mut through = |i: usize, signal: &[f64]| -> Vec<f64> {
+                let spectrum = Kernel::new(signal);
+                let mut out = vec![0.0; n * m];
+                for (j, part) in out.chunks_exact_mut(m).enumerate() {
+                    filters[j][i].times(&spectrum, part, &mut buffers);
+                    let scale = point.weights[j].sqrt();
+                    part.iter_mut().for_each(|v| *v *= scale);
+                }
+                out
+            };
+            let mut target = vec![0.0; n * m];
+            let (mut phi, mut psi, mut places) = (Vec::new(), Vec::new(), Vec::new());
+            for (i, structure) in self.structures.iter().enumerate() {
+                let whole = through(i, record.signal(structure.output));
+                target.iter_mut().zip(whole).for_each(|(t, v)| *t += v);
+                for (term, value) in self.fixed[i].iter().enumerate() {
+                    let (signal, eta) = (structure.terms[term].signal, structure.integration(term));
+                    let column = through(i, &record.integral(signal, eta));
+                    match value {
+                        Some(c) => target.iter_mut().zip(&column).for_each(|(t, v)| *t -= c * v),
+                        None => {
+                            psi.push(through(i, &simulated.integral(signal, eta)));
+                            phi.push(column);
+                        }
+                    }
+                }
+                for (e, &exponent) in self.exponents[i].iter().enumerate() {
+                    if unknowns.contains(&Unknown::Initial(i, r, e)) {
+                        let column = through(i, &record.initial_term(exponent));
+                        psi.push(column.clone());
+                        phi.push(column);
+                    }
+                }
+                places.extend((0..k).filter(|&a| match unknowns[a] {
+                    Unknown::Term(equation, _) => equation == i,
+                    Unknown::Initial(equation, run, _) => equation == i && run == r,
+                }));
+            }
+            parts.push((phi, target));
+            instruments.push(Instruments { columns: psi, places });
+        }
+        orthonormal(&mut instruments, k)?;
+        let (mut cross, mut rhs) = (vec![0.0; k * k], vec![0.0; k]);
+        for ((phi, target), Instruments { columns, places }) in parts.iter().zip(&instruments) {
+            for (instrument, &a) in columns.iter().zip(places) {
+                rhs[a] += dot(instrument, target);
+                for (regressor, &b) in phi.iter().zip(places) {
+                    cross[a * k + b] += dot(instrument, regressor);
+                }
+            }
+        }
+        let solved = Scaled::new(&cross, k)?;
+        let x = solved.solve(&rhs);
+        let mut next: Vec<Solution> = solutions.to_vec();
+        for (&unknown, &value) in unknowns.iter().zip(&x) {
+            match unknown {
+                Unknown::Term(i, term) => next[i][term] = value,
+                Unknown::Initial(i, r, e) => {
+                    next[i][self.structures[i].terms.len() + r * self.exponents[i].len() + e] = value;
+                }
+            }
+        }
+        let mut covariances = Vec::new();
+        if with_covariance {
+            let (mut meat, inverse) = (vec![0.0; k * k], solved.inverse());
+            for (((phi, target), made), record) in parts.iter().zip(&instruments).zip(self.records) {
+                let Instruments { columns: psi, places } = made;
+                let mut rest = target.clone();
+                for (column, &place) in phi.iter().zip(places) {
+                    rest.iter_mut().zip(column).for_each(|(e, v)| *e -= x[place] * v);
+                }
+                let m = record.m();
+                let scores: Vec<Vec<f64>> = psi
+                    .iter()
+                    .map(|p| (0..m).map(|t| (0..n).map(|j| p[j * m + t] * rest[j * m + t]).sum()).collect())
+                    .collect();
+                long_run(&scores, places, &mut meat, k);
+            }
+            let half = |i: usize, j: usize| -> f64 { (0..k).map(|b| meat[i * k + b] * inverse[j * k + b]).sum() };
+            for i in 0..n {
+                let own: Vec<usize> =
+                    (0..k).filter(|&a| matches!(unknowns[a], Unknown::Term(equation, _) if equation == i)).collect();
+                let block = own.iter().flat_map(|&a| own.iter().map(move |&b| (a, b)));
+                covariances.push(block.map(|(a, b)| (0..k).map(|c| inverse[a * k + c] * half(c, b)).sum()).collect());
+            }
+        }
+        Ok(Some((next, covariances)))
+    }
+}

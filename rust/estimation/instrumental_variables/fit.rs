@@ -1,0 +1,361 @@
+//! Equations refined from several starts, each by its own filter and then all of them together.
+//!
+//! All equations given are simulated together, from the signals that none of them has as its output; where those are
+//! measured outputs too, a clean substitute for them is asked for ([`super::prefilter::project`] makes one).
+
+use super::coupled;
+use super::prefilter::{damped_inverse, low_pass, power_frequency, unit};
+use super::single::{divisor, step, Scratch, Shelf, Source};
+use super::solution::{dot, equations, initial_terms, unmoved, Dropped, Settings, Solution};
+use crate::equation::{Initial, Structure};
+use crate::error::{check_length, Error, Result};
+use crate::estimation::least_squares;
+use crate::regressors::Record;
+use crate::series::Kernel;
+use crate::series_system::System;
+
+/// Low-passes behind which a start is made, in units of the output's own band; none: the plain record.
+const PREFILTERS: [Option<f64>; 4] = [None, Some(1.0), Some(2.0), Some(4.0)];
+
+/// A step that raises the output error by this factor is halved, at most so many times in a row.
+const WORSE: f64 = 1.2;
+const SHORTENED: usize = 4;
+
+/// What the iteration came to, for one equation.
+#[derive(Debug, Clone, PartialEq)]
+pub struct Estimate {
+    /// One a term; fixed ones as given.
+    pub coefficients: Vec<f64>,
+    /// Coefficients of the initial terms, per record; 0 where dropped as combinations of others.
+    pub initial: Vec<Vec<f64>>,
+    /// Exponents of the initial terms.
+    pub exponents: Vec<f64>,
+    /// Covariance of the free coefficients at these orders, row-major, robust to coloured residuals.
+    pub covariance: Vec<f64>,
+}
+
+/// Coefficients of all equations.
+#[derive(Debug, Clone, PartialEq)]
+pub struct Fit {
+    /// One an equation.
+    pub estimates: Vec<Estimate>,
+    /// Steps made.
+    pub iterations: usize,
+    /// Whether the last step moved nothing any more; else these are the coefficients with the least output error met.
+    pub converged: bool,
+    /// Whether the free run of the result is unstable, so that its instruments had to be damped.
+    pub damped: bool,
+}
+
+/// Refined instrumental variables for one or several equations on one or several records.
+///
+/// The records' clean signals ([`Record::with_clean`]) stand for outputs that no equation simulates, and are the first
+/// instruments for those that one does; a record without them stands for itself. The iteration
+/// starts from two-stage least squares behind several low-passes; the end with the least output error is kept, and
+/// where none stands still the iterate with the least. An unstable iterate is damped (its series read at ρz, ρ < 1),
+/// which keeps instruments bounded and clean.
+///
+/// O(iterations · Σ (terms · m log m + n² m log² m)).
+///
+/// # Errors
+/// As least squares and [`Settings::check`]; [`Error::Singular`] where instruments cannot tell the terms apart;
+/// [`Error::Length`].
+///
+/// ```
+/// # fn main() -> ftlm::error::Result<()> {
+/// use ftlm::equation::{Equation, Initial, Structure, Term};
+/// use ftlm::estimation::instrumental_variables as iv;
+/// use ftlm::regressors::Record;
+/// use ftlm::simulate;
+/// use ftlm::parallel::Stop;
+/// let terms = vec![Term { signal: 0, order: 0.5 }, Term { signal: 1, order: 0.0 }];
+/// let plant = Equation::new(Structure { output: 0, order: 1.5, terms }, vec![-4.0, 2.0])?;
+/// let input: Vec<f64> = (0..400).map(|k| if k % 100 < 50 { 1.0 } else { -1.0 }).collect();
+/// let driven = Record::new(0.02, vec![vec![0.0; 400], input.clone()], None)?;
+/// let output = simulate::respond(std::slice::from_ref(&plant), &driven, &[])?.remove(0);
+/// let measured = Record::new(0.02, vec![output, input], None)?;
+/// let run = iv::with_projections(measured, &[false, true], true, &Stop::default())?;
+/// let structures = [plant.structure.clone()];
+/// let found = iv::fit(&[run], &structures, &[vec![None, None]], &Initial::Rest, iv::Settings::default())?;
+/// assert!(found.converged && (found.estimates[0].coefficients[1] - 2.0).abs() < 1e-6);
+/// # Ok(())
+/// # }
+/// ```
+pub fn fit(
+    records: &[Record],
+    structures: &[Structure],
+    fixed: &[Vec<Option<f64>>],
+    initial: &Initial,
+    settings: Settings,
+) -> Result<Fit> {
+    settings.check()?;
+    check_length("fixed coefficients", structures.len(), fixed.len())?;
+    if structures.is_empty() {
+        return Err(Error::Length { name: "equations".into(), expected: 1, found: 0 });
+    }
+    let clean: Vec<Record> = records.iter().map(Record::cleaned).collect();
+    let exponents: Vec<Vec<f64>> = structures.iter().map(|s| s.initial_exponents(initial)).collect();
+    let problem = Problem::new(records, &clean, structures, (fixed, initial), &exponents)?;
+    let mut best: Option<Ended> = None;
+    let mut failure = None;
+    // Ends of all equations together, by cost; from one start the equations one by one may come out unstable, from
+    // another not.
+    let mut together: Option<coupled::Ended> = None;
+    for multiple in PREFILTERS {
+        // A start that cannot be made, or whose instruments fail, leaves the others.
+        match problem.start(multiple).and_then(|solutions| {
+            let ended = problem.iterate(solutions.clone(), settings)?;
+            Ok((solutions, ended))
+        }) {
+            Ok((start, ended)) => {
+                if structures.len() > 1 {
+                    for from in [&ended.solutions, &start] {
+                        let Some(found) = problem.together(from, settings)? else { continue };
+                        if together.as_ref().is_none_or(|t| found.cost < t.cost) {
+                            together = Some(found);
+                        }
+                        break;
+                    }
+                }
+                if best.as_ref().is_none_or(|b| ended.error < b.error) {
+                    best = Some(ended);
+                }
+            }
+            Err(error) => failure = failure.or(Some(error)),
+        }
+    }
+    let Some(mut ended) = best else {
+        return Err(failure.unwrap_or_else(|| Error::Diverged { what: "free run of every start".into(), index: 0 }));
+    };
+    if let Some(found) = together {
+        ended = Ended {
+            error: ended.error,
+            solutions: found.solutions,
+            covariances: found.covariances,
+            iterations: ended.iterations + found.iterations,
+            converged: found.converged,
+            damped: false,
+        };
+    }
+    let estimates = ended
+        .solutions
+        .into_iter()
+        .zip(structures)
+        .zip(exponents)
+        .zip(ended.covariances)
+        .map(|(((solution, structure), exponents), covariance)| {
+            let (coefficients, rest) = solution.split_at(structure.terms.len());
+            let width = exponents.len();
+            let initial = (0..records.len()).map(|r| rest[r * width..(r + 1) * width].to_vec()).collect();
+            Estimate { coefficients: coefficients.to_vec(), initial, exponents, covariance }
+        })
+        .collect();
+    Ok(Fit { estimates, iterations: ended.iterations, converged: ended.converged, damped: ended.damped })
+}
+
+struct Problem<'a> {
+    records: &'a [Record],
+    clean: &'a [Record],
+    structures: &'a [Structure],
+    fixed: &'a [Vec<Option<f64>>],
+    exponents: &'a [Vec<f64>],
+    /// Initial terms left out, per equation.
+    dropped: Vec<Dropped>,
+    /// Per equation and record: what no step changes, and what the clean signals make of its terms.
+    shelves: Vec<Vec<Shelf<'a>>>,
+    substitutes: Vec<Vec<Vec<Option<Kernel>>>>,
+}
+
+/// Where one start ended.
+struct Ended {
+    error: f64,
+    solutions: Vec<Solution>,
+    covariances: Vec<Vec<f64>>,
+    iterations: usize,
+    converged: bool,
+    damped: bool,
+}
+
+impl<'a> Problem<'a> {
+    fn new(
+        records: &'a [Record],
+        clean: &'a [Record],
+        structures: &'a [Structure],
+        (fixed, initial): (&'a [Vec<Option<f64>>], &Initial),
+        exponents: &'a [Vec<f64>],
+    ) -> Result<Self> {
+        let plain = |(structure, fixed): (&Structure, &Vec<Option<f64>>)| {
+            Ok(least_squares::fit(records, structure, fixed, initial)?.dropped)
+        };
+        let dropped = structures.iter().zip(fixed).map(plain).collect::<Result<Vec<Dropped>>>()?;
+        let of_equation = |(structure, exponents): (&Structure, &Vec<f64>)| -> Vec<Shelf<'a>> {
+            records.iter().map(|record| Shelf::new(record, structure, exponents)).collect()
+        };
+        let shelves: Vec<Vec<Shelf<'a>>> = structures.iter().zip(exponents).map(of_equation).collect();
+        let substituted = |shelves: &Vec<Shelf<'a>>| -> Vec<Vec<Option<Kernel>>> {
+            shelves.iter().zip(clean).map(|(shelf, clean)| shelf.clean(clean, |_| true)).collect()
+        };
+        let substitutes = shelves.iter().map(substituted).collect();
+        Ok(Self { records, clean, structures, fixed, exponents, dropped, shelves, substitutes })
+    }
+
+    /// Two-stage least squares: one step with the clean signals as instruments, behind a low-pass at a multiple of each
+    /// output's own band if one is given.
+    fn start(&self, multiple: Option<f64>) -> Result<Vec<Solution>> {
+        let mut scratch = Scratch::default();
+        let mut solutions = Vec::with_capacity(self.structures.len());
+        for (i, (structure, fixed)) in self.structures.iter().zip(self.fixed).enumerate() {
+            let pairs = self.shelves[i].iter().zip(&self.substitutes[i]);
+            let sources: Vec<Source<'_>> = pairs.map(|(shelf, clean)| shelf.source(|k| clean[k].as_ref())).collect();
+            let low_passed = |r: &Record, multiple: f64| {
+                low_pass(multiple * power_frequency(r.signal(structure.output), r.step()), r)
+            };
+            let filter = |r: &Record| multiple.map_or_else(|| Ok(unit(r.m())), |multiple| low_passed(r, multiple));
+            let filters = self.records.iter().map(|r| Ok(Kernel::new(&filter(r)?))).collect::<Result<Vec<Kernel>>>()?;
+            let own: Vec<Vec<f64>> = self.clean.iter().map(|r| r.signal(structure.output).to_vec()).collect();
+            solutions.push(step(&sources, &filters, &own, fixed, &self.dropped[i], false, &mut scratch)?.0);
+        }
+        Ok(solutions)
+    }
+
+    fn iterate(&self, mut solutions: Vec<Solution>, settings: Settings) -> Result<Ended> {
+        let mut scratch = Scratch::default();
+        let mut best = (f64::INFINITY, solutions.clone());
+        let (mut iterations, mut converged, mut shortened) = (0, false, 0);
+        loop {
+            let (responses, damped) = coupled(self.clean, self.structures, self.exponents, &solutions)?;
+            let error = output_error(self.records, self.structures, &responses);
+            if error < best.0 {
+                best = (error, solutions.clone());
+                shortened = 0;
+            }
+            let last = converged || iterations == settings.iterations;
+            if !last && shortened < SHORTENED && (error.is_nan() || error > WORSE * best.0) {
+                // A step too far: half-way back to the best.
+                for (x, y) in solutions.iter_mut().flatten().zip(best.1.iter().flatten()) {
+                    *x = 0.5 * (*x + y);
+                }
+                shortened += 1;
+                iterations += 1;
+                continue;
+            }
+            if last && !converged && solutions != best.1 {
+                // Once more, for the covariance of what is handed out.
+                solutions.clone_from(&best.1);
+                continue;
+            }
+            let (next, covariances) = self.step(&solutions, &responses, last, &mut scratch)?;
+            if last {
+                return Ok(Ended { error, solutions, covariances, iterations, converged, damped });
+            }
+            iterations += 1;
+            converged = solutions
+                .iter()
+                .zip(&next)
+                .zip(self.structures)
+                .all(|((a, b), s)| unmoved(a, b, s.terms.len(), settings.tolerance));
+            solutions = next;
+        }
+    }
+
+    /// All equations together from a start ([`crate::estimation::instrumental_variables::coupled`]); None where that
+    /// cannot be done.
+    fn together(&self, start: &[Solution], settings: Settings) -> Result<Option<coupled::Ended>> {
+        let problem = coupled::Problem {
+            records: self.records,
+            clean: self.clean,
+            structures: self.structures,
+            fixed: self.fixed,
+            exponents: self.exponents,
+            dropped: &self.dropped,
+        };
+        match problem.refine(start, settings) {
+            Err(Error::Singular { .. }) => Ok(None),
+            other => other,
+        }
+    }
+
+    /// One step of every equation with the instruments of one coupled free run.
+    fn step(
+        &self,
+        solutions: &[Solution],
+        responses: &[Vec<Vec<f64>>],
+        with_covariance: bool,
+        scratch: &mut Scratch,
+    ) -> Result<(Vec<Solution>, Vec<Vec<f64>>)> {
+        let simulated = self
+            .clean
+            .iter()
+            .zip(responses)
+            .map(|(record, outputs)| {
+                let replaced = (0..record.len()).map(|s| match self.structures.iter().position(|e| e.output == s) {
+                    Some(i) => outputs[i].clone(),
+                    None => record.signal(s).to_vec(),
+                });
+                Record::new(record.step(), replaced.collect(), None)
+            })
+            .collect::<Result<Vec<_>>>()?;
+        let mut out = (Vec::new(), Vec::new());
+        for (i, fixed) in self.fixed.iter().enumerate() {
+            let driven = |signal: usize| self.structures.iter().any(|e| e.output == signal);
+            let pairs = self.shelves[i].iter().zip(&simulated);
+            let made: Vec<Vec<Option<Kernel>>> = pairs.map(|(shelf, record)| shelf.clean(record, driven)).collect();
+            let terms = &self.structures[i].terms;
+            let sources: Vec<Source<'_>> = (0..made.len())
+                .map(|r| {
+                    let of = |k: usize| if driven(terms[k].signal) { &made[r][k] } else { &self.substitutes[i][r][k] };
+                    self.shelves[i][r].source(|k| of(k).as_ref())
+                })
+                .collect();
+            let filters = sources
+                .iter()
+                .map(|s| Ok(Kernel::new(&damped_inverse(&divisor(s, &solutions[i]))?.0)))
+                .collect::<Result<Vec<_>>>()?;
+            let own: Vec<Vec<f64>> = responses.iter().map(|outputs| outputs[i].clone()).collect();
+            let (solution, covariance) =
+                step(&sources, &filters, &own, fixed, &self.dropped[i], with_covariance, scratch)?;
+            out.0.push(solution);
+            out.1.push(covariance);
+        }
+        Ok(out)
+    }
+}
+
+/// Σ ‖y − ŷ‖²/‖y‖² over records and equations.
+fn output_error(records: &[Record], structures: &[Structure], responses: &[Vec<Vec<f64>>]) -> f64 {
+    let mut total = 0.0;
+    for (record, outputs) in records.iter().zip(responses) {
+        for (structure, response) in structures.iter().zip(outputs) {
+            let y = record.signal(structure.output);
+            let missed: f64 = y.iter().zip(response).map(|(y, v)| (y - v) * (y - v)).sum();
+            total += missed / dot(y, y).max(f64::MIN_POSITIVE);
+        }
+    }
+    total
+}
+
+/// Free runs of all equations together on every record, damped where they grow.
+fn coupled(
+    clean: &[Record],
+    structures: &[Structure],
+    exponents: &[Vec<f64>],
+    solutions: &[Solution],
+) -> Result<(Vec<Vec<Vec<f64>>>, bool)> {
+    let equations = equations(structures, solutions);
+    let mut damped = false;
+    let mut out = Vec::with_capacity(clean.len());
+    for (r, record) in clean.iter().enumerate() {
+        let initial = initial_terms(r, structures, exponents, solutions);
+        // A run that grows with its input is no instability; one that passes all measured sizes is.
+        let bounded = |outputs: &[Vec<f64>]| {
+            outputs.iter().zip(structures).all(|(response, s)| {
+                let measured = record.signal(s.output).iter().fold(0.0_f64, |a, v| a.max(v.abs()));
+                response.iter().all(|v| v.abs() <= 10.0 * measured.max(f64::MIN_POSITIVE))
+            })
+        };
+        let (outputs, grown) = System::new(&equations, record)?.bounded(&initial, bounded)?;
+        damped |= grown;
+        out.push(outputs);
+    }
+    Ok((out, damped))
+}

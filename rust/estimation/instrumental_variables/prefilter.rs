@@ -1,0 +1,203 @@
+//! The filters that stand before regressors and instruments: 1/D̂, damped where it grows, and low-passes.
+//!
+//! Clean substitutes for measured outputs: their projections on what the inputs excite.
+
+use super::solution::dot;
+use crate::equation::Filter;
+use crate::error::{Error, Result};
+use crate::fft;
+use crate::fractional::kernels::block_pulse_kernel;
+use crate::linalg::orthogonal::orthonormal_basis;
+use crate::parallel::Stop;
+use crate::regressors::Record;
+use crate::series::{self, reciprocal, Buffers, Kernel};
+
+/// A free run whose second half exceeds the first by this factor is unstable: its instruments would drown the rest.
+const GROWTH: f64 = 2.0;
+
+/// 1/D mod z^m, or of D(ρz) with the largest ρ = e^{−γ/m}, γ = 0, 4, 8, …, that keeps it from growing.
+///
+/// # Errors
+/// [`LeadingZero`](crate::error::Error::LeadingZero) where D starts with zero.
+#[allow(clippy::cast_precision_loss)]
+pub fn damped_inverse(divisor: &[f64]) -> Result<(Vec<f64>, bool)> {
+    let m = divisor.len();
+    let one = unit(m);
+    let quotient = series::divide(&one, divisor)?;
+    if !grows(&quotient) {
+        return Ok((quotient, false));
+    }
+    let finite = quotient.iter().all(|q| q.is_finite());
+    let mut gamma = 4.0;
+    loop {
+        let rho = libm::exp(-gamma / m as f64);
+        // The quotient of a divisor read at ρz is the quotient read at ρz, as long as numbers hold it.
+        let damped = if finite { read_at(rho, &quotient) } else { series::divide(&one, &read_at(rho, divisor))? };
+        // At γ = 64 m nothing is left of D but its first term.
+        if !grows(&damped) || gamma > 64.0 * m as f64 {
+            return Ok((damped, true));
+        }
+        gamma *= 2.0;
+    }
+}
+
+/// A series read at ρz.
+fn read_at(rho: f64, series: &[f64]) -> Vec<f64> {
+    let mut power = 1.0;
+    series
+        .iter()
+        .map(|v| {
+            let value = v * power;
+            power *= rho;
+            value
+        })
+        .collect()
+}
+
+pub(super) fn grows(response: &[f64]) -> bool {
+    let (first, second) = response.split_at(response.len() / 2);
+    let peak =
+        |part: &[f64]| part.iter().fold(0.0_f64, |a, v| if v.is_finite() { a.max(v.abs()) } else { f64::INFINITY });
+    let later = peak(second);
+    later.is_infinite() || later > GROWTH * peak(first)
+}
+
+/// Frequency [rad/s] below which 90 % of a signal's power lies.
+#[must_use]
+#[allow(clippy::cast_precision_loss)]
+pub fn power_frequency(signal: &[f64], step: f64) -> f64 {
+    let m = signal.len();
+    let mean = signal.iter().sum::<f64>() / m.max(1) as f64;
+    let power = fft::power_spectrum(signal.iter().enumerate().map(|(k, v)| {
+        // Hann's window: what an open end leaks would count as high frequency.
+        let window = 0.5 - 0.5 * libm::cos(2.0 * std::f64::consts::PI * k as f64 / m as f64);
+        window * (v - mean)
+    }));
+    let total: f64 = power.iter().sum();
+    let mut sum = 0.0;
+    let at = power.iter().position(|p| {
+        sum += p;
+        sum >= 0.9 * total
+    });
+    // Bins of the padded transform are 1/(its length) apart; the last bin is Nyquist's frequency.
+    let bins = power.len().saturating_sub(1).max(1) as f64;
+    std::f64::consts::PI / step * at.unwrap_or(0).max(1) as f64 / bins
+}
+
+/// A second-order low-pass as a series: behind it the equation between all signals stays the same.
+///
+/// # Errors
+/// As [`Filter::series`].
+pub fn low_pass(omega: f64, record: &Record) -> Result<Vec<f64>> {
+    let numerator = vec![(omega * omega, 0.0)];
+    let denominator = vec![(1.0, 2.0), (1.4 * omega, 1.0), (omega * omega, 0.0)];
+    Filter { numerator, denominator }.series(record.m(), record.step())
+}
+
+/// The series 1.
+pub(super) fn unit(m: usize) -> Vec<f64> {
+    let mut one = vec![0.0; m];
+    if let Some(first) = one.first_mut() {
+        *first = 1.0;
+    }
+    one
+}
+
+/// Resonators of [`project`] a decade and input, and their damping ratio: broad enough to leave no gap between them.
+const RESONATORS: usize = 8;
+const RESONATOR_DAMPING: f64 = 0.2;
+
+/// Where less than this share of every column of [`project`] is new the others are left out: what inputs excite has next to
+/// nothing along them, noise as much as along any, and rounding (10⁻¹¹ of columns of a thousand pulses) would choose them.
+const SPANNED: f64 = 1e-6;
+
+/// A record with clean substitutes ([`project`]) for all signals that are no inputs; inputs stand for themselves.
+///
+/// # Errors
+/// As [`project`], [`Error::Interrupted`].
+pub fn with_projections(record: Record, inputs: &[bool], at_rest: bool, stop: &Stop) -> Result<Record> {
+    let known: Vec<usize> = (0..record.len()).filter(|&s| inputs.get(s).copied().unwrap_or(false)).collect();
+    // One basis for all signals; none where all are inputs.
+    let basis = if known.len() < record.len() { excited(&record, &known, at_rest, stop)? } else { Vec::new() };
+    let clean = (0..record.len()).map(|s| {
+        let signal = record.signal(s);
+        if known.contains(&s) {
+            signal.to_vec()
+        } else {
+            along(&basis, signal)
+        }
+    });
+    let clean = clean.collect();
+    record.with_clean(clean)
+}
+
+/// A measured signal without most of its noise: its least-squares projection on what the inputs excite.
+///
+/// The basis holds each input's first two integrals and, eight a decade, its response through resonators: k directions
+/// leave k/m of the noise power, whatever the signal's dynamics. Deterministic powers of t (offset, ramp) are added
+/// where the record does not start at rest.
+///
+/// # Errors
+/// No input, a record of fewer than 8 pulses.
+pub fn project(record: &Record, signal: usize, inputs: &[usize], at_rest: bool) -> Result<Vec<f64>> {
+    Ok(along(&excited(record, inputs, at_rest, &Stop::default())?, record.signal(signal)))
+}
+
+/// The sum of a signal's parts along orthonormal directions.
+fn along(basis: &[Vec<f64>], signal: &[f64]) -> Vec<f64> {
+    let mut out = vec![0.0; signal.len()];
+    for direction in basis {
+        let along = dot(direction, signal);
+        out.iter_mut().zip(direction).for_each(|(o, v)| *o += along * v);
+    }
+    out
+}
+
+/// An orthonormal basis of what the inputs excite.
+#[allow(clippy::cast_precision_loss)]
+fn excited(record: &Record, inputs: &[usize], at_rest: bool, stop: &Stop) -> Result<Vec<Vec<f64>>> {
+    let (m, h) = (record.m(), record.step());
+    if m < 8 || inputs.is_empty() {
+        return Err(Error::Structure {
+            what: "instruments need an input and at least 8 pulses".into(),
+            remedy: "use a longer record, or least squares".into(),
+        });
+    }
+    let duration = m as f64 * h;
+    let (low, high) = (std::f64::consts::PI / duration, std::f64::consts::PI / (4.0 * h));
+    let decades = libm::log10(high / low);
+    #[allow(clippy::cast_possible_truncation, clippy::cast_sign_loss)]
+    let count = ((decades * RESONATORS as f64) as usize).clamp(2, (m / (8 * inputs.len())).max(2));
+    let mut columns = Vec::new();
+    if !at_rest {
+        columns.extend([0.0, 1.0].map(|e| record.initial_term(e)));
+    }
+    let [once, twice] = [1.0, 2.0].map(|eta| block_pulse_kernel(eta, m, h));
+    let mut buffers = Buffers::default();
+    for &input in inputs {
+        let driver = Kernel::new(record.signal(input));
+        let integrals = [&once, &twice].map(|kernel| {
+            let mut integral = vec![0.0; m];
+            driver.apply(kernel, &mut integral, &mut buffers);
+            integral
+        });
+        let spectra = [&integrals[0], &integrals[1]].map(|integral| Kernel::new(integral));
+        columns.extend(integrals);
+        for i in 0..count {
+            stop.check()?;
+            // s u and u over s² + 2ζωs + ω² are I u and I² u over 1 + 2ζω I + ω² I², whatever their sizes.
+            let omega = low * libm::pow(10.0, decades * i as f64 / (count - 1) as f64);
+            let resonator =
+                once.iter().zip(&twice).map(|(a, b)| 2.0 * RESONATOR_DAMPING * omega * a + omega * omega * b);
+            let mut resonator: Vec<f64> = resonator.collect();
+            resonator[0] += 1.0;
+            let answer = Kernel::made_with(&reciprocal(&resonator), &mut buffers);
+            columns.extend(spectra.each_ref().map(|integral| {
+                let mut column = vec![0.0; m];
+                answer.times(integral, &mut column, &mut buffers);
+                column
+            }));
+        }
+    }
+    orthonormal_basis(columns, SPANNED, stop)
+}

@@ -1,0 +1,299 @@
+//! One equation: the regression of a step, and steps until they stand still.
+//!
+//! The equation is filtered by 1/D̂, which leaves about the white noise of the output, and correlated with instruments
+//! that hold no noise: the inputs and the simulated output. Both follow from the last estimate, so the step is repeated.
+
+use super::prefilter::damped_inverse;
+use super::solution::{dot, long_run, orthonormal, unmoved, Instruments, Settings, Solution};
+use crate::equation::Structure;
+use crate::error::Result;
+use crate::fractional::kernels;
+use crate::linalg::small::Scaled;
+use crate::parallel::Stop;
+use crate::regressors::Record;
+use crate::series::{multiply, Buffers, Kernel, SumOfProducts};
+
+/// What a step reads of one record for one equation: spectra good for products of two series of m terms.
+pub struct Source<'a> {
+    /// Per term: kernel of I^η and its spectrum where the term is the output's own.
+    pub own: Vec<Option<(&'a [f64], &'a Kernel)>>,
+    /// Per term: I^η s as measured.
+    pub measured: Vec<&'a Kernel>,
+    /// Per term: I^η s without noise, the same object where it is no other; not read for own terms.
+    pub clean: Vec<&'a Kernel>,
+    /// Initial terms.
+    pub initial: Vec<&'a Kernel>,
+    /// The output's spectrum.
+    pub target: &'a Kernel,
+    /// The output.
+    pub output: &'a [f64],
+}
+
+/// Spectra that the sources of one record share, whatever solution they are for.
+pub(super) struct Shelf<'a> {
+    record: &'a Record,
+    output: usize,
+    terms: Vec<Shelved>,
+    initial: Vec<Kernel>,
+    target: Kernel,
+}
+
+/// One term: its signal and order, its kernel, that one's spectrum and that of I^η s as measured.
+struct Shelved {
+    signal: usize,
+    eta: f64,
+    kernel: Vec<f64>,
+    spectrum: Kernel,
+    measured: Kernel,
+}
+
+impl Shelved {
+    /// Spectrum of I^η of another signal.
+    fn of(&self, signal: &[f64]) -> Kernel {
+        if self.eta == 0.0 {
+            Kernel::new(signal)
+        } else {
+            Kernel::new(&multiply(&self.kernel, signal, signal.len()))
+        }
+    }
+}
+
+impl<'a> Shelf<'a> {
+    pub(super) fn new(record: &'a Record, structure: &Structure, exponents: &[f64]) -> Self {
+        let term = |k: usize| {
+            let (signal, eta) = (structure.terms[k].signal, structure.integration(k));
+            let kernel = kernels::kernel(eta, record.m(), record.step());
+            let spectrum = Kernel::new(&kernel);
+            let measured = Kernel::new(&record.integral(signal, eta));
+            Shelved { signal, eta, kernel, spectrum, measured }
+        };
+        Self {
+            record,
+            output: structure.output,
+            terms: (0..structure.terms.len()).map(term).collect(),
+            initial: exponents.iter().map(|&e| Kernel::new(&record.initial_term(e))).collect(),
+            target: Kernel::new(record.signal(structure.output)),
+        }
+    }
+
+    /// What substitutes make of the terms of other signals than the output, where `wanted` and where they are no other
+    /// than what was measured.
+    pub(super) fn clean(&self, substitute: &Record, wanted: impl Fn(usize) -> bool) -> Vec<Option<Kernel>> {
+        let other = |s: usize| s != self.output && wanted(s) && substitute.signal(s) != self.record.signal(s);
+        self.terms.iter().map(|t| other(t.signal).then(|| t.of(substitute.signal(t.signal)))).collect()
+    }
+
+    /// With what a substitute makes of each term, as measured where that is none.
+    pub(super) fn source<'b>(&'b self, clean: impl Fn(usize) -> Option<&'b Kernel>) -> Source<'b> {
+        let own = |t: &Shelved| t.signal == self.output;
+        let terms = || self.terms.iter();
+        Source {
+            own: terms().map(|t| own(t).then_some((&t.kernel[..], &t.spectrum))).collect(),
+            measured: terms().map(|t| &t.measured).collect(),
+            clean: terms().enumerate().map(|(k, t)| clean(k).unwrap_or(&t.measured)).collect(),
+            initial: self.initial.iter().collect(),
+            target: &self.target,
+            output: self.record.signal(self.output),
+        }
+    }
+}
+
+/// D = 1 − Σ c F^η over the own terms.
+pub(super) fn divisor(source: &Source<'_>, coefficients: &[f64]) -> Vec<f64> {
+    let mut out = vec![0.0; source.output.len()];
+    for (kernel, c) in source.own.iter().zip(coefficients) {
+        if let Some((kernel, _)) = kernel {
+            out.iter_mut().zip(*kernel).for_each(|(d, v)| *d -= c * v);
+        }
+    }
+    out[0] += 1.0;
+    out
+}
+
+/// Memory of the steps of one thread.
+#[derive(Default)]
+pub struct Scratch {
+    buffers: Buffers,
+    stop: Stop,
+}
+
+impl Scratch {
+    /// Of steps that end with [`Interrupted`](crate::error::Error::Interrupted) once they are told to stop.
+    #[must_use]
+    pub fn until(stop: &Stop) -> Self {
+        Self { buffers: Buffers::default(), stop: stop.clone() }
+    }
+}
+
+/// One step for one equation: new coefficients from filters 1/D̂ and simulated outputs, one of each a record.
+///
+/// `dropped` lists (record, position) of initial terms to leave out. Returns the solution and, if asked for, the
+/// covariance of the free coefficients.
+///
+/// # Errors
+/// [`Singular`](crate::error::Error::Singular) where the instruments do not tell the regressors apart,
+/// [`Interrupted`](crate::error::Error::Interrupted) once the scratch's stop is set.
+#[allow(clippy::cast_precision_loss)]
+pub fn step(
+    sources: &[Source<'_>],
+    filters: &[Kernel],
+    responses: &[Vec<f64>],
+    fixed: &[Option<f64>],
+    dropped: &[(usize, usize)],
+    with_covariance: bool,
+    scratch: &mut Scratch,
+) -> Result<(Solution, Vec<f64>)> {
+    let free: Vec<usize> = (0..fixed.len()).filter(|&k| fixed[k].is_none()).collect();
+    let width = sources.first().map_or(0, |s| s.initial.len());
+    let kept: Vec<(usize, usize)> = (0..sources.len())
+        .flat_map(|r| (0..width).map(move |i| (r, i)))
+        .filter(|place| !dropped.contains(place))
+        .collect();
+    let k = free.len() + kept.len();
+    let (mut filtered, mut instruments) = (Vec::with_capacity(sources.len()), Vec::with_capacity(sources.len()));
+    for (r, source) in sources.iter().enumerate() {
+        let m = source.output.len();
+        let filter = &filters[r];
+        let mut target = product(filter, source.target, m, scratch)?;
+        let mut phi: Vec<Vec<f64>> = Vec::with_capacity(k);
+        for (j, value) in fixed.iter().enumerate() {
+            let column = product(filter, source.measured[j], m, scratch)?;
+            match value {
+                Some(c) => target.iter_mut().zip(&column).for_each(|(t, v)| *t -= c * v),
+                None => phi.push(column),
+            }
+        }
+        let simulated = Kernel::new(&product(filter, &Kernel::new(&responses[r]), m, scratch)?);
+        let mut psi: Vec<Vec<f64>> = Vec::with_capacity(k);
+        for (place, &j) in free.iter().enumerate() {
+            psi.push(match source.own[j] {
+                None if std::ptr::eq(source.clean[j], source.measured[j]) => phi[place].clone(),
+                None => product(filter, source.clean[j], m, scratch)?,
+                Some((_, spectrum)) => product(&simulated, spectrum, m, scratch)?,
+            });
+        }
+        let mut places: Vec<usize> = (0..free.len()).collect();
+        for (place, &(_, i)) in kept.iter().enumerate().filter(|&(_, &(record, _))| record == r) {
+            let column = product(filter, source.initial[i], m, scratch)?;
+            psi.push(column.clone());
+            phi.push(column);
+            places.push(free.len() + place);
+        }
+        filtered.push(Filtered { phi, target });
+        instruments.push(Instruments { columns: psi, places });
+    }
+    orthonormal(&mut instruments, k)?;
+    let (mut cross, mut rhs) = (vec![0.0; k * k], vec![0.0; k]);
+    for (Filtered { phi, target }, Instruments { columns, places }) in filtered.iter().zip(&instruments) {
+        for (instrument, &a) in columns.iter().zip(places) {
+            rhs[a] += dot(instrument, target);
+            for (regressor, &b) in phi.iter().zip(places) {
+                cross[a * k + b] += dot(instrument, regressor);
+            }
+        }
+    }
+    let solved = Scaled::new(&cross, k)?;
+    let x = solved.solve(&rhs);
+    let mut solution: Solution = fixed.iter().map(|f| f.unwrap_or(0.0)).collect();
+    for (&j, &value) in free.iter().zip(&x) {
+        solution[j] = value;
+    }
+    solution.resize(fixed.len() + sources.len() * width, 0.0);
+    for (&(r, i), &value) in kept.iter().zip(&x[free.len()..]) {
+        solution[fixed.len() + r * width + i] = value;
+    }
+    let mut covariance = Vec::new();
+    if with_covariance {
+        let mut meat = vec![0.0; k * k];
+        for (part, instruments) in filtered.iter().zip(&instruments) {
+            long_run(&part.scores(instruments, &x), &instruments.places, &mut meat, k);
+        }
+        let (n, inverse) = (free.len(), solved.inverse());
+        covariance = vec![0.0; n * n];
+        for a in 0..n {
+            for b in 0..n {
+                let mut total = 0.0;
+                for i in 0..k {
+                    for j in 0..k {
+                        total += inverse[a * k + i] * meat[i * k + j] * inverse[b * k + j];
+                    }
+                }
+                covariance[a * n + b] = total;
+            }
+        }
+    }
+    Ok((solution, covariance))
+}
+
+/// Regressors and target of one record behind the filter.
+struct Filtered {
+    phi: Vec<Vec<f64>>,
+    target: Vec<f64>,
+}
+
+impl Filtered {
+    /// ψ e at a solution, a row each instrument.
+    fn scores(&self, instruments: &Instruments, x: &[f64]) -> Vec<Vec<f64>> {
+        let mut rest = self.target.clone();
+        for (column, &place) in self.phi.iter().zip(&instruments.places) {
+            rest.iter_mut().zip(column).for_each(|(e, v)| *e -= x[place] * v);
+        }
+        instruments.columns.iter().map(|p| p.iter().zip(&rest).map(|(p, e)| p * e).collect()).collect()
+    }
+}
+
+/// First m terms of a product of two cached series.
+fn product(a: &Kernel, b: &Kernel, m: usize, scratch: &mut Scratch) -> Result<Vec<f64>> {
+    scratch.stop.check()?;
+    let mut out = vec![0.0; m];
+    a.times(b, &mut out, &mut scratch.buffers);
+    Ok(out)
+}
+
+/// One equation refined from a start, its output simulated from the clean signals of its sources.
+///
+/// `start` holds the coefficients of the terms, then of the initial terms record by record. Returns the last solution,
+/// the steps made and whether the last moved nothing.
+///
+/// # Errors
+/// As [`step`] and [`damped_inverse`].
+pub fn refine(
+    sources: &[Source<'_>],
+    fixed: &[Option<f64>],
+    dropped: &[(usize, usize)],
+    start: &[f64],
+    settings: Settings,
+    scratch: &mut Scratch,
+) -> Result<(Solution, usize, bool)> {
+    let mut solution = start.to_vec();
+    for made in 1..=settings.iterations {
+        let mut filters = Vec::with_capacity(sources.len());
+        let mut responses = Vec::with_capacity(sources.len());
+        for (r, source) in sources.iter().enumerate() {
+            let m = source.output.len();
+            scratch.stop.check()?;
+            let (filter, _) = damped_inverse(&divisor(source, &solution))?;
+            let mut sum = SumOfProducts::new(m);
+            let spectrum = Kernel::new(&filter);
+            for (j, own) in source.own.iter().enumerate() {
+                if own.is_none() {
+                    sum.add(solution[j], source.clean[j], &spectrum);
+                }
+            }
+            for (i, term) in source.initial.iter().enumerate() {
+                sum.add(solution[fixed.len() + r * source.initial.len() + i], term, &spectrum);
+            }
+            let mut response = vec![0.0; m];
+            sum.take(&mut response, &mut scratch.buffers);
+            filters.push(spectrum);
+            responses.push(response);
+        }
+        let (next, _) = step(sources, &filters, &responses, fixed, dropped, false, scratch)?;
+        let still = unmoved(&solution, &next, fixed.len(), settings.tolerance);
+        solution = next;
+        if still {
+            return Ok((solution, made, true));
+        }
+    }
+    Ok((solution, settings.iterations, false))
+}

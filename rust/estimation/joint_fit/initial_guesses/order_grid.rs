@@ -1,0 +1,537 @@
+//! Rows of coarse lattices.
+//!
+//! Starts from coarse lattices.
+//!
+//! Coarse lattices of free orders.
+//!
+//! What an order search takes one by one.
+
+use std::collections::{BTreeMap, BTreeSet};
+
+use crate::equation::Initial;
+use crate::error::{Error, Result};
+use crate::estimation::joint_fit::format::short;
+use crate::estimation::joint_fit::parameter_set::{Free, ALPHA_BOUNDS, SEARCHED_ORDER};
+use crate::estimation::joint_fit::problem::{Place, Runner};
+use crate::estimation::joint_fit::structure::{Equation, Law, Order, Structure, Term};
+use crate::estimation::output_error::Point;
+use crate::order_search::batches;
+use crate::order_search::control::Control;
+use crate::order_search::grid::{Lattice, LawEquation, LawLattice, TermAxis};
+use crate::order_search::options::Options;
+use crate::order_search::stage_join;
+use crate::parallel::Stop;
+use crate::regressors::Record;
+use crate::signal::statistics::mean;
+
+/// A row of a lattice: its orders, and the coefficients freely estimated there, by name.
+#[derive(Debug, Clone, Default, PartialEq)]
+pub(super) struct Row {
+    /// Orders, in the order of their axes.
+    pub orders: Vec<(String, f64)>,
+    /// Coefficients.
+    pub coefficients: BTreeMap<String, f64>,
+}
+
+impl Row {
+    /// Values of these orders.
+    pub(super) fn values(&self, names: &[String]) -> Vec<f64> {
+        let value = |name: &String| self.orders.iter().find(|(n, _)| n == name).map_or(f64::NAN, |(_, value)| *value);
+        names.iter().map(value).collect()
+    }
+
+    /// Whether another one has the same orders, in whatever order they stand.
+    pub(super) fn is_at(&self, other: &Self) -> bool {
+        self.orders.len() == other.orders.len() && self.orders.iter().all(|pair| other.orders.contains(pair))
+    }
+
+    /// Takes in the orders and coefficients of another one.
+    fn take(&mut self, other: &Self) {
+        for (name, value) in &other.orders {
+            match self.orders.iter_mut().find(|(n, _)| n == name) {
+                Some((_, here)) => *here = *value,
+                None => self.orders.push((name.clone(), *value)),
+            }
+        }
+        self.coefficients.extend(other.coefficients.iter().map(|(name, value)| (name.clone(), *value)));
+    }
+}
+
+/// How coarse lattices are searched: by least squares, in time, on so many threads, within so many bytes.
+#[derive(Clone, Copy)]
+pub(super) struct Coarse<'a> {
+    /// What they are searched on.
+    pub records: &'a [Record],
+    /// Which signals are inputs.
+    pub inputs: &'a [bool],
+    /// Initial terms of each record.
+    pub initial: &'a Initial,
+    /// Threads.
+    pub threads: usize,
+    /// Bytes.
+    pub memory: u64,
+    /// Ends a search.
+    pub stop: &'a Stop,
+}
+
+impl Coarse<'_> {
+    /// The same on other records.
+    pub(super) fn on<'b>(&'b self, records: &'b [Record]) -> Coarse<'b> {
+        Coarse { records, ..*self }
+    }
+
+    /// So many best rows of a coarse lattice, by least squares.
+    pub(super) fn rows(&self, structure: &Structure, axes: &Axes, keep: usize) -> Result<Vec<Row>> {
+        if !structure.has_order_law() {
+            let tables: Result<Vec<_>> =
+                structure.equations.iter().map(|e| self.of_equation(structure, e, axes, keep)).collect();
+            return Ok(side_by_side(&tables?, structure));
+        }
+        let stages = parts(structure);
+        if stages.len() <= 1 {
+            return self.of_stage(structure, axes, keep);
+        }
+        // Stages that share no order are searched one by one; the best of each belong together.
+        let table = |stage: &Structure| {
+            let names = stage.order_names();
+            let own: Axes = axes.iter().filter(|(name, _)| names.contains(name)).cloned().collect();
+            self.rows(stage, &own, keep)
+        };
+        Ok(side_by_side(&stages.iter().map(table).collect::<Result<Vec<_>>>()?, structure))
+    }
+
+    fn options(&self, keep: usize) -> Options {
+        let (initial, threads, memory) = (self.initial.clone(), self.threads, self.memory);
+        Options { initial, keep, threads, memory, ..Options::default() }
+    }
+
+    fn control(&self) -> Control {
+        Control { stop: self.stop.clone(), ..Control::default() }
+    }
+
+    /// Best rows of equations under their order law.
+    #[allow(clippy::cast_precision_loss)]
+    fn of_stage(&self, structure: &Structure, axes: &Axes, keep: usize) -> Result<Vec<Row>> {
+        let (names, along): (Vec<String>, Vec<Vec<f64>>) = axes.iter().cloned().unzip();
+        let law = |e: &Equation| LawEquation {
+            output: e.output,
+            order: e.order.affine(&names),
+            terms: e.terms.iter().map(|t| (t.signal, t.order.affine(&names))).collect(),
+        };
+        let equations = &structure.equations;
+        let laws: Vec<LawEquation> = equations.iter().map(law).collect();
+        let fixed: Vec<Vec<Option<f64>>> = equations.iter().map(known).collect();
+        let size = |e: &Equation| self.records.iter().map(|r| deviation(r.signal(e.output)) * r.m() as f64).sum();
+        let scales: Vec<f64> = equations.iter().map(size).collect();
+        let lattice = LawLattice::new(&along, &laws, self.inputs)?.with_known(&fixed);
+        let found = stage_join::search(self.records, &lattice, &fixed, &scales, &self.options(keep), &self.control())?;
+        let row = |found: stage_join::StageRow| {
+            let pairs = equations.iter().zip(&found.rows);
+            let coefficients = pairs.flat_map(|(item, part)| named_coefficients(item, &part.coefficients)).collect();
+            Row { orders: names.iter().cloned().zip(found.free).collect(), coefficients }
+        };
+        Ok(found.rows.into_iter().map(row).collect())
+    }
+
+    /// Best rows of one equation whose orders are free by themselves.
+    fn of_equation(&self, structure: &Structure, item: &Equation, axes: &Axes, keep: usize) -> Result<Vec<Row>> {
+        check_linear(structure, item, "an order search")?;
+        let axis = |order: &Order| match order.names().next() {
+            Some(name) => values(axes, name).to_vec(),
+            None => vec![order.constant],
+        };
+        let term = |t: &Term| TermAxis {
+            signal: t.signal,
+            values: axis(&t.order),
+            interchangeable: t.order.is_free() && t.fixed().is_none(),
+        };
+        let terms: Vec<TermAxis> = item.terms.iter().map(term).collect();
+        let is_input = |signal: usize| self.inputs.get(signal).copied().unwrap_or(false);
+        let named = |error| named_signals(error, &structure.signals);
+        let lattice = Lattice::new(item.output, &axis(&item.order), &terms, is_input).map_err(named)?;
+        let (options, control) = (self.options(keep), self.control());
+        let found = batches::search(self.records, &lattice, &known(item), &options, &control).map_err(named)?;
+        let row = |found: crate::order_search::result::Row| {
+            let at = lattice.structure(found.index);
+            let there = std::iter::once(at.order).chain(at.terms.iter().map(|term| term.order));
+            let pairs = item.orders().zip(there);
+            let orders = pairs.filter_map(|(order, value)| Some((order.names().next()?.clone(), value))).collect();
+            Row { orders, coefficients: named_coefficients(item, &found.coefficients).collect() }
+        };
+        Ok(found.rows.into_iter().map(row).collect())
+    }
+}
+
+/// Rows of independent tables side by side, rank by rank; a table that ends goes on with its last row.
+pub(super) fn side_by_side(tables: &[Vec<Row>], structure: &Structure) -> Vec<Row> {
+    let wanted = structure.coefficient_names().len();
+    let merged = |rank: usize| {
+        let mut merged = Row::default();
+        tables.iter().filter_map(|table| table.get(rank).or(table.last())).for_each(|row| merged.take(row));
+        merged
+    };
+    let ranks = tables.iter().map(Vec::len).max().unwrap_or(0);
+    (0..ranks).map(merged).filter(|row| row.coefficients.len() == wanted).collect()
+}
+
+/// Free coefficients by name from the core's products of factor and coefficient.
+pub(super) fn named_coefficients<'a>(item: &'a Equation, raw: &'a [f64]) -> impl Iterator<Item = (String, f64)> + 'a {
+    let pairs = item.terms.iter().zip(raw);
+    pairs.filter_map(|(term, c)| Some((term.coefficient.name()?.clone(), c / term.factor)))
+}
+
+/// Products of factor and coefficient where they are known.
+pub(super) fn known(item: &Equation) -> Vec<Option<f64>> {
+    item.terms.iter().map(Term::fixed).collect()
+}
+
+/// Refuses friction where nothing knows it.
+pub(super) fn check_linear(structure: &Structure, item: &Equation, what: &str) -> Result<()> {
+    if item.friction.is_none() {
+        return Ok(());
+    }
+    let output = &structure.signals[item.output];
+    Err(Error::Structure {
+        what: format!("the equation of {output} has friction, which {what} does not know"),
+        remedy: "use free runs, or leave the friction out".into(),
+    })
+}
+
+/// The core knows signals by number; people know them by name.
+fn named_signals(error: Error, signals: &[String]) -> Error {
+    let named = |mut text: String| {
+        // From the last on, so that no number is the beginning of another.
+        for (i, signal) in signals.iter().enumerate().rev() {
+            text = text.replace(&format!("signal {i}"), &format!("signal '{signal}'"));
+        }
+        text
+    };
+    match error {
+        Error::EmptyLattice { why } => Error::EmptyLattice { why: named(why) },
+        Error::Structure { what, remedy } => Error::Structure { what: named(what), remedy },
+        other => other,
+    }
+}
+
+/// Standard deviation of values.
+fn deviation(values: &[f64]) -> f64 {
+    let centre = mean(values);
+    let squares: Vec<f64> = values.iter().map(|v| (v - centre) * (v - centre)).collect();
+    mean(&squares).sqrt()
+}
+
+/// Steps of the lattices on which a row is followed downhill, and how often it may move on each.
+const ZOOM_STEPS: [f64; 2] = [0.1, 0.05];
+const ZOOM_ROUNDS: usize = 8;
+/// Rows of each prefilter's table that are looked at, all where the first few do not do, and how many of them become
+/// starts: the first, then those that differ by APART in some order.
+const FIRST_ROWS: usize = 25;
+const ROWS_PER_FILTER: usize = 400;
+const STARTS_PER_FILTER: usize = 4;
+/// Ratios of a coefficient law at which a start takes one equation's coefficients from another's.
+const LAW_RATIOS: [f64; 3] = [0.25, 1.0, 4.0];
+/// Orders are one where they differ by less than these shares of 1 and of themselves.
+const CLOSE: (f64, f64) = (1e-9, 1e-5);
+
+/// A start.
+pub(super) fn runner(orders: Vec<f64>, coefficients: Vec<f64>, origin: &str) -> Runner {
+    Runner::at(Place { point: Point { orders, coefficients, inputs: Vec::new() }, states: Vec::new() }, origin)
+}
+
+/// Starts from the rows of a lattice that lie apart, the best one followed downhill; none that stood before.
+pub(super) fn lattice_attempts(
+    free: &Free,
+    coarse: &Coarse<'_>,
+    (axes, apart): &(Axes, f64),
+    origin: &str,
+    before: &[Runner],
+) -> Result<Vec<Runner>> {
+    let mut attempts: Vec<Runner> = Vec::new();
+    let mut rows = LyingApart::new(free, coarse, axes, *apart);
+    let mut rank = 0;
+    while let Some(row) = rows.next()? {
+        let start = if rank == 0 { zoom(free, coarse, row)? } else { row };
+        rank += 1;
+        let values = start.values(&free.orders);
+        if before.iter().chain(&attempts).any(|other| close(&values, &other.attempt.place.point.orders)) {
+            continue;
+        }
+        attempts.push(runner(values, free.free_from(&start.coefficients), origin));
+        if rank >= STARTS_PER_FILTER {
+            break;
+        }
+    }
+    Ok(attempts)
+}
+
+fn close(values: &[f64], others: &[f64]) -> bool {
+    values.iter().zip(others).all(|(a, b)| (a - b).abs() <= CLOSE.0 + CLOSE.1 * b.abs())
+}
+
+/// The rows of a lattice, best first, that each differ from all before in some order; many are asked for late.
+struct LyingApart<'a> {
+    free: &'a Free,
+    coarse: &'a Coarse<'a>,
+    axes: &'a Axes,
+    apart: f64,
+    picked: Vec<Vec<f64>>,
+    rows: std::vec::IntoIter<Row>,
+    seen: usize,
+    /// How many are asked for next; none where no more are there.
+    wanted: Vec<usize>,
+}
+
+impl<'a> LyingApart<'a> {
+    fn new(free: &'a Free, coarse: &'a Coarse<'a>, axes: &'a Axes, apart: f64) -> Self {
+        let (picked, rows, wanted) = (Vec::new(), Vec::new().into_iter(), vec![ROWS_PER_FILTER, FIRST_ROWS]);
+        Self { free, coarse, axes, apart, picked, rows, seen: 0, wanted }
+    }
+
+    fn next(&mut self) -> Result<Option<Row>> {
+        loop {
+            for row in self.rows.by_ref() {
+                let values = row.values(&self.free.orders);
+                let distance = |p: &Vec<f64>| p.iter().zip(&values).map(|(a, b)| (a - b).abs()).fold(0.0, f64::max);
+                if self.picked.iter().all(|p| distance(p) >= self.apart) {
+                    self.picked.push(values);
+                    return Ok(Some(row));
+                }
+            }
+            let Some(keep) = self.wanted.pop() else { return Ok(None) };
+            let mut rows = self.coarse.rows(&self.free.structure, self.axes, keep)?;
+            let found = rows.len();
+            rows.drain(..self.seen.min(found));
+            (self.rows, self.seen) = (rows.into_iter(), found);
+            if found < keep {
+                self.wanted.clear();
+            }
+        }
+    }
+}
+
+/// Starts with one equation's coefficients from another's by the law, the rest of it by least squares.
+///
+/// The hub of an arm is overdamped: current and friction nearly cancel, and what is left of the hub's acceleration is told
+/// as well by the link's own equation. Freely estimated, the hub's becomes the link's, stiffness reversed.
+pub(super) fn lawful_attempts(free: &Free, coarse: &Coarse<'_>, axes: &Axes, origin: &str) -> Result<Vec<Runner>> {
+    let (structure, signs) = (&free.structure, &free.structure.hints.positive);
+    let tied: Vec<(&Law, &String, usize)> = (free.products.iter())
+        .filter_map(|law| law.factors.split_first().map(|(first, others)| (law, first, others.len())))
+        .filter(|(_, first, _)| signs.contains(*first))
+        .collect();
+    if tied.is_empty() {
+        return Ok(Vec::new());
+    }
+    let named = structure.coefficient_names();
+    let mut attempts = Vec::new();
+    for row in coarse.rows(structure, axes, STARTS_PER_FILTER)? {
+        let point: Axes = row.orders.iter().map(|(name, value)| (name.clone(), vec![*value])).collect();
+        for ratio in LAW_RATIOS {
+            let value = |(law, first, others): &(&Law, &String, usize)| {
+                let size = row.coefficients.get(&law.name).copied().unwrap_or(f64::NAN).abs();
+                ((*first).clone(), (0..*others).fold(size, |size, _| size / ratio))
+            };
+            let known: BTreeMap<String, f64> = tied.iter().map(value).collect();
+            if !known.values().all(|v| v.is_finite() && *v != 0.0) {
+                continue;
+            }
+            if let Some(lost) = known.keys().find(|name| !named.contains(name)) {
+                let what = format!("no free coefficient {lost}");
+                return Err(Error::Structure { what, remedy: "name one of the equations'".into() });
+            }
+            for rest in coarse.rows(&structure.with_coefficients(&known), &point, 1)? {
+                let found = |name: &String| known.get(name).or(rest.coefficients.get(name)).copied().unwrap_or(ratio);
+                let coefficients = free.coefficients.iter().map(found).collect();
+                let words = format!("{origin}, by the law at {}", short(ratio, 6));
+                attempts.push(runner(row.values(&free.orders), coefficients, &words));
+            }
+        }
+    }
+    Ok(attempts)
+}
+
+/// Follow a row downhill on ever finer lattices around it.
+fn zoom(free: &Free, coarse: &Coarse<'_>, mut row: Row) -> Result<Row> {
+    if row.orders.is_empty() {
+        return Ok(row);
+    }
+    for step in ZOOM_STEPS {
+        for _ in 0..ZOOM_ROUNDS {
+            let axis = |(name, value): &(String, f64)| {
+                let place = free.orders.iter().position(|n| n == name);
+                let (low, high) = place.map_or((*value, *value), |at| free.bounds()[at]);
+                let around = [value - step, *value, value + step];
+                let mut values: Vec<f64> = around.iter().map(|v| to_nine(v.max(low).min(high))).collect();
+                values.sort_by(f64::total_cmp);
+                values.dedup();
+                (name.clone(), values)
+            };
+            let axes: Axes = row.orders.iter().map(axis).collect();
+            let found = coarse.rows(&free.structure, &axes, 1)?.into_iter().next();
+            match found {
+                Some(best) if !best.is_at(&row) => row = best,
+                _ => break,
+            }
+        }
+    }
+    Ok(row)
+}
+
+/// A number to nine decimals, the nearest of them that there is.
+fn to_nine(value: f64) -> f64 {
+    format!("{value:.9}").parse().unwrap_or(value)
+}
+
+/// Step of the lattice on which starts are searched; a start within half of it leads to the optimum.
+const START_STEP: f64 = 0.2;
+/// Candidates of the start's lattice beyond which orders of other signals get fewer values.
+const START_CANDIDATES: u128 = 200_000;
+/// The lowest of the intervals that are usual for highest orders where nothing is known of them.
+const LOWEST: f64 = 0.2;
+/// Highest order that any term but the highest is started from.
+const BELOW: f64 = 2.0;
+/// Orders are kept to one in so many.
+const GRAINS: f64 = 1e9;
+
+/// Values of free orders, by name.
+pub(super) type Axes = Vec<(String, Vec<f64>)>;
+
+/// A coarse lattice of the free orders within their bounds.
+#[allow(clippy::cast_possible_truncation, clippy::cast_sign_loss)]
+pub(super) fn start_axes(free: &Free) -> Axes {
+    let equations = &free.structure.equations;
+    let alone = equations.iter().filter(|e| e.order.is_single());
+    let highest: BTreeSet<&String> = alone.flat_map(|e| e.order.names()).collect();
+    let usual = free.structure.hints.highest.unwrap_or((LOWEST, SEARCHED_ORDER));
+    let axis = |(name, &bounds): (&String, &(f64, f64))| {
+        let above = highest.contains(name);
+        let (low, mut high) = if above && bounds == ALPHA_BOUNDS { usual } else { bounds };
+        if !above {
+            high = high.min(BELOW);
+        }
+        if high <= low {
+            return (name.clone(), vec![low]);
+        }
+        let count = ((high - low) / START_STEP).round_ties_even() as usize;
+        let tidied = |v: &f64| (v * GRAINS).round_ties_even() / GRAINS;
+        let values = between(low, high, count + 1).iter().map(tidied).collect();
+        (name.clone(), values)
+    };
+    let mut axes: Axes = free.orders.iter().zip(free.bounds()).map(axis).collect();
+    // Orders at which other signals enter matter less for where the optimum is than the output's own.
+    let driving: BTreeSet<&String> = equations
+        .iter()
+        .flat_map(|e| e.driving().flat_map(|term| term.order.names()))
+        .filter(|name| !highest.contains(name))
+        .collect();
+    for kept in [&[0.0, 1.0][..], &[0.0]] {
+        if equations.iter().all(|e| size(e, &axes) <= START_CANDIDATES) {
+            break;
+        }
+        for (_, values) in axes.iter_mut().filter(|(name, _)| driving.contains(name)) {
+            let (low, high) = (values[0], values[values.len() - 1]);
+            let inside: Vec<f64> = kept.iter().copied().filter(|v| low <= *v && *v <= high).collect();
+            *values = if inside.is_empty() { vec![low] } else { inside };
+        }
+    }
+    axes
+}
+
+/// A small lattice beside the whole orders of a structure's physics, or none where it knows of none.
+pub(super) fn natural_axes(free: &Free) -> Option<Axes> {
+    let natural = &free.structure.hints.natural;
+    let axis = |(name, &(low, high)): (&String, &(f64, f64))| {
+        let values: Vec<f64> =
+            natural.get(name).into_iter().flatten().copied().filter(|v| low <= *v && *v <= high).collect();
+        (!values.is_empty()).then(|| (name.clone(), values))
+    };
+    let axes = free.orders.iter().zip(free.bounds()).map(axis).collect::<Option<Axes>>()?;
+    (!natural.is_empty()).then_some(axes)
+}
+
+/// Evenly spaced values from one to another, both ends as they are.
+#[allow(clippy::cast_precision_loss)]
+pub(super) fn between(low: f64, high: f64, count: usize) -> Vec<f64> {
+    let intervals = count.saturating_sub(1);
+    let step = (high - low) / intervals.max(1) as f64;
+    let value = |k: usize| if k == intervals && k > 0 { high } else { k as f64 * step + low };
+    (0..count).map(value).collect()
+}
+
+/// The values of an order; none where it is not among them.
+pub(super) fn values<'a>(axes: &'a Axes, name: &str) -> &'a [f64] {
+    axes.iter().find(|(n, _)| n == name).map_or(&[], |(_, values)| values)
+}
+
+/// Candidates of an equation's lattice, whether they make an equation or not.
+fn size(equation: &Equation, axes: &Axes) -> u128 {
+    let names: BTreeSet<&String> = equation.orders().flat_map(Order::names).collect();
+    names.iter().fold(1, |size, name| size.saturating_mul(values(axes, name).len() as u128))
+}
+
+/// What an order search takes one by one: equations that share no free order do not wait for one another.
+///
+/// Equations that an order law ties stay together; any other equation is by itself. Equations without free orders are
+/// left out.
+pub(super) fn parts(structure: &Structure) -> Vec<Structure> {
+    let mut groups: Vec<(BTreeSet<&String>, Vec<&Equation>)> = Vec::new();
+    for item in &structure.equations {
+        let own: BTreeSet<&String> = item.orders().flat_map(Order::names).collect();
+        let (mut names, mut together, mut apart) = (own.clone(), vec![item], Vec::new());
+        for (others, equations) in groups {
+            if own.is_disjoint(&others) {
+                apart.push((others, equations));
+            } else {
+                names.extend(others);
+                together = [equations, together].concat();
+            }
+        }
+        apart.push((names, together));
+        groups = apart;
+    }
+    let ordered = groups.into_iter().filter(|(names, _)| !names.is_empty());
+    let part = |(_, equations): (_, Vec<&Equation>)| Structure {
+        equations: equations.into_iter().cloned().collect(),
+        laws: Vec::new(),
+        ..structure.clone()
+    };
+    ordered.map(part).collect()
+}
+
+#[cfg(test)]
+mod tests {
+    use super::{between, start_axes, values};
+    use crate::equation::Initial;
+    use crate::error::Result;
+    use crate::estimation::joint_fit::parameter_set::Free;
+    use crate::estimation::joint_fit::structure::{Coefficient, Equation, Hints, Order, Structure, Term};
+
+    #[test]
+    fn orders_lie_on_a_coarse_lattice_within_their_bounds() -> Result<()> {
+        let term = |signal, order| {
+            let coefficient = Coefficient::Free(format!("c_{order}"));
+            Term { signal, order: Order::free(order), coefficient, factor: 1.0 }
+        };
+        let terms = vec![term(0, "nu"), term(1, "beta")];
+        let equations = vec![Equation { output: 0, order: Order::free("alpha"), terms, friction: None }];
+        let structure = Structure {
+            signals: vec!["y".into(), "u".into()],
+            equations,
+            bounds: [("beta".into(), (0.5, 0.5))].into(),
+            coupled: false,
+            delayed: false,
+            initial: Initial::Rest,
+            history: false,
+            inputs: Vec::new(),
+            laws: Vec::new(),
+            hints: Hints::default(),
+        };
+        let axes = start_axes(&Free::of(structure)?);
+        let alphas = values(&axes, "alpha");
+        assert_eq!((alphas.len(), alphas[0], alphas[1], alphas[14]), (15, 0.2, 0.4, 3.0));
+        assert_eq!((values(&axes, "nu").len(), values(&axes, "nu")[10]), (11, 2.0));
+        assert_eq!(values(&axes, "beta"), [0.5]);
+        assert_eq!(between(1.0, 2.0, 1), [1.0]);
+        Ok(())
+    }
+}

@@ -1,0 +1,119 @@
+//! Low-passes before coarse lattices.
+//!
+//! How fast a signal is.
+
+use std::f64::consts::PI;
+use std::sync::{Arc, Mutex, PoisonError};
+
+use crate::equation::Filter;
+use crate::error::Result;
+use crate::fft::{plan, Bin, Workspace};
+use crate::regressors::Record;
+use crate::series;
+use crate::signal::statistics::{mean, sum};
+
+/// Series of prefilters that are kept: those of a few runs.
+const KEPT_LOW_PASSES: usize = 32;
+
+/// What a low-pass hangs on: the bits of its corner, the pulses, the bits of their width.
+type Key = (u64, usize, u64);
+
+/// The series of second-order low-passes: the same ones for every problem inside a race.
+#[derive(Debug, Default)]
+pub(super) struct LowPasses(Mutex<Vec<(Key, Arc<Vec<f64>>)>>);
+
+impl LowPasses {
+    /// All signals and the initial terms of a record through the low-pass of this corner \[rad/s\]; as it is without one.
+    pub(super) fn through(&self, record: &Record, corner: Option<f64>) -> Result<Record> {
+        let m = record.m();
+        let low_pass = corner.map(|corner| self.series(corner, m, record.step())).transpose()?;
+        let signals = (0..record.len()).map(|i| record.signal(i));
+        let Some(low_pass) = low_pass else {
+            // Equations are taken from what was measured, wherever it began.
+            return Record::new(record.step(), signals.map(<[f64]>::to_vec).collect(), record.filter().map(Into::into));
+        };
+        let filter = record.filter().map_or_else(|| low_pass.to_vec(), |f| series::multiply(&low_pass, f, m));
+        Record::new(record.step(), signals.map(|s| series::multiply(&low_pass, s, m)).collect(), Some(filter))
+    }
+
+    /// The series of a second-order low-pass of this corner \[rad/s\].
+    fn series(&self, omega: f64, m: usize, step: f64) -> Result<Arc<Vec<f64>>> {
+        let key = (omega.to_bits(), m, step.to_bits());
+        {
+            let mut kept = self.0.lock().unwrap_or_else(PoisonError::into_inner);
+            if let Some(at) = kept.iter().position(|(k, _)| *k == key) {
+                let found = kept.remove(at);
+                let series = found.1.clone();
+                kept.push(found);
+                return Ok(series);
+            }
+        }
+        let square = omega * omega;
+        let denominator = vec![(1.0, 2.0), (1.4 * omega, 1.0), (square, 0.0)];
+        let made = Arc::new(Filter { numerator: vec![(square, 0.0)], denominator }.series(m, step)?);
+        let mut kept = self.0.lock().unwrap_or_else(PoisonError::into_inner);
+        kept.push((key, made.clone()));
+        if kept.len() > KEPT_LOW_PASSES {
+            kept.remove(0);
+        }
+        Ok(made)
+    }
+}
+
+/// Share of the power that lies below a signal's frequency.
+const SHARE: f64 = 0.9;
+
+/// Frequency \[rad/s\] below which 90 % of the power of samples lies, `step` \[s\] apart; not a number where nothing was
+/// read. O(N log N).
+///
+/// ```
+/// use ftlm::estimation::joint_fit::initial_guesses::prefilter::power_frequency;
+/// let wave: Vec<f64> = (0..500).map(|k| (0.1 * f64::from(k)).sin()).collect();
+/// // One bin of the transform is 2π/5 rad/s.
+/// assert!((power_frequency(&wave, 0.01) - 10.0).abs() < 2.6);
+/// ```
+#[must_use]
+#[allow(clippy::cast_precision_loss)]
+pub fn power_frequency(samples: &[f64], step: f64) -> f64 {
+    let count = samples.len();
+    if count == 0 {
+        return f64::NAN;
+    }
+    let samples = bridged(samples);
+    let centre = mean(&samples);
+    let (last, plan) = (count as f64 - 1.0, plan(count));
+    let window = |k: usize| match count {
+        1 => 1.0,
+        _ => 0.5 + 0.5 * libm::cos(PI * (2.0 * k as f64 - last) / last),
+    };
+    let mut time: Vec<f64> = samples.iter().enumerate().map(|(k, v)| (v - centre) * window(k)).collect();
+    let mut spectrum = vec![Bin::new(0.0, 0.0); plan.bins()];
+    plan.forward(&mut time, &mut spectrum, &mut Workspace::new());
+    let power: Vec<f64> = spectrum.iter().map(Bin::norm_sqr).collect();
+    let (whole, mut below) = (sum(&power), 0.0);
+    // What never moves has no share to reach, and counts as slow as a run can tell.
+    let reached = |power: &f64| {
+        below += power;
+        below / whole >= SHARE || (below / whole).is_nan()
+    };
+    let at = power.iter().position(reached).unwrap_or(power.len());
+    2.0 * PI * at.max(1) as f64 / (count as f64 * step)
+}
+
+/// Samples with straight lines over what is missing, the nearest value at the ends; what is whole stays as it is.
+#[allow(clippy::cast_precision_loss)]
+fn bridged(samples: &[f64]) -> Vec<f64> {
+    let mut out = samples.to_vec();
+    let there: Vec<usize> = (0..samples.len()).filter(|&k| !samples[k].is_nan()).collect();
+    let (Some(&first), Some(&last)) = (there.first(), there.last()) else { return out };
+    out[..first].fill(samples[first]);
+    out[last..].fill(samples[last]);
+    for pair in there.windows(2) {
+        let (low, high) = (pair[0], pair[1]);
+        let slope = (samples[high] - samples[low]) / (high - low) as f64;
+        for (k, value) in out[low + 1..high].iter_mut().enumerate() {
+            *value = slope * (k + 1) as f64 + samples[low];
+        }
+    }
+    out
+}

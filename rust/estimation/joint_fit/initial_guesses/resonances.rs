@@ -1,0 +1,140 @@
+//! Starts from a scan of resonances: with the own terms of an equation fixed, its output error is linear in the rest.
+//!
+//! Where signals feed back on each other or residuals are coloured, least squares on the equation error says nothing about
+//! the own terms. Here they are put on a grid of frequencies and damping ratios; all other coefficients, and the initial
+//! terms, follow by linear least squares on the output error itself.
+
+use std::collections::BTreeMap;
+
+use super::order_grid::{check_linear, known, named_coefficients, runner, side_by_side, Coarse, Row};
+use crate::equation::{Initial, Structure as Bare, Term as BareTerm};
+use crate::error::Result;
+use crate::estimation::joint_fit::parameter_set::Free;
+use crate::estimation::joint_fit::problem::Runner;
+use crate::estimation::joint_fit::structure::{Equation, Structure, Term};
+use crate::estimation::resonance_scan::projected;
+use crate::signal::statistics::median;
+
+/// Frequencies of the scan in units of the frequency below which 90 % of the output's power lies: evenly from 0.15 to 8 in
+/// logarithms.
+const FREQUENCIES: [f64; 14] = [
+    0.15,
+    0.203_674_807_750_629_52,
+    0.276_556_182_081_705_9,
+    0.375_516_848_118_263_64,
+    0.509_888_812_317_398,
+    0.692_343_372_152_952_4,
+    0.940_086_021_471_167_4,
+    1.276_478_931_281_294_5,
+    1.733_244_006_176_311_5,
+    2.353_454_264_952_607,
+    3.195_595_633_094_143_7,
+    4.339_082_174_794_672,
+    5.891_744_851_769_920_5,
+    8.0,
+];
+/// Damping ratios.
+const DAMPINGS: [f64; 4] = [0.03, 0.15, 0.5, 1.0];
+/// Points of a scan of resonances that become starts.
+const SCANNED: usize = 4;
+/// Powers of t closer than this are one.
+const GRAIN: f64 = 1e-9;
+
+/// Starts whose own terms are scanned over frequency and damping, at whole orders and at the lattice's best ones.
+///
+/// Of each equation the frequencies of its output on each run are given.
+pub(super) fn scanned_attempts(
+    free: &Free,
+    coarse: &Coarse<'_>,
+    frequencies: &[Vec<f64>],
+    attempts: &[Runner],
+) -> Result<Vec<Runner>> {
+    let structure = &free.structure;
+    if structure.has_order_law() || !free.products.is_empty() {
+        return Ok(Vec::new());
+    }
+    let best = attempts.iter().take(usize::from(!free.orders.is_empty()));
+    let points = std::iter::once(free.whole_orders()).chain(best.map(|a| a.attempt.place.point.orders.clone()));
+    let mut out = Vec::new();
+    for values in points {
+        let point: BTreeMap<String, f64> = free.orders.iter().cloned().zip(values.iter().copied()).collect();
+        // Whole orders that the bounds moved together make no equation.
+        let Ok(fixed) = structure.with_orders(&point) else { continue };
+        if doubles(&fixed) {
+            continue;
+        }
+        let scan = |(item, of): (&Equation, &Vec<f64>)| scan_equation(&fixed, item, coarse, median(of.clone()));
+        let scans = fixed.equations.iter().zip(frequencies).map(scan).collect::<Result<Vec<_>>>()?;
+        let rows = side_by_side(&scans, structure);
+        out.extend(
+            rows.iter().map(|row| runner(values.clone(), free.free_from(&row.coefficients), "scan of resonances")),
+        );
+    }
+    Ok(out)
+}
+
+/// Whether an offset is one of the initial terms that were given: they cannot be told apart.
+fn doubles(fixed: &Structure) -> bool {
+    let given = match fixed.initial.under() {
+        Initial::Powers(powers) if !fixed.history => powers,
+        _ => return false,
+    };
+    let offsets = |e: &Equation| fixed.initial.offset_exponents(e.order.constant);
+    fixed.equations.iter().flat_map(offsets).any(|power| given.iter().any(|e| (power - e).abs() < GRAIN))
+}
+
+/// Coefficients of the own terms of D^alpha y = -2 zeta w^(alpha - nu) D^nu y - w^alpha y, one a term; none where all are
+/// known, or some.
+#[allow(clippy::cast_precision_loss)]
+fn own_coefficients(item: &Equation, omega: f64, damping: f64) -> Option<Vec<(String, f64)>> {
+    let mut own: Vec<(usize, &Term)> = item.own().enumerate().collect();
+    own.sort_by(|(_, a), (_, b)| a.order.constant.total_cmp(&b.order.constant));
+    let mut out = vec![(String::new(), 0.0); own.len()];
+    let others = own.len().saturating_sub(1) as f64;
+    for (rank, (place, term)) in own.into_iter().enumerate() {
+        let share = if rank == 0 { 1.0 } else { 2.0 * damping / others };
+        let size = -share * libm::pow(omega, item.order.constant - term.order.constant);
+        out[place] = (term.coefficient.name()?.clone(), size / term.factor);
+    }
+    Some(out).filter(|out| !out.is_empty())
+}
+
+/// Best points of the scan of one equation whose orders are numbers, of each frequency only the best damping.
+///
+/// The frequency \[rad/s\] is the unit of the scan's. Points come in the order of their root mean square output error.
+fn scan_equation(structure: &Structure, item: &Equation, coarse: &Coarse<'_>, frequency: f64) -> Result<Vec<Row>> {
+    let others: Vec<Term> = item.driving().cloned().collect();
+    let own: Vec<&Term> = item.own().collect();
+    if others.is_empty() || own.is_empty() {
+        return Ok(Vec::new());
+    }
+    let grid = FREQUENCIES.iter().flat_map(|share| DAMPINGS.iter().map(move |damping| (share * frequency, *damping)));
+    let tried: Option<Vec<_>> = grid.map(|(omega, damping)| own_coefficients(item, omega, damping)).collect();
+    let Some(tried) = tried else { return Ok(Vec::new()) };
+    check_linear(structure, item, "what is linear in its coefficients")?;
+    coarse.stop.check()?;
+    // Caputo's powers of the whole equation: the rest alone would not know those of the own terms.
+    let rest = Equation { terms: others, ..item.clone() };
+    let bare = Bare {
+        output: rest.output,
+        order: rest.order.constant,
+        terms: rest.terms.iter().map(|t| BareTerm { signal: t.signal, order: t.order.constant }).collect(),
+    };
+    bare.check(structure.signals.len(), |s| coarse.inputs.get(s).copied().unwrap_or(false))?;
+    let etas: Vec<f64> = own.iter().map(|t| item.order.constant - t.order.constant).collect();
+    let point = |values: &Vec<(String, f64)>| values.iter().zip(&own).map(|((_, v), t)| v * t.factor).collect();
+    let points: Vec<Vec<f64>> = tried.iter().map(point).collect();
+    let found = projected(coarse.records, &bare, &known(&rest), coarse.initial, &etas, &points)?;
+    let mut best: Vec<(f64, Row)> = Vec::new();
+    for (found, tried) in found.chunks(DAMPINGS.len()).zip(tried.chunks(DAMPINGS.len())) {
+        // What is not there is too fast for the step, or has regressors that this filter makes alike.
+        let there = found.iter().zip(tried).filter_map(|(at, values)| Some((at.as_ref()?, values)));
+        let there = there.filter(|(at, _)| at.error.is_finite());
+        if let Some((at, values)) = there.min_by(|(a, _), (b, _)| a.error.total_cmp(&b.error)) {
+            let coefficients = values.iter().cloned().chain(named_coefficients(&rest, &at.coefficients)).collect();
+            best.push((at.error, Row { orders: Vec::new(), coefficients }));
+        }
+    }
+    best.sort_by(|(a, _), (b, _)| a.total_cmp(b));
+    Ok(best.into_iter().take(SCANNED).map(|(_, row)| row).collect())
+}

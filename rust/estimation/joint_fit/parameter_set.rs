@@ -1,0 +1,345 @@
+//! Everything that is free in a structure, with bounds and coordinates.
+//!
+//! Numbers of a fit in a unit of time of the runs' own, so that nothing hangs on the unit in which time is told.
+//!
+//! A coefficient before D^ν y beside D^α y is a time to the power of −(α − ν), which free orders change.
+
+use std::collections::BTreeMap;
+
+use super::problem::{Place, Problem};
+use super::structure::{unique, Coefficient, Equation, Input, Law, Structure};
+use crate::equation::Initial;
+use crate::error::Result;
+use crate::estimation::output_error::parameterization::Clock as Unit;
+use crate::estimation::output_error::{Coordinate, FreeEquation, FreeModel, Monomial};
+use crate::fractional::kernels::MAX_ORDER;
+use crate::friction::FreeLaw;
+use crate::signal::statistics::median;
+
+/// Highest order that a fit tries of itself, where the structure holds none above it.
+pub const SEARCHED_ORDER: f64 = 3.0;
+/// Own bounds of highest orders where the structure gives none.
+pub const ALPHA_BOUNDS: (f64, f64) = (0.05, SEARCHED_ORDER);
+/// The same beside friction.
+const FRICTION_BOUNDS: (f64, f64) = (1.001, 2.0);
+/// Least distance of a ratio from what it exceeds, and its largest value, where equations tell it; and where none does.
+const LEAST_RATIO: f64 = 0.05;
+const LARGEST_RATIO: f64 = 20.0;
+const USUAL_RATIO: f64 = 0.5;
+
+/// A structure, its initial terms decided, and what is free in it: orders are affine in free ones, coefficients products of
+/// free ones.
+#[derive(Debug, Clone, PartialEq)]
+pub struct Free {
+    /// The structure.
+    pub structure: Structure,
+    /// Names of the free orders.
+    pub orders: Vec<String>,
+    /// Names of the free coefficients, those of a law among them.
+    pub coefficients: Vec<String>,
+    /// Coefficients that a law gives.
+    pub products: Vec<Law>,
+    /// As descents take it.
+    pub problem: Problem,
+}
+
+impl Free {
+    /// What is free in a structure.
+    ///
+    /// # Errors
+    /// Those of [`Structure::check`] and of [`Problem::new`].
+    pub fn of(structure: Structure) -> Result<Self> {
+        structure.check()?;
+        let named = structure.coefficient_names();
+        let law = |name: &String| structure.laws.iter().rev().find(|law| law.name == *name).cloned();
+        let products: Vec<Law> = named.iter().filter_map(law).collect();
+        let plain = named.iter().filter(|name| !products.iter().any(|law| law.name == **name));
+        let factors = products.iter().flat_map(|law| &law.factors).filter(|factor| !named.contains(factor));
+        let coefficients = unique(plain.chain(factors));
+        let orders = structure.order_names();
+        let bounds = bounds(&structure, &orders);
+        let powers = |name: &String| -> (f64, Vec<(usize, i32)>) {
+            let law = products.iter().find(|law| law.name == *name);
+            let own = std::slice::from_ref(name);
+            let (sign, factors) = law.map_or((1.0, own), |law| (law.sign, law.factors.as_slice()));
+            let mut powers: Vec<(usize, i32)> = Vec::new();
+            for at in factors.iter().filter_map(|factor| coefficients.iter().position(|c| c == factor)) {
+                match powers.iter_mut().find(|(i, _)| *i == at) {
+                    Some((_, n)) => *n += 1,
+                    None => powers.push((at, 1)),
+                }
+            }
+            (sign, powers)
+        };
+        let monomial = |coefficient: &Coefficient, factor: f64| match coefficient {
+            Coefficient::Known(value) => Monomial { factor: factor * value, powers: Vec::new() },
+            Coefficient::Free(name) => {
+                let (sign, powers) = powers(name);
+                Monomial { factor: factor * sign, powers }
+            }
+        };
+        let equation = |e: &Equation| FreeEquation {
+            output: e.output,
+            order: e.order.affine(&orders),
+            terms: (e.terms.iter())
+                .map(|t| (t.signal, t.order.affine(&orders), monomial(&t.coefficient, t.factor)))
+                .collect(),
+        };
+        let frictions = structure.equations.iter().enumerate().filter_map(|(place, e)| {
+            let [coulomb, stribeck, speed] = e.friction.as_ref()?.numbers().map(|(factor, c)| monomial(c, *factor));
+            Some((place, FreeLaw { coulomb, stribeck, speed }))
+        });
+        let model = FreeModel {
+            equations: structure.equations.iter().map(equation).collect(),
+            order_bounds: bounds,
+            coordinates: vec![Coordinate::Plain; coefficients.len()],
+            inputs: structure.inputs.iter().map(|input| input.free).collect(),
+            coupled: structure.coupled,
+            initial: structure.initial.clone(),
+        };
+        let outputs = structure.equations.iter().map(|e| structure.signals[e.output].clone()).collect();
+        let problem = Problem::new(outputs, model, frictions.collect())?;
+        Ok(Self { orders, coefficients, products, problem, structure })
+    }
+
+    /// Least and largest value of each free order.
+    #[must_use]
+    pub fn bounds(&self) -> &[(f64, f64)] {
+        &self.problem.model.order_bounds
+    }
+
+    /// Whether signals are compared or followed through friction.
+    #[must_use]
+    pub fn has_friction(&self) -> bool {
+        !self.problem.frictions.is_empty()
+    }
+
+    /// Everything that is free: orders, coefficients, then numbers of inputs.
+    pub fn names(&self) -> impl Iterator<Item = &String> {
+        let inputs = self.structure.inputs.iter().map(|Input { name, .. }| name);
+        self.orders.iter().chain(&self.coefficients).chain(inputs)
+    }
+
+    /// The problem from a start, coefficients in logarithms where it allows them unless they are to be plain, and some
+    /// numbers, by their places, held where they are.
+    #[must_use]
+    pub fn turned(&self, start: &Place, plain: bool, held: &[usize]) -> Problem {
+        let mut problem = self.problem.clone();
+        let named = self.structure.coefficient_names();
+        for (j, (name, &value)) in self.coefficients.iter().zip(&start.point.coefficients).enumerate() {
+            let is_speed = problem.frictions.iter().any(|(_, law)| law.speed.powers.iter().any(|&(i, _)| i == j));
+            let ratio = !named.contains(name) && self.exceeds(name) == 1.0;
+            problem.model.coordinates[j] = match () {
+                // A speed is positive, wherever it goes.
+                () if (plain || value == 0.0) && !is_speed => Coordinate::Plain,
+                () if ratio && value > 1.0 => Coordinate::ExcessLogarithm,
+                () => Coordinate::Logarithm,
+            };
+        }
+        let (orders, coefficients) = (self.orders.len(), self.coefficients.len());
+        for &number in held {
+            match number.checked_sub(orders) {
+                None => problem.model.order_bounds[number] = (start.point.orders[number], start.point.orders[number]),
+                Some(j) if j < coefficients => problem.model.coordinates[j] = Coordinate::Held,
+                Some(j) => {
+                    let value = start.point.inputs[j - coefficients];
+                    problem.model.inputs[j - coefficients].bounds = (value, value);
+                }
+            }
+        }
+        problem
+    }
+
+    /// Every coefficient of the structure, by name, from the free ones.
+    #[must_use]
+    pub fn named(&self, values: &[f64]) -> BTreeMap<String, f64> {
+        let free: BTreeMap<&String, f64> = self.coefficients.iter().zip(values.iter().copied()).collect();
+        let at = |name: &String| free.get(name).copied().unwrap_or(f64::NAN);
+        let of = |name: String| {
+            let law = self.products.iter().find(|law| law.name == name);
+            let value = law.map_or_else(|| at(&name), |law| law.sign * law.factors.iter().map(at).product::<f64>());
+            (name, value)
+        };
+        self.structure.coefficient_names().into_iter().map(of).collect()
+    }
+
+    /// Free coefficients from freely estimated ones; ratios as the median of what the equations can say.
+    #[must_use]
+    pub fn free_from(&self, estimated: &BTreeMap<String, f64>) -> Vec<f64> {
+        let of = |name: &String| {
+            if let Some(&value) = estimated.get(name) {
+                return value;
+            }
+            let least = self.exceeds(name);
+            let said = self.products.iter().filter(|law| law.factors.contains(name)).filter_map(|law| {
+                let others = law.factors.iter().filter(|factor| *factor != name);
+                let product: f64 = others.filter_map(|factor| estimated.get(factor)).product();
+                (product != 0.0).then(|| law.sign * estimated.get(&law.name).copied().unwrap_or(f64::NAN) / product)
+            });
+            let usable: Vec<f64> =
+                said.filter(|v| v.is_finite() && *v > least + LEAST_RATIO && *v < LARGEST_RATIO).collect();
+            if usable.is_empty() {
+                least + USUAL_RATIO
+            } else {
+                median(usable)
+            }
+        };
+        self.coefficients.iter().map(of).collect()
+    }
+
+    /// Second order with one derivative of the output, everything else as it is, as far as the bounds allow.
+    #[must_use]
+    pub fn whole_orders(&self) -> Vec<f64> {
+        let mut usual: BTreeMap<&String, f64> = BTreeMap::new();
+        for equation in &self.structure.equations {
+            usual.extend(equation.order.names().map(|name| (name, 2.0)));
+            let own = equation.own().flat_map(|term| term.order.names()).enumerate();
+            let value = |i| if i == 0 { 1.0 } else { 0.0 };
+            let own: Vec<_> = own.map(|(i, name)| (name, usual.get(name).copied().unwrap_or(value(i)))).collect();
+            usual.extend(own);
+        }
+        let pairs = self.orders.iter().zip(self.bounds());
+        // Bounds that meet the wrong way round are refused before.
+        pairs.map(|(name, (low, high))| usual.get(name).copied().unwrap_or(0.0).max(*low).min(*high)).collect()
+    }
+
+    /// The same equations with other initial terms, what else a run starts with as it is.
+    ///
+    /// # Errors
+    /// Those of [`Free::of`].
+    pub fn starting(&self, initial: Initial, history: bool) -> Result<Self> {
+        Self::of(Structure { initial, history, ..self.structure.clone() })
+    }
+
+    /// What a ratio of the coefficient law exceeds.
+    fn exceeds(&self, ratio: &String) -> f64 {
+        self.structure.hints.exceeds.get(ratio).copied().unwrap_or(1.0)
+    }
+}
+
+/// Bounds of free orders: those that were given, else as wide as a fit looks by itself.
+fn bounds(structure: &Structure, orders: &[String]) -> Vec<(f64, f64)> {
+    let highest: Vec<&String> =
+        structure.equations.iter().filter(|e| e.order.is_single()).flat_map(|e| e.order.names()).collect();
+    let inertia: Vec<&String> = structure
+        .equations
+        .iter()
+        .filter(|e| e.friction.is_some() && e.order.is_single())
+        .flat_map(|e| e.order.names())
+        .collect();
+    let of = |name: &String| {
+        let above = highest.contains(&name);
+        let own = || (if above { ALPHA_BOUNDS.0 } else { 0.0 }, reach(structure, name, above));
+        let (low, high) = structure.bounds.get(name).copied().unwrap_or_else(own);
+        if inertia.contains(&name) {
+            // A velocity needs inertia, and friction of it an order of 2 at most.
+            return (low.max(FRICTION_BOUNDS.0), high.min(FRICTION_BOUNDS.1));
+        }
+        (low, high)
+    };
+    orders.iter().map(of).collect()
+}
+
+/// How high a free order is sought: 3, or past the highest number in its equations where that is more.
+fn reach(structure: &Structure, name: &String, above: bool) -> f64 {
+    let beside = structure.equations.iter().filter(|e| e.orders().any(|order| order.names().any(|n| n == name)));
+    let numbers = beside.flat_map(Equation::orders).filter(|order| !order.is_free()).map(|order| order.constant);
+    numbers.map(|n| n + f64::from(u8::from(above))).fold(SEARCHED_ORDER, f64::max).min(MAX_ORDER)
+}
+
+/// The unit of time of some runs, and which numbers of a problem are powers of it.
+#[derive(Debug, Clone)]
+pub struct Clock {
+    unit: Unit,
+    orders: usize,
+    coefficients: usize,
+    size: usize,
+}
+
+impl Clock {
+    /// The unit is that of a frequency half way, in logarithms, between that of the runs and Nyquist's; each run is told
+    /// by its sample interval and its duration.
+    #[must_use]
+    pub fn of(problem: &Problem, spans: &[(f64, f64)]) -> Self {
+        let spans: Vec<f64> = spans.iter().map(|(step, duration)| libm::log(*step) + libm::log(*duration)).collect();
+        Self {
+            unit: Unit::of_spans(&problem.model, &spans),
+            orders: problem.model.order_bounds.len(),
+            coefficients: problem.model.coordinates.len(),
+            size: problem.size(),
+        }
+    }
+
+    /// ln of the unit of time.
+    #[must_use]
+    pub fn unit(&self) -> f64 {
+        self.unit.unit()
+    }
+
+    /// By what each number is to be multiplied for its value in the unit; only orders change that, and they are the same
+    /// in any unit.
+    fn factors(&self, values: &[f64]) -> Vec<f64> {
+        let of = |i: usize| match i.checked_sub(self.orders) {
+            Some(j) if j < self.coefficients => self.unit.factor(j, &values[..self.orders]),
+            _ => 1.0,
+        };
+        (0..self.size).map(of).collect()
+    }
+
+    /// Share of itself by which each number falls with a step of the orders, its value in the unit kept.
+    fn fall(&self, i: usize, moved: &[f64]) -> f64 {
+        match i.checked_sub(self.orders) {
+            Some(j) if j < self.coefficients => {
+                moved[..self.orders].iter().enumerate().map(|(k, by)| self.unit.fall(j, k) * by).sum()
+            }
+            _ => 0.0,
+        }
+    }
+
+    /// Parameters in the unit.
+    #[must_use]
+    pub fn told(&self, values: &[f64]) -> Vec<f64> {
+        values.iter().zip(self.factors(values)).map(|(v, f)| v * f).collect()
+    }
+
+    /// Parameters from those in the unit.
+    #[must_use]
+    pub fn untold(&self, values: &[f64]) -> Vec<f64> {
+        values.iter().zip(self.factors(values)).map(|(v, f)| v / f).collect()
+    }
+
+    /// A small step of the parameters at some values, from the one in the unit.
+    #[must_use]
+    pub fn step(&self, values: &[f64], moved: &[f64]) -> Vec<f64> {
+        let factors = self.factors(values);
+        let of = |(i, value): (usize, &f64)| moved[i] / factors[i] - value * self.fall(i, moved);
+        values.iter().enumerate().map(of).collect()
+    }
+
+    /// Standard errors in the unit, from a covariance by rows; infinite where the runs do not see all that takes part.
+    #[must_use]
+    pub fn errors(&self, values: &[f64], covariance: &[f64]) -> Vec<f64> {
+        let (n, factors) = (values.len(), self.factors(values));
+        let seen: Vec<bool> = (0..n).map(|i| covariance[i * n + i].is_finite()).collect();
+        let of = |i: usize| {
+            let mut row = vec![0.0; n];
+            row[i] = factors[i];
+            for (k, by) in row.iter_mut().enumerate().take(self.orders) {
+                let mut one = vec![0.0; self.orders];
+                one[k] = 1.0;
+                *by += factors[i] * values[i] * self.fall(i, &one);
+            }
+            if row.iter().zip(&seen).any(|(by, seen)| !seen && *by != 0.0) {
+                return f64::INFINITY;
+            }
+            let mut variance = 0.0;
+            for j in (0..n).filter(|&j| seen[j]) {
+                for k in (0..n).filter(|&k| seen[k]) {
+                    variance += row[j] * covariance[j * n + k] * row[k];
+                }
+            }
+            variance.max(0.0).sqrt()
+        };
+        (0..n).map(of).collect()
+    }
+}

@@ -1,0 +1,171 @@
+//! Where the runs of a joint fit come from: sampled as finely as it is asked.
+
+use crate::error::{check_length, check_points, check_step, Error, Result};
+use crate::estimation::output_error::{Experiment, Instant};
+use crate::regressors::Record;
+use crate::signal::block_pulse::{pulse_means, Intersample};
+
+/// Runs that can be sampled on any grid. Weights of what it gives are not looked at; shares say what was read.
+pub trait Source {
+    /// Sample interval and duration of each run \[s\].
+    fn spans(&self) -> Vec<(f64, f64)>;
+
+    /// The runs sampled so.
+    ///
+    /// # Errors
+    /// Whatever keeps it from that.
+    fn experiments(&self, sampling: Sampling) -> Result<Vec<Experiment>>;
+}
+
+/// How finely runs are sampled.
+#[derive(Debug, Clone, Copy, PartialEq, Eq, Hash)]
+pub struct Sampling {
+    /// Pulses a sample interval.
+    pub every: usize,
+    /// Of how many samples one counts.
+    pub decimation: usize,
+    /// So many sample intervals from the beginning of each run on; none: all.
+    pub first: Option<usize>,
+}
+
+impl Sampling {
+    /// Refuses a sampling of nothing, and one finer than memory.
+    ///
+    /// # Errors
+    /// [`Error::OutOfRange`].
+    pub fn check(self) -> Result<()> {
+        for (name, number) in [("pulses a sample interval", self.every), ("samples that become one", self.decimation)] {
+            check_points(name, number)?;
+            if number == 0 {
+                let (value, range) = (0.0, "[1, ∞)".into());
+                return Err(Error::OutOfRange { name: name.into(), value, range, remedy: "give 1 or more".into() });
+            }
+        }
+        Ok(())
+    }
+}
+
+impl Default for Sampling {
+    fn default() -> Self {
+        Self { every: 1, decimation: 1, first: None }
+    }
+}
+
+/// Runs of which starts can be made, too: what was read, and records for estimators on the equation error.
+pub trait Recordings: Source {
+    /// Which signals are inputs of the runs, and which of them hold between samples.
+    fn inputs(&self) -> Vec<Option<Intersample>>;
+
+    /// What was read of a signal by run, at regular times; not a number where nothing was.
+    ///
+    /// # Errors
+    /// Whatever keeps it from that.
+    fn samples(&self, signal: usize) -> Result<Vec<Vec<f64>>>;
+
+    /// Each run on so many pulses, every signal behind the sensor filter, equations driven by what was measured, free
+    /// numbers of inputs at these values.
+    ///
+    /// # Errors
+    /// Whatever keeps it from that.
+    fn records(&self, m: usize, inputs: &[f64]) -> Result<Vec<Record>>;
+}
+
+/// A signal that was read at regular times.
+#[derive(Debug, Clone, PartialEq)]
+pub struct Signal {
+    /// What was read.
+    pub samples: Vec<f64>,
+    /// What it does in between.
+    pub between: Intersample,
+}
+
+/// Runs whose signals were all read at the same regular times, throughout, without a filter.
+///
+/// ```
+/// # fn main() -> ftlm::error::Result<()> {
+/// use ftlm::estimation::joint_fit::source::{Sampled, Sampling, Signal, Source};
+/// use ftlm::signal::block_pulse::Intersample;
+/// let y = Signal { samples: vec![0.0, 1.0, 4.0, 9.0], between: Intersample::Linear };
+/// let u = Signal { samples: vec![1.0, 2.0, 2.0, 2.0], between: Intersample::Hold };
+/// let runs = Sampled::new(0.1, vec![0], vec![vec![y, u]])?;
+/// let fine = runs.experiments(Sampling { every: 2, ..Sampling::default() })?;
+/// assert_eq!(fine[0].record.signal(1), [1.0, 1.0, 2.0, 2.0, 2.0, 2.0]);
+/// # Ok(())
+/// # }
+/// ```
+#[derive(Debug, Clone, PartialEq)]
+pub struct Sampled {
+    step: f64,
+    outputs: Vec<usize>,
+    runs: Vec<Vec<Signal>>,
+}
+
+impl Sampled {
+    /// Runs of one sample interval, signals in one order, and which of them are the outputs of the equations.
+    ///
+    /// # Errors
+    /// [`Error::Length`], [`Error::OutOfRange`], [`Error::Structure`].
+    pub fn new(step: f64, outputs: Vec<usize>, runs: Vec<Vec<Signal>>) -> Result<Self> {
+        check_step(step)?;
+        for run in &runs {
+            let rows = run.first().map_or(0, |signal| signal.samples.len());
+            run.iter().try_for_each(|signal| check_length("samples of a signal", rows, signal.samples.len()))?;
+            if outputs.iter().any(|&output| output >= run.len()) || rows < 3 {
+                let what = format!("a run of {} signals and {rows} samples", run.len());
+                return Err(Error::Structure { what, remedy: "give every output, and three samples or more".into() });
+            }
+        }
+        Ok(Self { step, outputs, runs })
+    }
+}
+
+impl Source for Sampled {
+    #[allow(clippy::cast_precision_loss)]
+    fn spans(&self) -> Vec<(f64, f64)> {
+        self.runs.iter().map(|run| (self.step, run[0].samples.len() as f64 * self.step)).collect()
+    }
+
+    #[allow(clippy::cast_precision_loss)]
+    fn experiments(&self, sampling: Sampling) -> Result<Vec<Experiment>> {
+        let Sampling { every, decimation, first } = sampling;
+        let decimation = decimation.max(1);
+        let of = |run: &Vec<Signal>| {
+            let all = run[0].samples.len() - 1;
+            let intervals = first.map_or(all, |first| first.min(all)) / decimation;
+            let rows = intervals * decimation + 1;
+            let means = run.iter().map(|s| pulse_means(&s.samples[..rows], intervals * every, s.between));
+            let step = self.step * decimation as f64 / every.max(1) as f64;
+            let record = Record::new(step, means.collect::<Result<_>>()?, None)?;
+            let kept = |s: &Signal| s.samples[..rows].iter().copied().step_by(decimation).collect::<Vec<_>>();
+            let instants = run.iter().map(|s| Instant { values: Some(kept(s)), held: s.between == Intersample::Hold });
+            let instants = instants.collect();
+            let samples = self.outputs.iter().map(|&output| kept(&run[output])).collect();
+            Experiment::new(record, every, samples, vec![1.0; self.outputs.len()])?.with_instants(instants)
+        };
+        self.runs.iter().map(of).collect()
+    }
+}
+
+impl Recordings for Sampled {
+    fn inputs(&self) -> Vec<Option<Intersample>> {
+        let signals = self.runs.first().into_iter().flatten().enumerate();
+        signals.map(|(i, signal)| (!self.outputs.contains(&i)).then_some(signal.between)).collect()
+    }
+
+    fn samples(&self, signal: usize) -> Result<Vec<Vec<f64>>> {
+        let of = |run: &Vec<Signal>| run.get(signal).map(|signal| signal.samples.clone());
+        let missing = || Error::Structure { what: format!("no signal {signal}"), remedy: "number them from 0".into() };
+        self.runs.iter().map(of).collect::<Option<_>>().ok_or_else(missing)
+    }
+
+    #[allow(clippy::cast_precision_loss)]
+    fn records(&self, m: usize, inputs: &[f64]) -> Result<Vec<Record>> {
+        check_length("free numbers of inputs", 0, inputs.len())?;
+        let of = |run: &Vec<Signal>| {
+            let means = run.iter().map(|s| pulse_means(&s.samples, m, s.between)).collect::<Result<_>>()?;
+            let duration = self.step * (run[0].samples.len() - 1) as f64;
+            Record::new(duration / m.max(1) as f64, means, None)
+        };
+        self.runs.iter().map(of).collect()
+    }
+}

@@ -1,0 +1,183 @@
+//! Least squares on the equation error at given orders, by QR of the regressors.
+
+use crate::equation::{Initial, Structure};
+use crate::error::{check_finite, check_length, Error, Result};
+use crate::linalg::dense;
+use crate::linalg::small::back_substitute;
+use crate::regressors::Record;
+
+/// A column whose part outside the span of those before it is below this fraction of it is dependent.
+const RANK_FLOOR: f64 = 1e-12;
+
+/// Coefficients of an equation and what else the fit determined.
+#[derive(Debug, Clone, PartialEq)]
+pub struct Estimate {
+    /// One a term; fixed ones as given.
+    pub coefficients: Vec<f64>,
+    /// Coefficients of the initial terms, per record, in the order of the exponents; 0 where dropped.
+    pub initial: Vec<Vec<f64>>,
+    /// Exponents of the initial terms.
+    pub exponents: Vec<f64>,
+    /// (record, position) of the initial terms dropped as combinations of other regressors.
+    pub dropped: Vec<(usize, usize)>,
+}
+
+/// The regression of an equation on several records: stacked columns, the target last.
+pub struct Regression {
+    /// Free terms, then the initial terms of each record.
+    pub columns: Vec<Vec<f64>>,
+    /// y less the terms with fixed coefficients.
+    pub target: Vec<f64>,
+    /// First row of each record, and the end of the last.
+    pub starts: Vec<usize>,
+    exponents: Vec<f64>,
+    fixed: Vec<Option<f64>>,
+}
+
+impl Regression {
+    /// Builds the regressors I^{α−ν} s, and t^e per record, of an equation.
+    ///
+    /// # Errors
+    /// [`Error::Length`] where `fixed` does not match the terms; no record; a structure that a record cannot carry.
+    pub fn new(records: &[Record], structure: &Structure, fixed: &[Option<f64>], initial: &Initial) -> Result<Self> {
+        check_length("fixed coefficients", structure.terms.len(), fixed.len())?;
+        if records.is_empty() {
+            return Err(Error::Length { name: "records".into(), expected: 1, found: 0 });
+        }
+        let known: Vec<f64> = fixed.iter().flatten().copied().collect();
+        check_finite("fixed coefficients", &known)?;
+        records.iter().try_for_each(|record| structure.check(record.len(), |_| true))?;
+        initial.check()?;
+        let exponents = structure.initial_exponents(initial);
+        let mut starts = vec![0];
+        for record in records {
+            starts.push(starts[starts.len() - 1] + record.m());
+        }
+        let rows = starts[records.len()];
+        let mut target: Vec<f64> = Vec::with_capacity(rows);
+        for record in records {
+            target.extend_from_slice(record.signal(structure.output));
+        }
+        let mut columns = Vec::new();
+        for (k, (term, fixed)) in structure.terms.iter().zip(fixed).enumerate() {
+            let mut column = Vec::with_capacity(rows);
+            for record in records {
+                column.extend(record.integral(term.signal, structure.integration(k)));
+            }
+            match fixed {
+                None => columns.push(column),
+                Some(value) => target.iter_mut().zip(&column).for_each(|(t, c)| *t -= value * c),
+            }
+        }
+        for (r, record) in records.iter().enumerate() {
+            for &exponent in &exponents {
+                let mut column = vec![0.0; rows];
+                column[starts[r]..starts[r + 1]].copy_from_slice(&record.initial_term(exponent));
+                columns.push(column);
+            }
+        }
+        Ok(Self { columns, target, starts, exponents, fixed: fixed.to_vec() })
+    }
+
+    /// Number of free coefficients of terms.
+    #[must_use]
+    pub fn free(&self) -> usize {
+        self.fixed.iter().filter(|f| f.is_none()).count()
+    }
+
+    /// Sorts a solution (free coefficients, then initial terms by record) into an [`Estimate`].
+    #[must_use]
+    pub fn estimate(&self, solution: &[f64], dropped: &[usize]) -> Estimate {
+        let mut free = solution.iter();
+        let coefficients = self.fixed.iter().map(|f| f.or_else(|| free.next().copied()).unwrap_or(0.0)).collect();
+        let width = self.exponents.len();
+        let rest: Vec<f64> = free.copied().collect();
+        let initial = (0..self.starts.len() - 1).map(|r| rest[r * width..(r + 1) * width].to_vec()).collect();
+        let dropped = dropped
+            .iter()
+            .map(|&d| (d - self.free()) / width.max(1))
+            .zip(dropped.iter().map(|&d| (d - self.free()) % width.max(1)));
+        Estimate { coefficients, initial, exponents: self.exponents.clone(), dropped: dropped.collect() }
+    }
+}
+
+/// Least-squares coefficients of an equation on one or several records, each with its own initial terms.
+///
+/// `fixed` holds a value for each coefficient that is known. O(k² Σm).
+///
+/// # Errors
+/// [`Error::Singular`] with the first free term that is a combination of others; [`Error::Length`].
+///
+/// ```
+/// # fn main() -> ftlm::error::Result<()> {
+/// use ftlm::equation::{Initial, Structure, Term};
+/// use ftlm::estimation::least_squares;
+/// use ftlm::regressors::Record;
+/// let input: Vec<f64> = (0..64).map(|k| f64::from(k % 7)).collect();
+/// let record = Record::new(0.1, vec![vec![0.0; 64], input.clone()], None)?;
+/// // y = 3 I^0.5 u.
+/// let output = record.integral(1, 0.5).iter().map(|v| 3.0 * v).collect();
+/// let run = Record::new(0.1, vec![output, input], None)?;
+/// let structure = Structure { output: 0, order: 0.5, terms: vec![Term { signal: 1, order: 0.0 }] };
+/// let found = least_squares::fit(&[run], &structure, &[None], &Initial::Rest)?;
+/// assert!((found.coefficients[0] - 3.0).abs() < 1e-12);
+/// # Ok(())
+/// # }
+/// ```
+pub fn fit(records: &[Record], structure: &Structure, fixed: &[Option<f64>], initial: &Initial) -> Result<Estimate> {
+    let regression = Regression::new(records, structure, fixed, initial)?;
+    let (solution, dropped) = solve(&regression.columns, &regression.target, regression.free())?;
+    Ok(regression.estimate(&solution, &dropped))
+}
+
+/// argmin ‖target − Σ x_k column_k‖ by QR; the first `needed` columns must be independent, later dependent ones are
+/// dropped (x = 0) and returned.
+///
+/// # Errors
+/// [`Error::Singular`].
+pub fn solve(columns: &[Vec<f64>], target: &[f64], needed: usize) -> Result<(Vec<f64>, Vec<usize>)> {
+    let k = columns.len();
+    columns.iter().try_for_each(|column| check_length("column", target.len(), column.len()))?;
+    if k == 0 {
+        return Ok((Vec::new(), Vec::new()));
+    }
+    let scales: Vec<f64> = columns.iter().map(|c| norm(c)).collect();
+    let mut kept: Vec<usize> = (0..k).collect();
+    if let Some(&zero) = kept.iter().find(|&&i| i < needed && !(scales[i] > 0.0 && scales[i].is_finite())) {
+        return Err(Error::Singular { index: zero, count: k });
+    }
+    kept.retain(|&i| scales[i] > 0.0 && scales[i].is_finite());
+    let target_scale = norm(target).max(f64::MIN_POSITIVE);
+    loop {
+        let mut scaled: Vec<Vec<f64>> =
+            kept.iter().map(|&i| columns[i].iter().map(|v| v / scales[i]).collect()).collect();
+        scaled.push(target.iter().map(|v| v / target_scale).collect());
+        let r = dense::triangular_factor(&scaled);
+        let stride = scaled.len();
+        let dependent = (0..kept.len()).find(|&i| r[i * stride + i].abs() <= RANK_FLOOR);
+        if let Some(position) = dependent {
+            if kept[position] < needed {
+                return Err(Error::Singular { index: kept[position], count: k });
+            }
+            kept.remove(position);
+            continue;
+        }
+        let rhs: Vec<f64> = (0..kept.len()).map(|i| r[i * stride + kept.len()]).collect();
+        let solution = back_substitute(&r, stride, &rhs);
+        let mut x = vec![0.0; k];
+        for (&i, value) in kept.iter().zip(solution) {
+            x[i] = value * target_scale / scales[i];
+        }
+        let dropped = (0..k).filter(|i| !kept.contains(i)).collect();
+        return Ok((x, dropped));
+    }
+}
+
+fn norm(column: &[f64]) -> f64 {
+    // Scaled by the largest element, so that neither 1e200 nor 1e-200 is lost.
+    let largest = column.iter().fold(0.0_f64, |a, v| a.max(v.abs()));
+    if largest == 0.0 || !largest.is_finite() {
+        return largest;
+    }
+    largest * column.iter().map(|v| (v / largest) * (v / largest)).sum::<f64>().sqrt()
+}

@@ -1,0 +1,295 @@
+//! The fit: a model, its experiments and a start become a least-squares problem, and its minimum a result.
+
+use std::cell::RefCell;
+
+use super::evaluation_cache::Shelf;
+use super::experiment::Experiment;
+use super::parameterization::{Clock, Coordinate, FreeInput, FreeModel, Point};
+use super::residuals::Evaluation;
+use crate::error::{check_finite, check_length, Error, Result};
+use crate::estimation::optimization::damped_step::Problem;
+use crate::estimation::optimization::levenberg_marquardt::{minimise, Settings, Status};
+use crate::parallel::Stop;
+
+/// The optimum and what describes it.
+#[derive(Debug, Clone, PartialEq)]
+pub struct Fit {
+    /// Free orders, coefficients and numbers of inputs.
+    pub point: Point,
+    /// Half the weighted sum of squared residuals.
+    pub cost: f64,
+    /// Weighted residuals (y − ŷ)/σ, records one after the other, outputs within.
+    pub residuals: Vec<f64>,
+    /// Their derivatives with respect to orders, coefficients (plain coordinates), then inputs, initial terms projected
+    /// out; none where only residuals were asked for.
+    pub jacobian: Vec<Vec<f64>>,
+    /// Coefficients of the initial terms per record and equation.
+    pub initial: Vec<Vec<Vec<f64>>>,
+    /// Exponents of the initial terms per equation.
+    pub exponents: Vec<Vec<f64>>,
+    /// Evaluations of residuals.
+    pub evaluations: usize,
+    /// How it ended.
+    pub status: Status,
+}
+
+/// The output error of a model on its experiments, as a problem of least squares.
+struct OutputError<'a> {
+    model: &'a FreeModel,
+    experiments: &'a [Experiment],
+    /// Where the coefficients start, in the unit of time of the clock.
+    start: Vec<f64>,
+    /// The unit of time in which coefficients are moved.
+    clock: Clock,
+    /// Whether a free run that grows is no place to go.
+    steady: bool,
+    /// Whether all coefficients keep their own coordinates, as where an optimum is followed and not looked for.
+    plain: bool,
+    /// Coefficients that are solved for at every point.
+    linear: Vec<usize>,
+    /// What evaluations share, by experiment.
+    shelves: RefCell<Vec<Shelf>>,
+    /// What ends the search between two computations.
+    stop: &'a Stop,
+}
+
+impl Problem for OutputError<'_> {
+    type Point = Point;
+    type Evaluation = Evaluation;
+
+    fn evaluate(&self, point: &Point) -> Result<Evaluation> {
+        self.stop.check()?;
+        self.model.evaluate(self.experiments, &mut self.shelves.borrow_mut(), point, &self.linear)
+    }
+
+    fn settled(&self, evaluation: &Evaluation, _point: Point) -> Point {
+        evaluation.point.clone()
+    }
+
+    fn projected(&self, parameter: usize) -> bool {
+        parameter.checked_sub(self.model.order_bounds.len()).is_some_and(|c| self.linear.contains(&c))
+    }
+
+    fn residuals<'a>(&self, evaluation: &'a Evaluation) -> &'a [f64] {
+        &evaluation.residuals
+    }
+
+    fn jacobian(&self, _point: &Point, evaluation: &Evaluation) -> Result<Vec<Vec<f64>>> {
+        self.stop.check()?;
+        self.model.jacobian(self.experiments, &mut self.shelves.borrow_mut(), &self.linear, evaluation)
+    }
+
+    fn moved(&self, point: &Point, steps: &[f64]) -> (Point, f64) {
+        stepped(self.model, &self.clock, point, steps)
+    }
+
+    fn stretch(&self, point: &Point, parameter: usize) -> f64 {
+        parameter.checked_sub(point.orders.len()).filter(|j| *j < point.coefficients.len()).map_or(1.0, |j| {
+            let factor = self.clock.factor(j, &point.orders);
+            self.model.coordinates[j].stretch(factor * point.coefficients[j]) / factor
+        })
+    }
+
+    /// With an order move the coefficients whose numbers stay in the unit of time.
+    fn carried(&self, point: &Point, parameter: usize) -> Vec<(usize, f64)> {
+        if parameter >= point.orders.len() {
+            return Vec::new();
+        }
+        (point.coefficients.iter().enumerate())
+            .map(|(j, c)| (point.orders.len() + j, -c * self.clock.fall(j, parameter)))
+            .filter(|(_, slope)| *slope != 0.0)
+            .collect()
+    }
+
+    /// Distance of orders and of inputs' numbers from their bounds; coefficients have none but 0 where they keep a sign.
+    fn room(&self, point: &Point, parameter: usize) -> (f64, f64) {
+        let behind = point.orders.len() + point.coefficients.len();
+        let (value, (low, high)) = match (point.orders.get(parameter), parameter.checked_sub(behind)) {
+            (Some(order), _) => (*order, self.model.order_bounds[parameter]),
+            (None, Some(input)) => (point.inputs[input], self.model.inputs[input].bounds),
+            (None, None) => {
+                let j = parameter - point.orders.len();
+                let value = self.clock.factor(j, &point.orders) * point.coefficients[j];
+                let down = self.model.coordinates[j].room(value, self.start[j]);
+                return (down, f64::INFINITY);
+            }
+        };
+        (value - low, high - value)
+    }
+
+    /// The response is linear in a delay between whole numbers of steps, and in a limit between values of the input; there
+    /// its slope jumps.
+    fn kinked(&self, point: &Point, parameter: usize) -> bool {
+        parameter >= point.orders.len() + point.coefficients.len()
+    }
+
+    fn size(&self, evaluation: &Evaluation) -> f64 {
+        evaluation.size
+    }
+
+    /// Where the grids see all of each equation: a fit would follow noise with what they do not see.
+    fn trusted(&self, point: &Point) -> bool {
+        self.model.resolved(self.experiments, point) && !(self.steady && self.model.grows(point))
+    }
+
+    fn leaps(&self) -> bool {
+        self.plain
+    }
+}
+
+/// A point moved by steps in its coordinates, within bounds, and how far: orders as they are, coefficients as a share
+/// of themselves in the clock's unit, numbers of inputs as a share of their interval.
+fn stepped(model: &FreeModel, clock: &Clock, point: &Point, deltas: &[f64]) -> (Point, f64) {
+    let mut next = point.clone();
+    let mut moved: f64 = 0.0;
+    let (orders, rest) = deltas.split_at(point.orders.len());
+    let (coefficients, inputs) = rest.split_at(point.coefficients.len());
+    for ((order, &(low, high)), delta) in next.orders.iter_mut().zip(&model.order_bounds).zip(orders) {
+        let before = *order;
+        *order = (before + delta).clamp(low, high);
+        moved = moved.max((*order - before).abs());
+    }
+    for (j, (&coordinate, &delta)) in model.coordinates.iter().zip(coefficients).enumerate() {
+        let before = clock.factor(j, &point.orders) * point.coefficients[j];
+        let value = coordinate.shifted(before, delta);
+        next.coefficients[j] = value / clock.factor(j, &next.orders);
+        moved = moved.max((value - before).abs() / before.abs().max(f64::MIN_POSITIVE));
+    }
+    for ((value, FreeInput { bounds: (low, high), .. }), delta) in next.inputs.iter_mut().zip(&model.inputs).zip(inputs)
+    {
+        let before = *value;
+        *value = (before + delta).clamp(*low, *high);
+        moved = moved.max((*value - before).abs() / (high - low).max(f64::MIN_POSITIVE));
+    }
+    (next, moved)
+}
+
+/// Weighted least squares on the output error from a start, by Levenberg–Marquardt with columns scaled by the Jacobian.
+///
+/// Coefficients of what drives from outside are solved for at every point, so where they start does not matter, nor with
+/// which sign; a single evaluation is of the start as it is.
+///
+/// # Errors
+/// A start whose free run is not finite ([`Error::Diverged`]), or that lies outside its coordinates; a model that names
+/// what is not there, experiments that do not fit it ([`FreeModel::check`]).
+///
+/// ```
+/// # fn main() -> ftlm::error::Result<()> {
+/// use ftlm::equation::{AffineOrder, Initial};
+/// use ftlm::estimation::output_error::*;
+/// use ftlm::signal::block_pulse::point_samples;
+/// use ftlm::regressors::Record;
+/// // D^a y = c u with the truth a = 0.8, c = 3.
+/// let input: Vec<f64> = (0..100).map(|k| if k % 40 < 20 { 1.0 } else { -1.0 }).collect();
+/// let run = Record::new(0.05, vec![vec![0.0; 100], input], None)?;
+/// let output: Vec<f64> = run.integral(1, 0.8).iter().map(|v| 3.0 * v).collect();
+/// let experiment = Experiment::new(run, 1, vec![point_samples(&output)], vec![1.0])?;
+/// let model = FreeModel {
+///     equations: vec![FreeEquation {
+///         output: 0,
+///         order: AffineOrder { constant: 0.0, weights: vec![1.0] },
+///         terms: vec![(
+///             1,
+///             AffineOrder { constant: 0.0, weights: vec![0.0] },
+///             Monomial { factor: 1.0, powers: vec![(0, 1)] },
+///         )],
+///     }],
+///     order_bounds: vec![(0.1, 2.0)],
+///     coordinates: vec![Coordinate::Logarithm],
+///     inputs: vec![],
+///     coupled: false,
+///     initial: Initial::Rest,
+/// };
+/// let start = Point { orders: vec![1.0], coefficients: vec![1.0], inputs: vec![] };
+/// let found = fit(&model, &[experiment], &start, Settings::default())?;
+/// assert!((found.point.orders[0] - 0.8).abs() < 1e-6 && (found.point.coefficients[0] - 3.0).abs() < 1e-6);
+/// # Ok(())
+/// # }
+/// ```
+pub fn fit(model: &FreeModel, experiments: &[Experiment], start: &Point, settings: Settings) -> Result<Fit> {
+    fit_until(model, experiments, start, settings, false, &Stop::default())
+}
+
+/// The same, but from a start whose free run does not grow no step leads to one that does.
+///
+/// With initial terms that are estimated, a growing mode costs nothing: they take it away until the end of the run, and
+/// what is left depends on what the inputs will be. Equations that drive each other as simulated are not looked at.
+///
+/// # Errors
+/// As [`fit`].
+pub fn fit_steady(model: &FreeModel, experiments: &[Experiment], start: &Point, settings: Settings) -> Result<Fit> {
+    fit_until(model, experiments, start, settings, true, &Stop::default())
+}
+
+/// [`fit`], or where `steady` [`fit_steady`], until it is told to stop.
+///
+/// # Errors
+/// As [`fit`]; [`Error::Interrupted`].
+pub fn fit_until(
+    model: &FreeModel,
+    experiments: &[Experiment],
+    start: &Point,
+    settings: Settings,
+    steady: bool,
+    stop: &Stop,
+) -> Result<Fit> {
+    check_length("orders", model.order_bounds.len(), start.orders.len())?;
+    check_length("coefficients", model.coordinates.len(), start.coefficients.len())?;
+    check_length("inputs", model.inputs.len(), start.inputs.len())?;
+    model.check(experiments)?;
+    check_start(model, start)?;
+    let mut point = start.clone();
+    point.orders.iter_mut().zip(&model.order_bounds).for_each(|(o, &(low, high))| *o = o.clamp(low, high));
+    point.inputs.iter_mut().zip(&model.inputs).for_each(|(t, d)| *t = t.clamp(d.bounds.0, d.bounds.1));
+    // A single evaluation is of the start as it is.
+    let linear = if settings.evaluations > 1 { model.linear() } else { Vec::new() };
+    let plain = !model.coordinates.iter().any(|c| matches!(c, Coordinate::Logarithm | Coordinate::ExcessLogarithm));
+    let mut model = model.clone();
+    // Solved for, they need no coordinate that keeps a sign.
+    linear.iter().for_each(|&j| model.coordinates[j] = Coordinate::Plain);
+    // With free inputs, what drives is no signal of the record.
+    let passed: Option<Vec<Experiment>> = match settings.evaluations > 1 && model.inputs.is_empty() {
+        true => experiments.iter().map(Experiment::passed_first).collect::<Result<_>>()?,
+        false => None,
+    };
+    let experiments = passed.as_deref().unwrap_or(experiments);
+    let shelves = RefCell::new(Shelf::of(experiments)?);
+    let clock = Clock::of(&model, experiments);
+    let start = (point.coefficients.iter().enumerate()).map(|(j, c)| clock.factor(j, &point.orders) * c).collect();
+    let problem = OutputError { model: &model, experiments, start, clock, steady, plain, linear, shelves, stop };
+    let found = minimise(&problem, point, settings)?;
+    Ok(Fit {
+        point: found.point,
+        cost: found.cost,
+        residuals: found.evaluation.residuals,
+        jacobian: found.jacobian,
+        initial: found.evaluation.initial,
+        exponents: found.evaluation.exponents,
+        evaluations: found.evaluations,
+        status: found.status,
+    })
+}
+
+/// Refuses a start that its coordinates cannot move, or that is no number.
+fn check_start(model: &FreeModel, start: &Point) -> Result<()> {
+    for (i, (&c, coordinate)) in start.coefficients.iter().zip(&model.coordinates).enumerate() {
+        if !coordinate.holds(c) {
+            return Err(Error::OutOfRange {
+                name: format!("start of coefficient {i}"),
+                value: c,
+                range: "its coordinate".into(),
+                remedy: "start a logarithmic coefficient away from 0, a ratio above 1".into(),
+            });
+        }
+    }
+    check_finite("orders of the start", &start.orders)?;
+    match start.inputs.iter().position(|v| !v.is_finite()) {
+        None => Ok(()),
+        Some(index) => Err(Error::OutOfRange {
+            name: format!("start of the number of input {index}"),
+            value: start.inputs[index],
+            range: "numbers within its bounds".into(),
+            remedy: "start each delay and limit at a finite number".into(),
+        }),
+    }
+}

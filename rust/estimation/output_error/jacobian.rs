@@ -1,0 +1,169 @@
+//! Derivatives of the residuals: A⁻¹(∂b − ∂A y) as products of three spectra, one inverse transform a parameter and output.
+
+use std::borrow::Cow;
+use std::rc::Rc;
+
+use super::evaluation_cache::Shelf;
+use super::experiment::Experiment;
+use super::parameterization::{FreeModel, Point};
+use super::residuals::{Evaluation, Part};
+use crate::equation::AffineOrder;
+use crate::error::{Error, Result};
+use crate::linalg::orthogonal::project_out;
+use crate::series::Kernel;
+
+impl FreeModel {
+    /// Derivatives of the residuals at an evaluated point with respect to orders, coefficients (plain coordinates),
+    /// then inputs' numbers, initial terms projected out; those of linear coefficients are there already.
+    pub(crate) fn jacobian(
+        &self,
+        experiments: &[Experiment],
+        shelves: &mut [Shelf],
+        linear: &[usize],
+        at: &Evaluation,
+    ) -> Result<Vec<Vec<f64>>> {
+        let point = &at.point;
+        let count = point.orders.len() + point.coefficients.len() + point.inputs.len();
+        let mut jacobian = vec![Vec::with_capacity(at.residuals.len()); count];
+        for (index, ((experiment, part), shelf)) in experiments.iter().zip(&at.parts).zip(shelves).enumerate() {
+            self.sensitivities(experiment, shelf, part, point, &at.initial[index], linear, &mut jacobian)?;
+        }
+        if jacobian.iter().flatten().any(|v| !v.is_finite()) {
+            return Err(Error::Diverged { what: "sensitivity of the free run".into(), index: 0 });
+        }
+        Ok(jacobian)
+    }
+
+    /// One experiment's rows of the Jacobian: A⁻¹(∂b − ∂A y) as products of three spectra.
+    #[allow(clippy::too_many_arguments)]
+    fn sensitivities(
+        &self,
+        experiment: &Experiment,
+        shelf: &mut Shelf,
+        part: &Part,
+        point: &Point,
+        initial: &[Vec<f64>],
+        linear: &[usize],
+        jacobian: &mut [Vec<f64>],
+    ) -> Result<()> {
+        let record = &experiment.record;
+        let (orders, coefficients) = (&point.orders, &point.coefficients);
+        let (m, n) = (record.m(), self.equations.len());
+        let mut responses: Vec<Option<Rc<Kernel>>> = part.response.iter().map(|_| None).collect();
+        let mut columns: Vec<Option<Vec<f64>>> = vec![None; jacobian.len()];
+        for (&coefficient, driven) in linear.iter().zip(&part.driven) {
+            columns[orders.len() + coefficient] = Some(driven.samples.clone());
+        }
+        let open: Vec<usize> = (0..columns.len()).filter(|&parameter| columns[parameter].is_none()).collect();
+        part.solved.inverse()?.each(
+            (n, m),
+            open.len(),
+            |place, rights| {
+                let parameter = open[place];
+                for (i, equation) in self.equations.iter().enumerate() {
+                    for (k, (signal, _, _)) in equation.terms.iter().enumerate() {
+                        let turns = parameter < orders.len();
+                        let weight = self.pull((i, k), point, parameter);
+                        if weight == 0.0 {
+                            continue;
+                        }
+                        let operator = &part.operators[i][k];
+                        if let Some(input) = parameter.checked_sub(orders.len() + coefficients.len()) {
+                            let slope = &part.acted[input].1;
+                            rights.add(i, weight, (operator, false), || Cow::Borrowed(slope), || shelf.spectrum(slope));
+                        } else if let Some(j) = self.unknown(i, *signal) {
+                            let (response, known) = (&part.response[j], &mut responses[j]);
+                            let made = || known.get_or_insert_with(|| shelf.spectrum(response)).clone();
+                            rights.add(i, weight, (operator, turns), || Cow::Borrowed(response), made);
+                        } else {
+                            let series = || Cow::Borrowed(self.drives(record, (*signal, operator.eta()), &part.acted));
+                            let made = || shelf.driver(self, experiment, (*signal, operator.eta()), &part.acted);
+                            rights.add(i, weight, (operator, turns), series, made);
+                        }
+                    }
+                    if parameter < orders.len() {
+                        if let Some(moved) =
+                            initial_slope(self, (i, parameter), orders, &initial[i], (experiment, shelf))?
+                        {
+                            let series = || Cow::Owned(shelf.filtered(&moved));
+                            rights.add_series(i, series, || shelf.filtered_spectrum(&moved));
+                        }
+                    }
+                }
+                Ok(())
+            },
+            |place, means| {
+                if let Some(means) = means {
+                    columns[open[place]] = Some(part.moved_by(open[place], means, (self, experiment, point))?.samples);
+                }
+                Ok(())
+            },
+        )?;
+        for (column, out) in columns.into_iter().zip(jacobian) {
+            match column {
+                None => out.extend(std::iter::repeat_n(0.0, n * experiment.compared())),
+                Some(mut column) => {
+                    project_out(&part.basis, &mut column);
+                    // Residuals fall where the response rises.
+                    out.extend(column.iter().map(|v| -v));
+                }
+            }
+        }
+        Ok(())
+    }
+
+    /// How a parameter moves the right-hand side by term k of equation i: the weight of the term's operator, of its
+    /// derivative for an order, of the slope of what drives for a number of an input.
+    fn pull(&self, (i, k): (usize, usize), point: &Point, parameter: usize) -> f64 {
+        let (equation, (orders, coefficients)) = (&self.equations[i], (&point.orders, &point.coefficients));
+        let (signal, order, monomial) = &equation.terms[k];
+        if let Some(input) = parameter.checked_sub(orders.len() + coefficients.len()) {
+            // It moves only what it drives: kernel and coefficient stay.
+            return if self.inputs[input].signal == *signal { monomial.at(coefficients) } else { 0.0 };
+        }
+        match parameter.checked_sub(orders.len()) {
+            Some(coefficient) => monomial.slope(coefficients, coefficient),
+            None => {
+                let of = |law: &AffineOrder| law.weights.get(parameter).copied().unwrap_or(0.0);
+                monomial.at(coefficients) * (of(&equation.order) - of(order))
+            }
+        }
+    }
+}
+
+/// How the initial terms of equation i move with a free order, weighted by their coefficients, before the filter; none if
+/// they do not.
+fn initial_slope(
+    model: &FreeModel,
+    (i, parameter): (usize, usize),
+    orders: &[f64],
+    values: &[f64],
+    (experiment, shelf): (&Experiment, &Shelf),
+) -> Result<Option<Vec<f64>>> {
+    // Exponents are sums of orders: any shift tells how they follow them.
+    const SHIFT: f64 = 1e-4;
+    if values.is_empty() || !model.initial.follows_orders() {
+        return Ok(None);
+    }
+    let exponents = |shift: f64| {
+        let mut moved = orders.to_vec();
+        moved[parameter] += shift;
+        model.exponents(experiment, i, &model.structures(&moved)[i])
+    };
+    let (below, here, above) = (exponents(-SHIFT), exponents(0.0), exponents(SHIFT));
+    if [&below, &here, &above].iter().any(|list| list.len() != values.len()) {
+        // An exponent appears or merges here: the projection follows it in the next evaluation.
+        return Ok(None);
+    }
+    let mut out = Vec::new();
+    for (k, (&exponent, &x)) in here.iter().zip(values).enumerate() {
+        let follows = (above[k] - below[k]) / (2.0 * SHIFT);
+        if follows.abs() < 1e-4 || x == 0.0 {
+            continue;
+        }
+        out.resize(experiment.record.m(), 0.0);
+        let power = shelf.power(exponent);
+        out.iter_mut().zip(power.slope()).for_each(|(v, slope)| *v += x * follows * slope);
+    }
+    Ok(Some(out).filter(|out| !out.is_empty()))
+}

@@ -1,0 +1,506 @@
+//! The free run of a model at a point, its residuals on every experiment, and the initial terms that are projected out.
+//!
+//! Coefficients in which the residuals are linear: those of what drives, once everything else is given.
+//!
+//! They are solved for at every point of the search (variable projection, Golub & Pereyra, doi:10.1137/0710036), so that
+//! only own terms, orders and inputs' numbers are searched: no sign to guess, no valley between what drives alike.
+//!
+//! What a free run leaves behind for the derivatives of its residuals.
+
+use std::borrow::Cow;
+use std::rc::Rc;
+
+use super::evaluation_cache::Shelf;
+use super::experiment::Experiment;
+use super::feedthrough::{add_slope, Direct, Early};
+use super::kink_correction::Corners;
+use super::parameterization::{Coordinate, FreeModel, Point};
+use super::system_inverse::{Means, Operator, Solved};
+use crate::equation::Structure;
+use crate::error::{Error, Result};
+use crate::estimation::least_squares;
+use crate::fractional::kernels::MAX_EXCESS;
+use crate::linalg::dense;
+use crate::linalg::orthogonal::{extend_orthonormal, norm, project_out};
+use crate::linalg::small::back_substitute;
+use crate::regressors::Record;
+use crate::series::{Buffers, Recursion, SumOfProducts};
+
+/// Own-output orders closer to α than this make the equation say that the output equals itself.
+const LEAST_INTEGRATION: f64 = 1e-3;
+
+/// An initial term whose response lies in the span of the others up to this share adds nothing to the projection.
+const SPANNED: f64 = 1e-12;
+
+/// Residuals at a point, and what their derivatives there are made of.
+pub(crate) struct Evaluation {
+    /// The point, with the best values of what the residuals are linear in.
+    pub(crate) point: Point,
+    pub(crate) residuals: Vec<f64>,
+    /// Norm of the weighted samples, of which the residuals are differences.
+    pub(crate) size: f64,
+    pub(crate) initial: Vec<Vec<Vec<f64>>>,
+    pub(crate) exponents: Vec<Vec<f64>>,
+    pub(crate) parts: Vec<Part>,
+}
+
+/// Response of an experiment to an initial term: its equation, weighted samples, pulse means; none of what moves nothing
+/// but the filter of an output.
+struct Free {
+    equation: usize,
+    samples: Vec<f64>,
+    means: Rc<Means>,
+}
+
+/// An experiment's free run before its initial terms are added.
+struct Answer {
+    part: Part,
+    residuals: Vec<f64>,
+    free: Vec<Free>,
+}
+
+impl FreeModel {
+    /// Residuals at a point, the coefficients that are named, in which they are linear, at their best (variable
+    /// projection, doi:10.1137/0710036).
+    pub(crate) fn evaluate(
+        &self,
+        experiments: &[Experiment],
+        shelves: &mut [Shelf],
+        point: &Point,
+        linear: &[usize],
+    ) -> Result<Evaluation> {
+        let structures = self.structures(&point.orders);
+        let mut out = Evaluation {
+            point: point.clone(),
+            residuals: Vec::new(),
+            size: 0.0,
+            initial: Vec::new(),
+            exponents: Vec::new(),
+            parts: Vec::with_capacity(experiments.len()),
+        };
+        let mut answers = Vec::with_capacity(experiments.len());
+        for (experiment, shelf) in experiments.iter().zip(shelves) {
+            answers.push(self.answer(experiment, shelf, &structures, point, linear, &mut out)?);
+        }
+        if !linear.is_empty() {
+            let sides: Vec<(&[f64], &Part)> = answers.iter().map(|a| (&a.residuals[..], &a.part)).collect();
+            let moves = best_moves(&sides)?;
+            linear.iter().zip(&moves).for_each(|(&j, by)| out.point.coefficients[j] += by);
+            for (answer, experiment) in answers.iter_mut().zip(experiments) {
+                let Part { driven, response, direct, acted, .. } = &mut answer.part;
+                for (column, by) in driven.iter_mut().zip(&moves) {
+                    column.moved(*by, &mut answer.residuals, response);
+                }
+                if direct.is_some() {
+                    *direct = Direct::of(self, experiment, &structures, &out.point, acted)?;
+                }
+            }
+        }
+        for answer in answers {
+            Self::add_initial(answer, structures.len(), &mut out)?;
+        }
+        Ok(out)
+    }
+
+    fn answer(
+        &self,
+        experiment: &Experiment,
+        shelf: &mut Shelf,
+        structures: &[Structure],
+        point: &Point,
+        linear: &[usize],
+        out: &mut Evaluation,
+    ) -> Result<Answer> {
+        let record = &experiment.record;
+        let acted = (self.inputs.iter().zip(&point.inputs))
+            .map(|(&input, &value)| self.acted(record, input, value))
+            .collect::<Result<Vec<_>>>()?;
+        let operators = self.operators(experiment, shelf, structures)?;
+        out.exponents = (structures.iter().enumerate()).map(|(i, s)| self.exponents(experiment, i, s)).collect();
+        let asked = out.exponents.iter().any(|list| !list.is_empty()) || !linear.is_empty();
+        let (response, solved) = self.response(experiment, shelf, &operators, point, &acted)?;
+        let mut residuals = experiment.measured();
+        out.size = out.size.hypot(residuals.iter().map(|v| v * v).sum::<f64>().sqrt());
+        let mut sampled = experiment.sampled(&response);
+        let early = Early::of(self, experiment, &acted);
+        early.correct(self, experiment, point, &mut sampled)?;
+        residuals.iter_mut().zip(sampled).for_each(|(e, v)| *e -= v);
+        let direct = Direct::of(self, experiment, structures, point, &acted)?;
+        if let Some(direct) = &direct {
+            residuals.iter_mut().zip(direct.samples(experiment)).for_each(|(e, v)| *e -= v);
+        }
+        let corners = Corners::of(self, experiment, structures);
+        if let Some(corners) = &corners {
+            let there = corners.samples(self, experiment, point, direct.as_ref());
+            residuals.iter_mut().zip(there).for_each(|(e, v)| *e -= v);
+        }
+        if let Some(index) = residuals.iter().position(|e| !e.is_finite()) {
+            return Err(Error::Diverged { what: "free run".into(), index });
+        }
+        let mut free = Vec::new();
+        let mut basis = Vec::new();
+        if asked {
+            let terms: Vec<(usize, f64)> =
+                out.exponents.iter().enumerate().flat_map(|(i, list)| list.iter().map(move |e| (i, *e))).collect();
+            let beside = |i: usize, e: f64| experiment.moves_filter(self.equations[i].output, e);
+            let moving: Vec<(usize, f64)> = terms.iter().filter(|&&(i, e)| !beside(i, e)).copied().collect();
+            let mut answers = shelf.natural(&solved, (structures.len(), record.m()), &moving)?.into_iter();
+            for (i, exponent) in terms {
+                let moves = if beside(i, exponent) { None } else { answers.next() };
+                let (samples, means) = match moves {
+                    None => (shelf.impulse(experiment, i, exponent), Rc::default()),
+                    Some(means) => {
+                        let mut samples = experiment.sampled(&cut(&means, record.m()));
+                        if experiment.own.is_some() {
+                            let corner = Corners::of_power(experiment, i, exponent);
+                            samples.iter_mut().zip(corner).for_each(|(v, c)| *v += c);
+                        }
+                        (samples, means)
+                    }
+                };
+                extend_orthonormal(&mut basis, samples.clone(), SPANNED);
+                free.push(Free { equation: i, samples, means });
+            }
+        }
+        let mut part = Part { solved, operators, response, basis, driven: Vec::new(), acted, direct, early, corners };
+        part.driven = self.driven_by(experiment, shelf, &part, point, linear)?;
+        Ok(Answer { part, residuals, free })
+    }
+
+    /// The integral of each term of each equation.
+    fn operators(
+        &self,
+        experiment: &Experiment,
+        shelf: &Shelf,
+        structures: &[Structure],
+    ) -> Result<Vec<Vec<Rc<Operator>>>> {
+        let mut operators = Vec::with_capacity(structures.len());
+        for (i, structure) in structures.iter().enumerate() {
+            let mut row = Vec::with_capacity(structure.terms.len());
+            for (k, term) in structure.terms.iter().enumerate() {
+                let eta = structure.order - term.order;
+                let held = experiment.instants.get(term.signal).is_some_and(|instant| instant.held);
+                let least = if term.signal == structure.output {
+                    LEAST_INTEGRATION
+                } else if held {
+                    // The derivative of a jump is infinite.
+                    0.0
+                } else {
+                    LEAST_INTEGRATION - MAX_EXCESS
+                };
+                if eta < least {
+                    // Reported like a step too far, so that the search shortens it.
+                    return Err(Error::Diverged { what: "order of a term above alpha; the free run".into(), index: 0 });
+                }
+                row.push(shelf.operator((i, k), eta, self.turns(i, k)));
+            }
+            operators.push(row);
+        }
+        Ok(operators)
+    }
+
+    /// Pulse means of the free run from rest, and what solves the equations.
+    fn response(
+        &self,
+        experiment: &Experiment,
+        shelf: &mut Shelf,
+        operators: &[Vec<Rc<Operator>>],
+        point: &Point,
+        acted: &[(Vec<f64>, Vec<f64>)],
+    ) -> Result<(Means, Rc<Solved>)> {
+        let (record, n) = (&experiment.record, operators.len());
+        let m = record.m();
+        let coefficient = |i: usize, k: usize| self.equations[i].terms[k].2.at(&point.coefficients);
+        let places = || operators.iter().enumerate().flat_map(|(i, row)| (0..row.len()).map(move |k| (i, k)));
+        let whole: Option<Vec<usize>> = operators.iter().flatten().map(|operator| operator.whole()).collect();
+        if let Some(orders) = whole {
+            let own = places().zip(&orders).filter_map(|((i, k), &order)| {
+                let j = self.unknown(i, self.equations[i].terms[k].0)?;
+                Some((i, j, order, coefficient(i, k)))
+            });
+            let highest = orders.iter().copied().max().unwrap_or(0);
+            let solved = Solved::of(Recursion::new(n, highest, record.step(), &own.collect::<Vec<_>>())?);
+            let mut response = vec![vec![0.0; m]; n];
+            solved.inverse()?.each(
+                (n, m),
+                1,
+                |_, rights| {
+                    for (i, k) in places() {
+                        let (signal, c) = (self.equations[i].terms[k].0, coefficient(i, k));
+                        if self.unknown(i, signal).is_none() && c != 0.0 {
+                            let eta = operators[i][k].eta();
+                            let series = || Cow::Borrowed(self.drives(record, (signal, eta), acted));
+                            rights.add(i, c, (&operators[i][k], false), series, || {
+                                shelf.driver(self, experiment, (signal, eta), acted)
+                            });
+                        }
+                    }
+                    Ok(())
+                },
+                |_, means| {
+                    means.into_iter().for_each(|means| response = means);
+                    Ok(())
+                },
+            )?;
+            return Ok((response, Rc::new(solved)));
+        }
+        let mut rhs = vec![vec![0.0; m]; n];
+        let mut sum = SumOfProducts::with_length(shelf.total);
+        let mut buffers = Buffers::default();
+        let mut bits = Vec::new();
+        for (i, row) in operators.iter().enumerate() {
+            let mut drives = false;
+            for (k, operator) in row.iter().enumerate() {
+                let (signal, c) = (self.equations[i].terms[k].0, coefficient(i, k));
+                if self.unknown(i, signal).is_some() {
+                    bits.extend([operator.eta().to_bits(), c.to_bits()]);
+                } else if c != 0.0 {
+                    drives = true;
+                    sum.add(
+                        c,
+                        &operator.spectrum(false),
+                        &shelf.driver(self, experiment, (signal, operator.eta()), acted),
+                    );
+                }
+            }
+            if drives {
+                sum.take(&mut rhs[i], &mut buffers);
+            }
+        }
+        let solved = shelf.solved(bits, || {
+            let mut matrix = vec![vec![vec![0.0; shelf.pulses()]; n]; n];
+            for (i, row) in operators.iter().enumerate() {
+                matrix[i][i][0] += 1.0;
+                for (k, operator) in row.iter().enumerate() {
+                    if let Some(j) = self.unknown(i, self.equations[i].terms[k].0) {
+                        let c = coefficient(i, k);
+                        matrix[i][j].iter_mut().zip(operator.kernel()).for_each(|(a, v)| *a -= c * v);
+                    }
+                }
+            }
+            Solved::by(matrix)
+        })?;
+        let response = solved.divided(&rhs)?;
+        let response = response.ok_or_else(|| Error::Internal { what: "equations that nothing divides".into() })?;
+        Ok((response, solved))
+    }
+
+    /// Pulse means of what drives a term that is integrated by `eta`: a signal of the record, or what an actuator makes of
+    /// it.
+    pub(crate) fn drives<'a>(
+        &self,
+        record: &'a Record,
+        (signal, eta): (usize, f64),
+        acted: &'a [(Vec<f64>, Vec<f64>)],
+    ) -> &'a [f64] {
+        self.law_of(signal).map_or_else(|| record.driver(signal, eta), |law| &acted[law].0)
+    }
+
+    /// Initial terms: the projection of the residuals on their responses.
+    fn add_initial(answer: Answer, equations: usize, out: &mut Evaluation) -> Result<()> {
+        let Answer { mut part, mut residuals, free } = answer;
+        let mut initial: Vec<Vec<f64>> = vec![Vec::new(); equations];
+        if !free.is_empty() {
+            let (places, columns): (Vec<_>, Vec<_>) =
+                free.into_iter().map(|Free { equation, samples, means }| ((equation, means), samples)).unzip();
+            let (values, _) = least_squares::solve(&columns, &residuals, 0)?;
+            for (((i, means), column), x) in places.iter().zip(&columns).zip(&values) {
+                initial[*i].push(*x);
+                residuals.iter_mut().zip(column).for_each(|(e, v)| *e -= x * v);
+                for (total, more) in part.response.iter_mut().zip(means.iter()) {
+                    total.iter_mut().zip(more).for_each(|(y, v)| *y += x * v);
+                }
+            }
+        }
+        out.residuals.extend(residuals);
+        out.initial.push(initial);
+        out.parts.push(part);
+        Ok(())
+    }
+
+    /// Whether a free order moves the order by which a term is integrated.
+    fn turns(&self, equation: usize, term: usize) -> bool {
+        let item = &self.equations[equation];
+        let of = |weights: &[f64], k: usize| weights.get(k).copied().unwrap_or(0.0);
+        (0..self.order_bounds.len()).any(|k| of(&item.order.weights, k) != of(&item.terms[term].1.weights, k))
+    }
+}
+
+/// The first m pulses of every unknown.
+fn cut(means: &Means, m: usize) -> Cow<'_, [Vec<f64>]> {
+    match means.iter().all(|row| row.len() == m) {
+        true => Cow::Borrowed(means),
+        false => means.iter().map(|row| row[..m.min(row.len())].to_vec()).collect::<Vec<_>>().into(),
+    }
+}
+
+/// What is not told from the rest by this share of its column stays where it was: there rounding is as large.
+const UNTOLD: f64 = 1e-7;
+
+impl FreeModel {
+    /// Coefficients that stand alone, once, and before nothing but what drives from outside.
+    pub(crate) fn linear(&self) -> Vec<usize> {
+        let stands = |j: usize| {
+            let mut found = false;
+            for (i, equation) in self.equations.iter().enumerate() {
+                for (signal, _, monomial) in &equation.terms {
+                    if monomial.powers.iter().any(|&(k, _)| k == j) {
+                        if monomial.powers != [(j, 1)] || self.unknown(i, *signal).is_some() {
+                            return false;
+                        }
+                        found = true;
+                    }
+                }
+            }
+            found
+        };
+        let moves = |j: usize| matches!(self.coordinates[j], Coordinate::Plain | Coordinate::Logarithm);
+        (0..self.coordinates.len()).filter(|&j| moves(j) && stands(j)).collect()
+    }
+
+    /// What one more of each coefficient does that stands before what drives.
+    pub(crate) fn driven_by(
+        &self,
+        experiment: &Experiment,
+        shelf: &mut Shelf,
+        part: &Part,
+        point: &Point,
+        coefficients: &[usize],
+    ) -> Result<Vec<Driven>> {
+        if coefficients.is_empty() {
+            return Ok(Vec::new());
+        }
+        let (record, n) = (&experiment.record, self.equations.len());
+        let mut driven = Vec::with_capacity(coefficients.len());
+        part.solved.inverse()?.each(
+            (n, record.m()),
+            coefficients.len(),
+            |place, rights| {
+                for (i, equation) in self.equations.iter().enumerate() {
+                    for (k, (signal, _, monomial)) in equation.terms.iter().enumerate() {
+                        let weight = monomial.slope(&point.coefficients, coefficients[place]);
+                        if weight != 0.0 {
+                            let eta = part.operators[i][k].eta();
+                            let series = || Cow::Borrowed(self.drives(record, (*signal, eta), &part.acted));
+                            rights.add(i, weight, (&part.operators[i][k], false), series, || {
+                                shelf.driver(self, experiment, (*signal, eta), &part.acted)
+                            });
+                        }
+                    }
+                }
+                Ok(())
+            },
+            |place, means| {
+                let parameter = point.orders.len() + coefficients[place];
+                let means = means.unwrap_or_else(|| vec![vec![0.0; record.m()]; n]);
+                let found = part.moved_by(parameter, means, (self, experiment, point))?;
+                if let Some(index) = found.samples.iter().position(|v| !v.is_finite()) {
+                    return Err(Error::Diverged { what: "free run".into(), index });
+                }
+                driven.push(found);
+                Ok(())
+            },
+        )?;
+        Ok(driven)
+    }
+}
+
+/// How far linear coefficients move to where the residuals of all experiments are least, each experiment's initial terms
+/// projected out.
+pub(crate) fn best_moves(sides: &[(&[f64], &Part)]) -> Result<Vec<f64>> {
+    let count = sides.first().map_or(0, |(_, part)| part.driven.len());
+    let mut columns: Vec<Vec<f64>> = vec![Vec::new(); count + 1];
+    for (residuals, run) in sides {
+        for (column, part) in columns.iter_mut().zip(run.driven.iter().map(|d| &d.samples[..]).chain([*residuals])) {
+            let first = column.len();
+            column.extend_from_slice(part);
+            project_out(&run.basis, &mut column[first..]);
+        }
+    }
+    let mut scales = Vec::with_capacity(count);
+    for (place, column) in columns.iter_mut().enumerate() {
+        let size = norm(column);
+        if place < count {
+            let scale = if size > 0.0 && size.is_finite() { 1.0 / size } else { 0.0 };
+            column.iter_mut().for_each(|v| *v *= scale);
+            scales.push(scale);
+        }
+        let rows = column.len();
+        column.resize(rows + count, 0.0);
+        if place < count {
+            column[rows + place] = UNTOLD;
+        }
+    }
+    let r = dense::triangular_factor(&columns);
+    let stride = count + 1;
+    let rhs: Vec<f64> = (0..count).map(|i| r[i * stride + count]).collect();
+    let moves: Vec<f64> = back_substitute(&r, stride, &rhs).iter().zip(&scales).map(|(s, scale)| s * scale).collect();
+    match moves.iter().position(|v| !v.is_finite()) {
+        Some(index) => Err(Error::Diverged { what: "linear coefficient".into(), index }),
+        None => Ok(moves),
+    }
+}
+
+/// What one experiment leaves behind for its sensitivities.
+pub(crate) struct Part {
+    /// What solves the equations.
+    pub(crate) solved: Rc<Solved>,
+    /// Of each term of each equation.
+    pub(crate) operators: Vec<Vec<Rc<Operator>>>,
+    /// Simulated pulse means, initial terms included.
+    pub(crate) response: Vec<Vec<f64>>,
+    /// Orthonormal basis of the sampled responses to the initial terms.
+    pub(crate) basis: Vec<Vec<f64>>,
+    /// What each coefficient does that the residuals are linear in.
+    pub(crate) driven: Vec<Driven>,
+    /// Pulse means of each input with a free number once it acts, and their derivative with respect to it.
+    pub(crate) acted: Vec<(Vec<f64>, Vec<f64>)>,
+    /// What feeds through at once.
+    pub(crate) direct: Option<Direct>,
+    /// What pulses see too early.
+    pub(crate) early: Early,
+    /// Corners near samples that were read at times of their own.
+    pub(crate) corners: Option<Corners>,
+}
+
+impl Part {
+    /// What one more of a parameter does to weighted samples, from what it does to pulse means. Orders come first among
+    /// the parameters, coefficients next, numbers of inputs last.
+    pub(crate) fn moved_by(
+        &self,
+        parameter: usize,
+        means: Vec<Vec<f64>>,
+        (model, experiment, point): (&FreeModel, &Experiment, &Point),
+    ) -> Result<Driven> {
+        let mut samples = experiment.sampled(&means);
+        self.early.correct_slope(model, experiment, point, parameter, &mut samples)?;
+        if let Some(direct) = &self.direct {
+            add_slope(model, experiment, direct, point, parameter, &mut samples);
+        }
+        if let Some(corners) = &self.corners {
+            corners.add_slope(model, experiment, self.direct.as_ref(), point, parameter, &mut samples);
+        }
+        Ok(Driven { samples, means })
+    }
+}
+
+/// What a coefficient of 1 more does to an experiment.
+pub(crate) struct Driven {
+    /// To its weighted samples.
+    pub(crate) samples: Vec<f64>,
+    /// To the pulse means of each output; empty once it was moved.
+    pub(crate) means: Vec<Vec<f64>>,
+}
+
+impl Driven {
+    /// Moves the coefficient: residuals and pulse means follow.
+    pub(crate) fn moved(&mut self, by: f64, residuals: &mut [f64], response: &mut [Vec<f64>]) {
+        if by != 0.0 {
+            residuals.iter_mut().zip(&self.samples).for_each(|(e, v)| *e -= by * v);
+            for (total, more) in response.iter_mut().zip(&self.means) {
+                total.iter_mut().zip(more).for_each(|(y, v)| *y += by * v);
+            }
+        }
+        self.means = Vec::new();
+    }
+}

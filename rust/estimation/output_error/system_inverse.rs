@@ -1,0 +1,409 @@
+//! A⁻¹ of the equations of one experiment, applied to any right-hand side: by products of spectra, or by running sums where
+//! every order of integration is whole and stays so.
+//!
+//! The integral of a term and the power of t of an initial term, with spectra that are made when they are asked for.
+
+use std::borrow::Cow;
+use std::cell::{OnceCell, RefCell};
+use std::collections::HashMap;
+use std::rc::Rc;
+
+use crate::error::{Error, Result};
+use crate::fractional::kernels::{
+    kernel, kernel_with_derivative, power_means, power_means_slope, power_pulses, power_pulses_slope,
+};
+use crate::series::{multiply, Buffers, Kernel, Recursion, Solver, Source, SumOfProducts, ABREAST, MAX_SUMS};
+
+/// A⁻¹ at a point.
+pub(crate) enum Inverse {
+    /// Spectra of its entries, and points of all series that are multiplied together.
+    Spectra { rows: Vec<Vec<Kernel>>, total: usize },
+    /// Running sums, one solution a right-hand side.
+    Sums(Recursion),
+}
+
+/// What stands on the right-hand sides of the equations: integrals of signals, added up.
+pub(crate) enum Rights<'a> {
+    /// Of each equation, and whether anything was added.
+    Spectra(Vec<(bool, SumOfProducts)>),
+    /// Equation, order, weight and signal of each.
+    Sums(Vec<(usize, usize, f64, Cow<'a, [f64]>)>),
+}
+
+impl<'a> Rights<'a> {
+    /// Forgets what was added.
+    pub(crate) fn clear(&mut self) {
+        match self {
+            Self::Spectra(rights) => {
+                for (used, right) in rights.iter_mut().filter(|(used, _)| *used) {
+                    right.clear();
+                    *used = false;
+                }
+            }
+            Self::Sums(sources) => sources.clear(),
+        }
+    }
+
+    /// Whether anything was added.
+    pub(crate) fn moves(&self) -> bool {
+        match self {
+            Self::Spectra(rights) => rights.iter().any(|(used, _)| *used),
+            Self::Sums(sources) => !sources.is_empty(),
+        }
+    }
+
+    /// What an inverse by spectra makes of it.
+    fn through(
+        &self,
+        rows: &[Vec<Kernel>],
+        m: usize,
+        target: &mut SumOfProducts,
+        buffers: &mut Buffers,
+    ) -> Option<Vec<Vec<f64>>> {
+        let Self::Spectra(rights) = self else { return None };
+        let of_row = |row: &Vec<Kernel>| {
+            let moved = row.iter().zip(rights).filter(|(_, (used, _))| *used);
+            moved.for_each(|(entry, (_, right))| target.add_product(right, entry));
+            let mut means = vec![0.0; m];
+            target.take(&mut means, buffers);
+            means
+        };
+        self.moves().then(|| rows.iter().map(of_row).collect())
+    }
+
+    /// What running sums take.
+    fn sources(&self) -> Vec<Source<'_>> {
+        let Self::Sums(sources) = self else { return Vec::new() };
+        (sources.iter())
+            .map(|(equation, order, weight, series)| Source {
+                equation: *equation,
+                order: *order,
+                weight: *weight,
+                series,
+            })
+            .collect()
+    }
+
+    /// Adds an operator, or with `slope` its derivative with respect to its order, of a signal; its spectrum is asked for
+    /// only where it is needed, and so is its series.
+    pub(crate) fn add(
+        &mut self,
+        equation: usize,
+        weight: f64,
+        (operator, slope): (&Operator, bool),
+        series: impl FnOnce() -> Cow<'a, [f64]>,
+        spectrum: impl FnOnce() -> Rc<Kernel>,
+    ) {
+        match self {
+            Self::Spectra(rights) => {
+                let (used, right) = &mut rights[equation];
+                *used = true;
+                right.add(weight, &operator.spectrum(slope), &spectrum());
+            }
+            Self::Sums(sources) => {
+                // Orders that are whole here stay so, and have no slope.
+                sources.extend(operator.whole().filter(|_| !slope).map(|order| (equation, order, weight, series())));
+            }
+        }
+    }
+
+    /// Adds a series as it is; of it and its spectrum that is asked for which is needed.
+    pub(crate) fn add_series(
+        &mut self,
+        equation: usize,
+        series: impl FnOnce() -> Cow<'a, [f64]>,
+        spectrum: impl FnOnce() -> Rc<Kernel>,
+    ) {
+        match self {
+            Self::Spectra(rights) => {
+                let (used, right) = &mut rights[equation];
+                *used = true;
+                right.add_series(&spectrum());
+            }
+            Self::Sums(sources) => sources.push((equation, 0, 1.0, series())),
+        }
+    }
+}
+
+/// Pulse means of every unknown.
+pub(crate) type Means = Vec<Vec<f64>>;
+
+/// The equations A y = b at a point, for right-hand sides as long as the longest run or shorter.
+pub(crate) struct Solved {
+    /// What divides by A; none where running sums do.
+    solver: Option<RefCell<Solver<'static>>>,
+    inverse: OnceCell<Inverse>,
+    /// Answers to initial terms, by equation and bits of the exponent, where several runs ask for them.
+    natural: RefCell<HashMap<(usize, u64), Rc<Means>>>,
+}
+
+impl Solved {
+    /// Of A, entry by entry.
+    ///
+    /// # Errors
+    /// As [`Solver::new`].
+    pub(crate) fn by(matrix: Vec<Vec<Vec<f64>>>) -> Result<Self> {
+        let solver = Some(RefCell::new(Solver::keeping(matrix)?));
+        Ok(Self { solver, inverse: OnceCell::new(), natural: RefCell::default() })
+    }
+
+    /// Of running sums.
+    pub(crate) fn of(sums: Recursion) -> Self {
+        Self { solver: None, inverse: OnceCell::from(Inverse::Sums(sums)), natural: RefCell::default() }
+    }
+
+    /// y by division, exact whether or not A⁻¹ grows; none where running sums solve.
+    ///
+    /// # Errors
+    /// As [`Solver::solve`].
+    pub(crate) fn divided(&self, rhs: &[Vec<f64>]) -> Result<Option<Means>> {
+        self.solver.as_ref().map(|solver| solver.borrow_mut().solve(rhs)).transpose()
+    }
+
+    /// A⁻¹, its spectra for products of [`FACTORS`] series of the longest run.
+    ///
+    /// # Errors
+    /// As [`Solver::solve`].
+    pub(crate) fn inverse(&self) -> Result<&Inverse> {
+        if let (None, Some(solver)) = (self.inverse.get(), &self.solver) {
+            let mut solver = solver.borrow_mut();
+            let total = FACTORS * solver.terms();
+            let rows = solver.inverse_spectra(total)?;
+            return Ok(self.inverse.get_or_init(|| Inverse::Spectra { rows, total }));
+        }
+        self.inverse.get().ok_or_else(|| Error::Internal { what: "equations that nothing solves".into() })
+    }
+
+    /// Answers to the powers t^e of equations, m pulses of n unknowns; to be made once where they are kept.
+    ///
+    /// # Errors
+    /// As [`Solver::solve`].
+    pub(crate) fn natural(
+        &self,
+        (n, m): (usize, usize),
+        terms: &[(usize, f64)],
+        keep: bool,
+        power: impl Fn(f64) -> Rc<Power>,
+    ) -> Result<Vec<Rc<Means>>> {
+        let key = |&(i, e): &(usize, f64)| (i, e.to_bits());
+        let open: Vec<(usize, f64)> =
+            terms.iter().filter(|t| !self.natural.borrow().contains_key(&key(t))).copied().collect();
+        let powers: Vec<Rc<Power>> = open.iter().map(|&(_, e)| power(e)).collect();
+        let mut made = HashMap::new();
+        self.inverse()?.each(
+            (n, m),
+            open.len(),
+            |place, rights| {
+                let power = &powers[place];
+                rights.add_series(open[place].0, || Cow::Borrowed(power.series()), || power.spectrum());
+                Ok(())
+            },
+            |place, means| {
+                made.insert(key(&open[place]), Rc::new(means.unwrap_or_default()));
+                Ok(())
+            },
+        )?;
+        let mut kept = self.natural.borrow_mut();
+        let answers = terms.iter().filter_map(|t| kept.get(&key(t)).or_else(|| made.get(&key(t))).cloned()).collect();
+        if keep {
+            kept.extend(made);
+        }
+        Ok(answers)
+    }
+}
+
+impl Inverse {
+    /// For each of `count` right-hand sides, as `given` adds it up, the pulse means of each unknown to `taken`; none where
+    /// nothing was added.
+    ///
+    /// # Errors
+    /// Those of `given` and `taken`.
+    pub(crate) fn each<'a>(
+        &self,
+        (n, m): (usize, usize),
+        count: usize,
+        mut given: impl FnMut(usize, &mut Rights<'a>) -> Result<()>,
+        mut taken: impl FnMut(usize, Option<Vec<Vec<f64>>>) -> Result<()>,
+    ) -> Result<()> {
+        match self {
+            Self::Spectra { rows, total } => {
+                let sum = || (false, SumOfProducts::with_length(*total));
+                let mut rights = Rights::Spectra((0..n).map(|_| sum()).collect());
+                let mut target = SumOfProducts::with_length(*total);
+                let mut buffers = Buffers::default();
+                for place in 0..count {
+                    given(place, &mut rights)?;
+                    taken(place, rights.through(rows, m, &mut target, &mut buffers))?;
+                    rights.clear();
+                }
+            }
+            Self::Sums(recursion) => {
+                for first in (0..count).step_by(ABREAST) {
+                    let mut lists = Vec::with_capacity(ABREAST);
+                    for place in first..(first + ABREAST).min(count) {
+                        let mut rights = Rights::Sums(Vec::new());
+                        given(place, &mut rights)?;
+                        lists.push(rights);
+                    }
+                    let sources: Vec<Vec<Source>> = lists.iter().map(Rights::sources).collect();
+                    for (place, (means, rights)) in (first..).zip(recursion.solve(m, &sources)?.into_iter().zip(&lists))
+                    {
+                        taken(place, rights.moves().then_some(means))?;
+                    }
+                }
+            }
+        }
+        Ok(())
+    }
+}
+
+/// Terms of a product of three series of m terms: spectra of this length multiply without wrapping onto the first m.
+pub(crate) const FACTORS: usize = 3;
+
+/// Spectra of longer records are made anew each time: those of all terms together would be many times the record.
+pub(crate) const KEPT_PULSES: usize = 1 << 15;
+
+/// How near to a whole number an order of integration is one: the kernels differ by as much.
+const WHOLE: f64 = 1e-12;
+
+/// The integral of a term: its kernel, and the kernel's derivative with respect to its order where the order is free.
+pub(crate) struct Operator {
+    eta: f64,
+    free: bool,
+    m: usize,
+    step: f64,
+    /// Kernel and, of an order above 0, its derivative, once they are asked for.
+    series: OnceCell<(Vec<f64>, Vec<f64>)>,
+    spectra: [OnceCell<Rc<Kernel>>; 2],
+}
+
+impl Operator {
+    /// That integrates by `eta` on a grid of m pulses; its order may be free.
+    pub(crate) fn new(eta: f64, free: bool, m: usize, step: f64) -> Self {
+        Self { eta, free, m, step, series: OnceCell::new(), spectra: [OnceCell::new(), OnceCell::new()] }
+    }
+
+    fn series(&self) -> &(Vec<f64>, Vec<f64>) {
+        self.series.get_or_init(|| match self.free && self.eta >= 0.0 {
+            true => kernel_with_derivative(self.eta, self.m, self.step),
+            false => (kernel(self.eta, self.m, self.step), Vec::new()),
+        })
+    }
+
+    /// The spectrum of the kernel's derivative. Below order 0 that is a product of three, which no rejected step asks for.
+    fn slope(&self) -> Kernel {
+        let total = FACTORS * self.m;
+        if self.eta >= 0.0 || !self.free {
+            return Kernel::with_length(&self.series().1, total);
+        }
+        // d/dη of 1/F(−η) is F′(−η)/F(−η)².
+        let (_, turned) = kernel_with_derivative(-self.eta, self.m, self.step);
+        let (mut product, made) = (Kernel::with_length(&turned, total), self.spectrum(false));
+        product.multiply(&made);
+        let mut slope = vec![0.0; self.m];
+        product.times(&made, &mut slope, &mut Buffers::default());
+        Kernel::with_length(&slope, total)
+    }
+
+    /// The order of the integral.
+    pub(crate) fn eta(&self) -> f64 {
+        self.eta
+    }
+
+    /// Whether it is the integral of this order, with or without a derivative.
+    pub(crate) fn serves(&self, eta: f64, free: bool) -> bool {
+        self.eta.to_bits() == eta.to_bits() && self.free == free
+    }
+
+    /// Of the integral.
+    pub(crate) fn kernel(&self) -> &[f64] {
+        &self.series().0
+    }
+
+    /// The order of the integral where it is whole and stays so.
+    #[allow(clippy::cast_possible_truncation, clippy::cast_sign_loss)]
+    pub(crate) fn whole(&self) -> Option<usize> {
+        let near = self.eta.round();
+        let stays = !self.free && (self.eta - near).abs() <= WHOLE && near >= 0.0;
+        (stays && near <= MAX_SUMS as f64).then_some(near as usize)
+    }
+
+    /// The spectrum of the kernel, or of its derivative, for products of [`FACTORS`] series.
+    pub(crate) fn spectrum(&self, slope: bool) -> Rc<Kernel> {
+        let made = || Rc::new(if slope { self.slope() } else { Kernel::with_length(self.kernel(), FACTORS * self.m) });
+        if self.m > KEPT_PULSES {
+            return made();
+        }
+        self.spectra[usize::from(slope)].get_or_init(made).clone()
+    }
+}
+
+/// What an initial term t^e adds, behind the filter that all signals pass, and how that turns with its exponent.
+pub(crate) struct Power {
+    exponent: f64,
+    step: f64,
+    filter: Option<Rc<Filter>>,
+    raw: Vec<f64>,
+    series: OnceCell<Vec<f64>>,
+    spectrum: OnceCell<Rc<Kernel>>,
+    slope: OnceCell<Vec<f64>>,
+}
+
+/// A filter with its spectrum for products of [`FACTORS`] series.
+pub(crate) struct Filter {
+    series: Vec<f64>,
+    spectrum: Kernel,
+}
+
+impl Filter {
+    /// Of its series.
+    pub(crate) fn new(series: &[f64]) -> Self {
+        Self { series: series.to_vec(), spectrum: Kernel::with_length(series, FACTORS * series.len()) }
+    }
+
+    /// What it makes of a series.
+    pub(crate) fn of(&self, series: &[f64]) -> Vec<f64> {
+        multiply(&self.series, series, series.len())
+    }
+}
+
+impl Power {
+    /// On a grid of m pulses.
+    pub(crate) fn new(exponent: f64, m: usize, step: f64, filter: Option<Rc<Filter>>) -> Self {
+        let raw = if filter.is_some() { power_pulses(exponent, m, step) } else { power_means(exponent, m, step) };
+        let (series, spectrum, slope) = Default::default();
+        Self { exponent, step, filter, raw, series, spectrum, slope }
+    }
+
+    /// Pulse means.
+    pub(crate) fn series(&self) -> &[f64] {
+        match &self.filter {
+            None => &self.raw,
+            Some(filter) => self.series.get_or_init(|| filter.of(&self.raw)),
+        }
+    }
+
+    /// The derivative of t^e with respect to e, before the filter.
+    pub(crate) fn slope(&self) -> &[f64] {
+        let of = if self.filter.is_some() { power_pulses_slope } else { power_means_slope };
+        self.slope.get_or_init(|| of(self.exponent, self.raw.len(), self.step))
+    }
+
+    /// Their spectrum, for a product with one more series.
+    pub(crate) fn spectrum(&self) -> Rc<Kernel> {
+        let made = || Rc::new(filtered_spectrum(&self.raw, self.filter.as_deref(), FACTORS * self.raw.len()));
+        if self.raw.len() > KEPT_PULSES {
+            return made();
+        }
+        self.spectrum.get_or_init(made).clone()
+    }
+}
+
+/// The spectrum of a series that passes a filter, for products of so many terms in all.
+pub(crate) fn filtered_spectrum(series: &[f64], filter: Option<&Filter>, total: usize) -> Kernel {
+    let mut spectrum = Kernel::with_length(series, total);
+    if let Some(filter) = filter {
+        spectrum.multiply(&filter.spectrum);
+    }
+    spectrum
+}

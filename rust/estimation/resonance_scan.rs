@@ -1,0 +1,182 @@
+//! Output errors of an equation whose own terms are known: all else follows by linear least squares on them.
+
+use super::least_squares::{solve, Regression};
+use crate::equation::{Initial, Structure};
+use crate::error::{check_finite, check_length, Result};
+use crate::fractional::kernels::{block_pulse_kernel, check_order};
+use crate::linalg::orthogonal::{extend_orthonormal, norm, project_out};
+use crate::regressors::Record;
+use crate::series::{reciprocal, Buffers, Kernel};
+
+/// Of an initial term's answer, the share outside the span of others below which it adds nothing.
+const SPANNED: f64 = 1e-12;
+/// A column of which initial terms leave less than this share is solved for beside them.
+const LEFT: f64 = 1e-6;
+
+/// The best that an equation with given own terms comes to.
+#[derive(Debug, Clone, PartialEq)]
+pub struct Projected {
+    /// Root mean square output error as a share of the output's size.
+    pub error: f64,
+    /// One a term of the structure; fixed ones as given.
+    pub coefficients: Vec<f64>,
+}
+
+/// The parts of the regression of one record, each with its spectrum.
+struct Part {
+    target: Vec<f64>,
+    terms: Vec<Kernel>,
+    initial: Vec<Kernel>,
+    /// Kernels of the own terms.
+    own: Vec<Vec<f64>>,
+}
+
+/// What least squares on the output error makes of the terms of `structure`, none of which is its own output's, and of the
+/// initial terms, beside own terms that are integrated by `own` and have the coefficients of each point; none where the
+/// own terms, or the answers to them, are no numbers on this step, or where a free term is a combination of others.
+///
+/// Integrals of signals, powers of t and kernels are made once. O(points · columns · m log m).
+///
+/// # Errors
+/// As [`Regression::new`]; an order of `own` out of range; a point with another number of coefficients.
+///
+/// ```
+/// # fn main() -> ftlm::error::Result<()> {
+/// use ftlm::equation::{Equation, Initial, Structure, Term};
+/// use ftlm::estimation::resonance_scan;
+/// use ftlm::regressors::Record;
+/// // D^2 y = -9 y + 2 u.
+/// let terms = vec![Term { signal: 0, order: 0.0 }, Term { signal: 1, order: 0.0 }];
+/// let plant = Equation::new(Structure { output: 0, order: 2.0, terms }, vec![-9.0, 2.0])?;
+/// let input: Vec<f64> = (0..300).map(|k| f64::from(k % 40 / 20)).collect();
+/// let rest = Record::new(0.02, vec![vec![0.0; 300], input.clone()], None)?;
+/// let y = ftlm::simulate::respond(&[plant], &rest, &[])?.remove(0);
+/// let run = Record::new(0.02, vec![y, input], None)?;
+/// let driven = Structure { output: 0, order: 2.0, terms: vec![Term { signal: 1, order: 0.0 }] };
+/// let found = resonance_scan::projected(&[run], &driven, &[None], &Initial::Rest, &[2.0], &[vec![-4.0], vec![-9.0]])?;
+/// let errors: Vec<f64> = found.iter().flatten().map(|one| one.error).collect();
+/// assert!(errors.len() == 2 && errors[0] > 0.1 && errors[1] < 1e-9);
+/// # Ok(())
+/// # }
+/// ```
+pub fn projected(
+    records: &[Record],
+    structure: &Structure,
+    fixed: &[Option<f64>],
+    initial: &Initial,
+    own: &[f64],
+    points: &[Vec<f64>],
+) -> Result<Vec<Option<Projected>>> {
+    check_length("fixed coefficients", structure.terms.len(), fixed.len())?;
+    check_finite("fixed coefficients", &fixed.iter().flatten().copied().collect::<Vec<_>>())?;
+    own.iter().try_for_each(|&eta| check_order("integration of an own term", eta))?;
+    points.iter().try_for_each(|point| check_length("coefficients of a point", own.len(), point.len()))?;
+    let regression = Regression::new(records, structure, &vec![None; fixed.len()], initial)?;
+    // What is a combination of others drives as one, and own terms leave no more than rounding between the two.
+    if solve(&regression.columns[..regression.free()], &regression.target, regression.free()).is_err() {
+        return Ok(vec![None; points.len()]);
+    }
+    let parts: Vec<Part> = (records.iter().enumerate()).map(|(r, record)| part(&regression, own, r, record)).collect();
+    let size = norm(&regression.target).max(1e-300);
+    points.iter().map(|point| at(&parts, fixed, point, size)).collect()
+}
+
+fn part(regression: &Regression, own: &[f64], r: usize, record: &Record) -> Part {
+    let rows = regression.starts[r]..regression.starts[r + 1];
+    let of = |column: &Vec<f64>| Kernel::new(&column[rows.clone()]);
+    let (terms, initial) = regression.columns.split_at(regression.free());
+    let each = initial.len() / (regression.starts.len() - 1);
+    Part {
+        target: regression.target[rows.clone()].to_vec(),
+        terms: terms.iter().map(of).collect(),
+        initial: initial[r * each..(r + 1) * each].iter().map(of).collect(),
+        own: own.iter().map(|&eta| block_pulse_kernel(eta, record.m(), record.step())).collect(),
+    }
+}
+
+/// One point: the answers of each record, before its initial terms are projected out.
+fn at(parts: &[Part], fixed: &[Option<f64>], point: &[f64], size: f64) -> Result<Option<Projected>> {
+    let mut buffers = Buffers::default();
+    let mut target: Vec<f64> = Vec::new();
+    let mut columns: Vec<Vec<f64>> = vec![Vec::new(); fixed.iter().filter(|f| f.is_none()).count()];
+    let mut starts = Vec::with_capacity(parts.len());
+    for part in parts {
+        let m = part.target.len();
+        let mut divisor = vec![0.0; m];
+        divisor[0] = 1.0;
+        for (c, kernel) in point.iter().zip(&part.own) {
+            divisor.iter_mut().zip(kernel).for_each(|(d, v)| *d -= c * v);
+        }
+        let response = reciprocal(&divisor);
+        if response.iter().any(|v| !v.is_finite()) {
+            return Ok(None);
+        }
+        let response = Kernel::new(&response);
+        let mut through = |series: &Kernel| {
+            let mut out = vec![0.0; m];
+            response.times(series, &mut out, &mut buffers);
+            out
+        };
+        let mut left = part.target.clone();
+        let mut free = columns.iter_mut();
+        for (series, known) in part.terms.iter().zip(fixed) {
+            let answer = through(series);
+            match known {
+                Some(c) => left.iter_mut().zip(&answer).for_each(|(t, v)| *t -= c * v),
+                None => free.next().into_iter().for_each(|column| column.extend(&answer)),
+            }
+        }
+        target.extend(left);
+        starts.push(part.initial.iter().map(&mut through).collect::<Vec<_>>());
+    }
+    let finite = |v: &[f64]| v.iter().all(|x| x.is_finite());
+    if !finite(&target) || !columns.iter().all(|c| finite(c)) || !starts.iter().flatten().all(|c| finite(c)) {
+        return Ok(None);
+    }
+    let Some((values, missed)) = solved(columns, target, starts) else { return Ok(None) };
+    let mut values = values.into_iter();
+    let coefficients = fixed.iter().map(|f| f.or_else(|| values.next()).unwrap_or(f64::NAN)).collect();
+    Ok(Some(Projected { error: missed / size, coefficients }))
+}
+
+/// Coefficients of the columns beside initial terms of each record, and the norm of what is left; none where they are not
+/// determined.
+fn solved(columns: Vec<Vec<f64>>, target: Vec<f64>, starts: Vec<Vec<Vec<f64>>>) -> Option<(Vec<f64>, f64)> {
+    let lengths: Vec<usize> = starts.iter().map(|own| own.first().map_or(0, Vec::len)).collect();
+    let free = columns.len();
+    let (mut less, mut left) = (columns.clone(), target.clone());
+    let mut from = 0;
+    for (own, &m) in starts.iter().zip(&lengths) {
+        let mut basis = Vec::new();
+        own.iter().for_each(|column| extend_orthonormal(&mut basis, column.clone(), SPANNED));
+        for series in less.iter_mut().chain(std::iter::once(&mut left)) {
+            let rows = &mut series[from..from + m];
+            project_out(&basis, rows);
+            project_out(&basis, rows);
+        }
+        from += m;
+    }
+    let told = less.iter().zip(&columns).all(|(less, whole)| norm(less) > LEFT * norm(whole));
+    let (columns, target) = if told { (less, left) } else { (beside(columns, &starts, &lengths), target) };
+    let (x, _) = solve(&columns, &target, free).ok()?;
+    let mut missed = target;
+    for (column, c) in columns.iter().zip(&x) {
+        missed.iter_mut().zip(column).for_each(|(e, v)| *e -= c * v);
+    }
+    Some((x, norm(&missed)))
+}
+
+/// Columns with those of initial terms behind them, each as long as all records.
+fn beside(mut columns: Vec<Vec<f64>>, starts: &[Vec<Vec<f64>>], lengths: &[usize]) -> Vec<Vec<f64>> {
+    let rows = lengths.iter().sum();
+    let mut from = 0;
+    for (own, &m) in starts.iter().zip(lengths) {
+        for series in own {
+            let mut column = vec![0.0; rows];
+            column[from..from + m].copy_from_slice(series);
+            columns.push(column);
+        }
+        from += m;
+    }
+    columns
+}

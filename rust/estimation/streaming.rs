@@ -1,0 +1,256 @@
+//! Recursion (44) while a run is recorded: rows in the order of time, each new one in constant time.
+//!
+//! A new row needs the fractional integrals of every signal at the newest pulse, which depend on the whole past. The
+//! newest two pulses enter by the exact kernel (32); what is older has lag of at least one pulse and enters through
+//! the exponentials of [`crate::fractional::exponential_sum`], exact to rounding. An order above 1 is a running
+//! integral of the order less one. So a row costs O((signals + terms)·rates + p k² + k³), whatever the length of the
+//! run.
+
+use crate::equation::Structure;
+use crate::error::{check_finite, check_length, check_step, Error, Result};
+use crate::estimation::multi_innovation::{Innovation, Rows};
+use crate::fractional::exponential_sum::{decay, Rates};
+use crate::fractional::kernels::block_pulse_kernel;
+use crate::linalg::small::Recursion;
+
+/// Accuracy of the memory: at the rounding of the batch form's transforms.
+const TOLERANCE: f64 = 2e-15;
+
+/// The state of one signal: exponentials of all pulses but the newest two, and the last pulse.
+#[derive(Debug, Clone)]
+struct Past {
+    states: Vec<f64>,
+    last: f64,
+}
+
+/// I^η of one signal at the newest pulse.
+#[derive(Debug, Clone)]
+struct Integral {
+    signal: usize,
+    /// On the newest pulse and the one before it.
+    near: [f64; 2],
+    far: Vec<f64>,
+    /// For orders above 1: the integral of the order less one, and its running integral so far.
+    inner: Option<Box<(Integral, f64)>>,
+    step: f64,
+}
+
+impl Integral {
+    fn new(signal: usize, eta: f64, step: f64, rates: &Rates) -> Result<Self> {
+        if eta == 0.0 {
+            return Ok(Self { signal, near: [1.0, 0.0], far: Vec::new(), inner: None, step });
+        }
+        if !(eta > 0.0 && eta <= 2.0) {
+            return Err(Error::OutOfRange {
+                name: "order of an integral in a stream".into(),
+                value: eta,
+                range: "[0, 2]".into(),
+                remedy: "identify such an equation from the recorded run".into(),
+            });
+        }
+        let kernel = block_pulse_kernel(eta, 2, step);
+        let q = if eta > 1.0 { eta - 1.0 } else { eta };
+        let inner = if eta > 1.0 { Some(Box::new((Self::new(signal, q, step, rates)?, 0.0))) } else { None };
+        let mut near = [kernel[0], kernel[1]];
+        if eta > 1.0 {
+            // The running integral holds what the last pulse had amounted to at its end.
+            near[1] -= libm::pow(step, eta) / libm::tgamma(eta + 1.0);
+        }
+        let far = rates
+            .weights(q)
+            .iter()
+            .zip(rates.rates())
+            .map(|(w, s)| {
+                let (keep, first, last) = decay(s * step);
+                w * keep * if eta > 1.0 { step * last } else { first + last }
+            })
+            .collect();
+        Ok(Self { signal, near, far, inner, step })
+    }
+
+    /// Mean over the newest pulse.
+    fn next(&mut self, newest: f64, past: &Past) -> f64 {
+        let older: f64 = self.far.iter().zip(&past.states).map(|(w, z)| w * z).sum();
+        let local = self.near[0] * newest + self.near[1] * past.last + older;
+        match &mut self.inner {
+            None => local,
+            Some(pair) => {
+                let (inner, sum) = pair.as_mut();
+                let value = *sum + local;
+                *sum += self.step * inner.next(newest, past);
+                value
+            }
+        }
+    }
+}
+
+/// One equation in a stream.
+#[derive(Debug, Clone)]
+struct Fit {
+    output: usize,
+    integrals: Vec<Integral>,
+    fixed: Vec<Option<f64>>,
+    recursion: Recursion,
+    /// The p newest rows, each with its target, as a ring.
+    rows: Vec<(Vec<f64>, f64)>,
+    at: usize,
+}
+
+/// Recursion (44) for several equations on one stream of samples.
+#[derive(Debug, Clone)]
+pub struct Streaming {
+    inputs: Vec<bool>,
+    keep: Vec<f64>,
+    share: Vec<f64>,
+    pasts: Vec<Past>,
+    fits: Vec<Fit>,
+    sample: Option<Vec<f64>>,
+    means: Vec<f64>,
+    length: usize,
+    pulses: usize,
+    longest: usize,
+}
+
+impl Streaming {
+    /// A stream of samples `step` s apart for at most `longest` pulses; `inputs` tells held inputs from outputs.
+    ///
+    /// # Errors
+    /// [`Error::OutOfRange`] for a step, length, prior or order of an integral that cannot be used;
+    /// [`Error::Length`] where `fixed` does not match the terms; [`Error::Structure`] for a signal that is not there.
+    ///
+    /// ```
+    /// # fn main() -> ftlm::error::Result<()> {
+    /// use ftlm::equation::{Structure, Term};
+    /// use ftlm::estimation::streaming::Streaming;
+    /// // y = c I^1 u, sampled every 0.1 s.
+    /// let structure = Structure { output: 0, order: 1.0, terms: vec![Term { signal: 1, order: 0.0 }] };
+    /// let mut stream = Streaming::new(0.1, 50, &[false, true], &[(structure, vec![None])], 1, 1e6)?;
+    /// (0..50).try_for_each(|k| stream.push(&[0.3 * f64::from(k), 1.0]))?;
+    /// assert!((stream.coefficients()[0][0] - 3.0).abs() < 1e-3);
+    /// # Ok(())
+    /// # }
+    /// ```
+    pub fn new(
+        step: f64,
+        longest: usize,
+        inputs: &[bool],
+        equations: &[(Structure, Vec<Option<f64>>)],
+        length: usize,
+        prior: f64,
+    ) -> Result<Self> {
+        check_step(step)?;
+        Innovation { length, prior_covariance: prior, rows: Rows::Time }.check()?;
+        #[allow(clippy::cast_precision_loss)]
+        let rates = Rates::new(step, step * (longest.max(2) as f64), TOLERANCE)?;
+        let mut fits = Vec::with_capacity(equations.len());
+        for (structure, fixed) in equations {
+            structure.check(inputs.len(), |s| inputs[s])?;
+            check_length("fixed coefficients", structure.terms.len(), fixed.len())?;
+            let known: Vec<f64> = fixed.iter().flatten().copied().collect();
+            check_finite("fixed coefficients", &known)?;
+            let integrals = structure
+                .terms
+                .iter()
+                .enumerate()
+                .map(|(k, term)| Integral::new(term.signal, structure.integration(k), step, &rates))
+                .collect::<Result<Vec<_>>>()?;
+            let free = fixed.iter().filter(|f| f.is_none()).count();
+            fits.push(Fit {
+                output: structure.output,
+                integrals,
+                fixed: fixed.clone(),
+                recursion: Recursion::new(&vec![0.0; free], prior)?,
+                rows: Vec::new(),
+                at: 0,
+            });
+        }
+        let decays: Vec<_> = rates.rates().iter().map(|s| decay(s * step)).collect();
+        let count = decays.len();
+        Ok(Self {
+            inputs: inputs.to_vec(),
+            keep: decays.iter().map(|d| d.0).collect(),
+            share: decays.iter().map(|d| step * (d.1 + d.2)).collect(),
+            pasts: vec![Past { states: vec![0.0; count], last: 0.0 }; inputs.len()],
+            fits,
+            sample: None,
+            means: vec![0.0; inputs.len()],
+            length,
+            pulses: 0,
+            longest,
+        })
+    }
+
+    /// Takes one sample of every signal. Constant time.
+    ///
+    /// # Errors
+    /// [`Error::Length`], [`Error::NotFinite`]; [`Error::OutOfRange`] past the longest run;
+    /// [`Error::Diverged`] where the covariance loses its sign to rounding.
+    pub fn push(&mut self, sample: &[f64]) -> Result<()> {
+        check_length("sample", self.inputs.len(), sample.len())?;
+        check_finite("sample", sample)?;
+        let Some(before) = self.sample.replace(sample.to_vec()) else { return Ok(()) };
+        if self.pulses == self.longest {
+            #[allow(clippy::cast_precision_loss)]
+            return Err(Error::OutOfRange {
+                name: "pulses in the stream".into(),
+                value: (self.pulses + 1) as f64,
+                range: format!("[0, {}]", self.longest),
+                remedy: "state a longer run".into(),
+            });
+        }
+        for (s, mean) in self.means.iter_mut().enumerate() {
+            *mean = if self.inputs[s] { before[s] } else { 0.5 * (before[s] + sample[s]) };
+        }
+        for fit in &mut self.fits {
+            fit.step(&self.means, &self.pasts, self.length, self.pulses)?;
+        }
+        for (past, mean) in self.pasts.iter_mut().zip(&self.means) {
+            for ((z, keep), share) in past.states.iter_mut().zip(&self.keep).zip(&self.share) {
+                *z = *z * keep + share * past.last;
+            }
+            past.last = *mean;
+        }
+        self.pulses += 1;
+        Ok(())
+    }
+
+    /// Coefficients of every equation's terms after the newest sample, fixed ones as given.
+    #[must_use]
+    pub fn coefficients(&self) -> Vec<Vec<f64>> {
+        self.fits.iter().map(Fit::coefficients).collect()
+    }
+
+    /// Pulses so far.
+    #[must_use]
+    pub fn pulses(&self) -> usize {
+        self.pulses
+    }
+}
+
+impl Fit {
+    fn step(&mut self, means: &[f64], pasts: &[Past], length: usize, pulse: usize) -> Result<()> {
+        let mut target = means[self.output];
+        let mut row = Vec::with_capacity(self.integrals.len());
+        for (integral, fixed) in self.integrals.iter_mut().zip(&self.fixed) {
+            let value = integral.next(means[integral.signal], &pasts[integral.signal]);
+            match fixed {
+                None => row.push(value),
+                Some(coefficient) => target -= coefficient * value,
+            }
+        }
+        if self.rows.len() < length {
+            self.rows.push((row, target));
+        } else {
+            self.rows[self.at] = (row, target);
+            self.at = (self.at + 1) % length;
+        }
+        self.recursion
+            .step(self.rows.iter().map(|(row, target)| (row.as_slice(), *target)))
+            .map_err(|_| Error::Diverged { what: "covariance of the recursion".into(), index: pulse })
+    }
+
+    fn coefficients(&self) -> Vec<f64> {
+        let mut free = self.recursion.coefficients().iter();
+        self.fixed.iter().map(|f| f.unwrap_or_else(|| free.next().copied().unwrap_or(0.0))).collect()
+    }
+}

@@ -1,0 +1,7 @@
+//! Fractional integrals and derivatives: kernels, operational matrices, and memory in bounded space.
+
+pub mod exponential_sum;
+mod integer_powers;
+pub mod integral;
+pub mod kernels;
+pub mod operational_matrices;

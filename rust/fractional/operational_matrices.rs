@@ -1,0 +1,283 @@
+//! Integration operational matrices: F^η of block pulses and P^η of Haar wavelets, dense, for study and as oracle.
+//!
+//! Identification and simulation never need them: they apply F^η as a series ([`crate::series`]).
+//!
+//! The fast Haar transform and the dense Haar matrix: an orthogonal change of basis of pulse means.
+
+use crate::error::{check_dense, check_step, Error, Result};
+use crate::fractional::kernels::{block_pulse_kernel, check_order};
+#[cfg(feature = "oracles")]
+use crate::linalg::dense;
+
+/// Upper-triangular Toeplitz F^η, row-major m × m (paper (32)); `step` = duration / m.
+///
+/// # Errors
+/// An order outside [0, 10], a step that is not positive, m = 0 or beyond memory.
+pub fn block_pulse_matrix(eta: f64, m: usize, step: f64) -> Result<Vec<f64>> {
+    check_order("order", eta)?;
+    check_step(step)?;
+    check_dense(m)?;
+    let kernel = block_pulse_kernel(eta, m, step);
+    let mut f = vec![0.0; m * m];
+    for (i, row) in f.chunks_exact_mut(m).enumerate() {
+        row[i..].copy_from_slice(&kernel[..m - i]);
+    }
+    Ok(f)
+}
+
+/// P^η = Φ F^η Φᵀ (paper (37)), row-major m × m, at little more than the cost of writing it. O(m²).
+///
+/// F is Toeplitz, so an entry depends on the two wavelets' widths and on how far apart they stand, nothing else: rows of
+/// a level are windows into one table for each other level, and all tables together hold O(m log m) numbers.
+///
+/// # Errors
+/// As [`block_pulse_matrix`], and m must be a power of two.
+///
+/// ```
+/// # fn main() -> ftlm::error::Result<()> {
+/// // The mean of I^1 of one on [0, 2] is 1.
+/// let p = ftlm::fractional::operational_matrices::operational_matrix(1.0, 2, 1.0)?;
+/// assert!((p[0] - 1.0).abs() < 1e-12);
+/// # Ok(())
+/// # }
+/// ```
+pub fn operational_matrix(eta: f64, m: usize, step: f64) -> Result<Vec<f64>> {
+    check_power_of_two(m)?;
+    check_order("order", eta)?;
+    check_step(step)?;
+    check_dense(m)?;
+    // sums[k] holds the sums of 2^k successive kernel values, the last of them at n.
+    let mut sums = vec![block_pulse_kernel(eta, m, step)];
+    let mut width = 1;
+    while width < m {
+        let last = &sums[sums.len() - 1];
+        let wider = (0..m).map(|n| last[n] + if n < width { 0.0 } else { last[n - width] }).collect();
+        sums.push(wider);
+        width *= 2;
+    }
+    let mut out = Vec::with_capacity(m * m);
+    let mut response = vec![0.0; m];
+    // The constant, then wavelets from the widest to the narrowest.
+    for level in 0..sums.len() {
+        let rows = Wavelet::of(level, m);
+        rows.respond(&sums, &mut response);
+        let tables = tables(&rows, &response, m);
+        for i in 0..m / rows.width {
+            for table in &tables {
+                out.extend_from_slice(table.window(i));
+            }
+        }
+    }
+    Ok(out)
+}
+
+/// One level of the Haar basis.
+struct Wavelet {
+    width: usize,
+    constant: bool,
+    scale: f64,
+}
+
+impl Wavelet {
+    #[allow(clippy::cast_precision_loss)]
+    fn of(level: usize, m: usize) -> Self {
+        let width = m >> level.saturating_sub(1);
+        Self { width, constant: level == 0, scale: 1.0 / (width as f64).sqrt() }
+    }
+
+    /// Σ_s φ(s) f(n − s) from the running sums of f.
+    fn respond(&self, sums: &[Vec<f64>], out: &mut [f64]) {
+        let half = self.width / 2;
+        if self.constant {
+            let all = &sums[sums.len() - 1];
+            out.iter_mut().zip(all).for_each(|(o, v)| *o = v * self.scale);
+            return;
+        }
+        let part = &sums[half.trailing_zeros() as usize];
+        for (n, o) in out.iter_mut().enumerate() {
+            *o = (part[n] - if n < half { 0.0 } else { part[n - half] }) * self.scale;
+        }
+    }
+}
+
+/// Entries of one level of rows with one level of columns, by distance, laid out so that every row is a window.
+struct Table {
+    values: Vec<f64>,
+    /// Columns of the level.
+    count: usize,
+    /// Where the columns are wider than the rows: so many rows to a column, each with a stretch of its own.
+    phases: usize,
+    /// Where they are not: columns to a row.
+    stride: usize,
+    /// Rows of the level.
+    rows: usize,
+}
+
+impl Table {
+    fn window(&self, i: usize) -> &[f64] {
+        let start = if self.phases > 1 {
+            (i % self.phases) * (2 * self.count - 1) + self.count - 1 - i / self.phases
+        } else {
+            (self.rows - 1 - i) * self.stride
+        };
+        &self.values[start..start + self.count]
+    }
+}
+
+/// The tables of a level of rows with all levels of columns, in the order of the columns.
+fn tables(rows: &Wavelet, response: &[f64], m: usize) -> Vec<Table> {
+    // ahead[m + d] holds the sum of as many responses from d on as the half width at hand.
+    let mut ahead = vec![0.0; 2 * m];
+    ahead[m..].copy_from_slice(response);
+    let levels = m.trailing_zeros() as usize;
+    let mut tables = Vec::with_capacity(levels + 1);
+    for level in (1..=levels).rev() {
+        let columns = Wavelet::of(level, m);
+        let half = columns.width / 2;
+        tables.push(table(rows, &columns, m, |e| (ahead[e] - ahead[e + half]) * columns.scale));
+        for e in 0..2 * m - half {
+            ahead[e] += ahead[e + half];
+        }
+    }
+    let constant = Wavelet::of(0, m);
+    tables.push(table(rows, &constant, m, |e| ahead[e] * constant.scale));
+    tables.reverse();
+    tables
+}
+
+/// `entry(m + d)` is the entry of a column that starts d pulses after its row.
+fn table(rows: &Wavelet, columns: &Wavelet, m: usize, entry: impl Fn(usize) -> f64) -> Table {
+    let count = m / columns.width;
+    let (phases, stride) = ((columns.width / rows.width).max(1), (rows.width / columns.width).max(1));
+    let values = if phases > 1 {
+        let stretch = |phase: usize| (0..2 * count - 1).map(move |k| (k + 1) * columns.width - phase * rows.width);
+        (0..phases).flat_map(stretch).map(&entry).collect()
+    } else {
+        (rows.width..=2 * m - columns.width).step_by(columns.width).map(&entry).collect()
+    };
+    Table { values, count, phases, stride, rows: m / rows.width }
+}
+
+/// P^η by two dense matrix products: the oracle of [`operational_matrix`]. O(m³).
+///
+/// # Errors
+/// As [`operational_matrix`].
+#[cfg(feature = "oracles")]
+pub fn operational_matrix_dense(eta: f64, m: usize, step: f64) -> Result<Vec<f64>> {
+    let phi = matrix(m)?;
+    let f = block_pulse_matrix(eta, m, step)?;
+    let phi_f = dense::multiply(&phi, &f, m, m, m);
+    let mut phi_transposed = phi;
+    transpose(&mut phi_transposed, m);
+    Ok(dense::multiply(&phi_f, &phi_transposed, m, m, m))
+}
+
+/// In-place transpose in tiles that fit the first-level cache.
+#[cfg(feature = "oracles")]
+fn transpose(a: &mut [f64], m: usize) {
+    const TILE: usize = 32;
+    for i0 in (0..m).step_by(TILE) {
+        for j0 in (i0..m).step_by(TILE) {
+            for i in i0..(i0 + TILE).min(m) {
+                for j in j0.max(i + 1)..(j0 + TILE).min(m) {
+                    a.swap(i * m + j, j * m + i);
+                }
+            }
+        }
+    }
+}
+
+/// Refuses a length that is no power of two.
+///
+/// # Errors
+/// [`Error::NotPowerOfTwo`] with the two nearest powers, [`Error::Length`] for m = 0.
+pub fn check_power_of_two(m: usize) -> Result<()> {
+    if m == 0 {
+        return Err(Error::Length { name: "the signal".into(), expected: 1, found: 0 });
+    }
+    if m.is_power_of_two() {
+        Ok(())
+    } else {
+        let above = m.next_power_of_two();
+        Err(Error::NotPowerOfTwo { m, below: above / 2, above })
+    }
+}
+
+/// Φ f in place: Haar coefficients, coarse to fine, of pulse means. O(m).
+///
+/// # Errors
+/// [`Error::NotPowerOfTwo`].
+///
+/// ```
+/// # fn main() -> ftlm::error::Result<()> {
+/// let mut f = [1.0, 1.0, 1.0, 1.0];
+/// ftlm::fractional::operational_matrices::transform(&mut f)?;
+/// assert!((f[0] - 2.0).abs() < 1e-15 && f[1..] == [0.0; 3]);
+/// # Ok(())
+/// # }
+/// ```
+pub fn transform(f: &mut [f64]) -> Result<()> {
+    check_power_of_two(f.len())?;
+    let mut scratch = vec![0.0; f.len()];
+    forward(f, &mut scratch);
+    Ok(())
+}
+
+/// Φᵀ c in place: pulse means from Haar coefficients. O(m).
+///
+/// # Errors
+/// [`Error::NotPowerOfTwo`].
+pub fn inverse(c: &mut [f64]) -> Result<()> {
+    check_power_of_two(c.len())?;
+    let mut scratch = vec![0.0; c.len()];
+    let mut len = 1;
+    while len < c.len() {
+        for i in 0..len {
+            let (sum, rise) = (c[i], c[len + i]);
+            scratch[2 * i] = (sum + rise) * std::f64::consts::FRAC_1_SQRT_2;
+            scratch[2 * i + 1] = (sum - rise) * std::f64::consts::FRAC_1_SQRT_2;
+        }
+        len *= 2;
+        c[..len].copy_from_slice(&scratch[..len]);
+    }
+    Ok(())
+}
+
+/// [`transform`] with the caller's scratch, for loops over rows; `f` has a power of two of elements.
+pub(crate) fn forward(f: &mut [f64], scratch: &mut [f64]) {
+    let mut len = f.len();
+    while len > 1 {
+        let half = len / 2;
+        for i in 0..half {
+            let (left, right) = (f[2 * i], f[2 * i + 1]);
+            scratch[i] = (left + right) * std::f64::consts::FRAC_1_SQRT_2;
+            scratch[half + i] = (left - right) * std::f64::consts::FRAC_1_SQRT_2;
+        }
+        f[..len].copy_from_slice(&scratch[..len]);
+        len = half;
+    }
+}
+
+/// The orthogonal Haar matrix Φ, row-major m × m (paper (27), (29)), written from the definition.
+///
+/// # Errors
+/// [`Error::NotPowerOfTwo`].
+#[allow(clippy::cast_precision_loss)]
+pub fn matrix(m: usize) -> Result<Vec<f64>> {
+    check_power_of_two(m)?;
+    check_dense(m)?;
+    let mut phi = vec![0.0; m * m];
+    let unit = 1.0 / (m as f64).sqrt();
+    phi[..m].fill(unit);
+    for sigma in 1..m {
+        let level = sigma.ilog2();
+        let support = m >> level;
+        let start = (sigma - (1 << level)) * support;
+        let height = unit * libm::exp2(f64::from(level) / 2.0);
+        let row = &mut phi[sigma * m + start..sigma * m + start + support];
+        let (left, right) = row.split_at_mut(support / 2);
+        left.fill(height);
+        right.fill(-height);
+    }
+    Ok(phi)
+}

@@ -1,0 +1,273 @@
+//! What a run starts with, and the constants on its right-hand sides, as powers of t that drive outputs and velocities.
+
+use super::convolution::Integrated;
+use crate::equation::{Equation, Initial, ORDER_GRAIN};
+use crate::error::{Error, Result};
+use crate::fractional::kernels::{kernel, power_means};
+use crate::linalg::small;
+use crate::regressors::is_impulse;
+
+/// A term of an output that is followed.
+#[derive(Debug, Clone, Copy, PartialEq)]
+pub(super) struct Link {
+    /// Equation of the output.
+    pub(super) output: usize,
+    pub(super) order: f64,
+    /// α of the equation in which it stands less that order.
+    pub(super) integration: f64,
+    pub(super) coefficient: f64,
+}
+
+/// What drives bodies besides their inputs: on the level of their outputs and of their velocities, by equation.
+#[derive(Debug, Clone, PartialEq)]
+pub(super) struct Forcing {
+    /// Pulse means on the level of the output.
+    pub(super) output: Vec<Vec<f64>>,
+    /// At the ends of the pulses what drives a velocity on from where it starts.
+    pub(super) edges: Vec<Vec<f64>>,
+    /// The velocities at the start.
+    pub(super) start: Vec<f64>,
+    /// The outputs at the start.
+    pub(super) levels: Vec<f64>,
+    m: usize,
+}
+
+impl Forcing {
+    pub(super) fn none(m: usize, n: usize) -> Self {
+        let rows = vec![vec![0.0; m]; n];
+        Self { output: rows.clone(), edges: rows, start: vec![0.0; n], levels: vec![0.0; n], m }
+    }
+
+    /// The same size, nothing in it.
+    pub(super) fn nothing(&self) -> Self {
+        Self::none(self.m, self.levels.len())
+    }
+
+    /// Adds another one, weighted.
+    pub(super) fn add(&mut self, weight: f64, other: &Self) {
+        let rows = self.output.iter_mut().chain(&mut self.edges).zip(other.output.iter().chain(&other.edges));
+        for (sum, part) in rows {
+            sum.iter_mut().zip(part).for_each(|(s, v)| *s += weight * v);
+        }
+        self.start.iter_mut().zip(&other.start).for_each(|(s, v)| *s += weight * v);
+        self.levels.iter_mut().zip(&other.levels).for_each(|(s, v)| *s += weight * v);
+    }
+
+    /// Adds an integrated signal to one equation, weighted.
+    pub(super) fn add_to(&mut self, equation: usize, weight: f64, part: &Integrated) {
+        let add = |sum: &mut Vec<f64>, part: &[f64]| sum.iter_mut().zip(part).for_each(|(s, v)| *s += weight * v);
+        add(&mut self.output[equation], &part.output);
+        add(&mut self.edges[equation], &part.edges);
+    }
+
+    /// Powers of t on the level of the outputs, as (exponent, coefficient) by equation, beside terms of followed outputs.
+    ///
+    /// A level x₀ at the start is integrated by these terms, and so is the jump to it: to the velocity it is
+    /// c x₀ t^{η−1}/Γ(η). A velocity v₀ at the start is c v₀ t^η/Γ(η + 1) to the velocities that follow it.
+    ///
+    /// # Errors
+    /// [`Error::OutOfRange`] for a power whose rate has no mean over the first pulse; [`Error::LeadingZero`] where the
+    /// levels or velocities at the start follow from no equation.
+    #[allow(clippy::cast_precision_loss)]
+    pub(super) fn of(powers: &[Vec<(f64, f64)>], links: &[Vec<Link>], m: usize, step: f64) -> Result<Self> {
+        let n = powers.len();
+        let mut out = Self::none(m, n);
+        let constant = |own: &Vec<(f64, f64)>| own.iter().filter(|p| p.0.abs() < ORDER_GRAIN).map(|p| p.1).sum::<f64>();
+        out.levels = at_once(&powers.iter().map(constant).collect::<Vec<f64>>(), links)?;
+        let mut all = vec![Sum::default(); n];
+        for (i, own) in powers.iter().enumerate() {
+            for &(exponent, value) in own {
+                if value != 0.0 {
+                    let means = means_of(exponent, m, step);
+                    out.output[i].iter_mut().zip(means).for_each(|(s, v)| *s += value * v);
+                }
+                if exponent.abs() >= ORDER_GRAIN {
+                    all[i].add(exponent - 1.0, value * exponent);
+                }
+            }
+            for link in links[i].iter().filter(|link| link.integration.abs() >= ORDER_GRAIN) {
+                let eta = link.integration;
+                all[i].add(eta - 1.0, link.coefficient * out.levels[link.output] / libm::tgamma(eta));
+            }
+            if let Some((exponent, _)) = all[i].powers().find(|power| power.0 <= -1.0) {
+                return Err(Error::OutOfRange {
+                    name: "exponent of an initial term".into(),
+                    value: exponent + 1.0,
+                    range: "(0, ∞) or 0".into(),
+                    remedy: "a level that a term above its equation's order differentiates needs that term's power of \
+                             t beside it; start at rest, or let the start be found"
+                        .into(),
+                });
+            }
+        }
+        let given: Vec<f64> =
+            all.iter().map(|own| own.powers().filter(|p| p.0.abs() < ORDER_GRAIN).map(|p| p.1).sum()).collect();
+        out.start = at_once(&given, links)?;
+        for (i, own) in all.iter_mut().enumerate() {
+            own.add(0.0, -out.start[i]);
+            for link in &links[i] {
+                let eta = link.integration;
+                own.add(eta, link.coefficient * out.start[link.output] / libm::tgamma(eta + 1.0));
+            }
+            for (exponent, value) in own.powers() {
+                let ends = (1..=m).map(|k| libm::pow(k as f64 * step, exponent));
+                out.edges[i].iter_mut().zip(ends).for_each(|(s, v)| *s += value * v);
+            }
+        }
+        Ok(out)
+    }
+}
+
+/// Powers of t, equal exponents together.
+#[derive(Debug, Clone, Default)]
+struct Sum(Vec<(f64, f64, f64)>);
+
+impl Sum {
+    fn add(&mut self, exponent: f64, value: f64) {
+        match self.0.iter_mut().find(|r| (r.0 - exponent).abs() < ORDER_GRAIN) {
+            Some(known) => (known.1, known.2) = (known.1 + value, known.2.max(value.abs())),
+            None => self.0.push((exponent, value, value.abs())),
+        }
+    }
+
+    /// (exponent, coefficient): what one adds and another takes away again is nothing, but for rounding.
+    fn powers(&self) -> impl Iterator<Item = (f64, f64)> + '_ {
+        self.0.iter().filter(|r| r.1.abs() > 1e-13 * r.2).map(|r| (r.0, r.1))
+    }
+}
+
+/// Pulse means of t^e; of a negative power as the kernels of derivatives make it of a jump, which it takes away again.
+fn means_of(exponent: f64, m: usize, step: f64) -> Vec<f64> {
+    if exponent >= 0.0 {
+        return power_means(exponent, m, step);
+    }
+    let (mut sum, scale) = (0.0, libm::tgamma(exponent + 1.0));
+    let summed = |v: f64| {
+        sum += v;
+        scale * sum
+    };
+    kernel(exponent, m, step).into_iter().map(summed).collect()
+}
+
+/// What outputs or velocities start at: what is given of each, and what of the others feeds through at once.
+fn at_once(given: &[f64], links: &[Vec<Link>]) -> Result<Vec<f64>> {
+    let n = given.len();
+    if !links.iter().flatten().any(|link| link.integration.abs() < ORDER_GRAIN) {
+        return Ok(given.to_vec());
+    }
+    let mut matrix = vec![0.0; n * n];
+    for (i, row) in links.iter().enumerate() {
+        matrix[i * n + i] += 1.0;
+        for link in row.iter().filter(|link| link.integration.abs() < ORDER_GRAIN) {
+            matrix[i * n + link.output] -= link.coefficient;
+        }
+    }
+    let inverse = small::inverse(&matrix, n)?;
+    Ok((0..n).map(|i| (0..n).map(|j| inverse[i * n + j] * given[j]).sum()).collect())
+}
+
+/// What is free of a run's start: each a combination of powers of t, of the equation named first.
+#[derive(Debug, Clone, Copy, PartialEq)]
+pub(super) enum State {
+    /// The level at which the output stood before, and moved on from.
+    Level(usize),
+    /// Its velocity.
+    Rate(usize),
+    /// The power of t by which a term starts whose signal did not start at 0.
+    Jump {
+        /// Equation and term.
+        at: (usize, usize),
+        /// One more for each derivative of the signal.
+        more: u32,
+    },
+    /// A constant on the right-hand side, or a ramp (1).
+    Offset(usize, u32),
+    /// A power of t that was asked for; −1, −2, …: an impulse that the filter of an output gets, and its derivatives.
+    Power(usize, f64),
+}
+
+impl State {
+    /// Those of a run; `free` says of which term of an equation the integration moves with an order. Each output that
+    /// passes a filter before it is compared (`filtered`, empty: none does) has the free motions of the filter besides.
+    pub(super) fn all(
+        equations: &[Equation],
+        initial: &Initial,
+        filtered: &[bool],
+        free: impl Fn(usize, usize) -> bool,
+    ) -> Vec<Self> {
+        let followed = |signal: usize| equations.iter().any(|e| e.structure.output == signal);
+        let mut all: Vec<Self> = Vec::new();
+        for (i, Equation { structure, .. }) in equations.iter().enumerate() {
+            match initial.under() {
+                Initial::Rest | Initial::Offset { .. } | Initial::Filtered { .. } => {}
+                Initial::Powers(powers) => all.extend(powers.iter().map(|&e| Self::Power(i, e))),
+                Initial::Caputo => {
+                    all.push(Self::Level(i));
+                    if structure.order > 1.0 + ORDER_GRAIN {
+                        all.push(Self::Rate(i));
+                    }
+                    for (term, driver) in structure.terms.iter().enumerate().filter(|(_, t)| !followed(t.signal)) {
+                        for more in (0_u32..).take_while(|&k| f64::from(k) < driver.order - ORDER_GRAIN) {
+                            let exponent = structure.order - driver.order + f64::from(more);
+                            let known = [0.0, 1.0].iter().any(|e: &f64| (e - exponent).abs() < ORDER_GRAIN);
+                            if free(i, term) || !known {
+                                all.push(Self::Jump { at: (i, term), more });
+                            }
+                        }
+                    }
+                }
+            }
+        }
+        for (i, Equation { structure, .. }) in equations.iter().enumerate() {
+            let offsets = initial.offset_exponents(structure.order).len();
+            all.extend((0..offsets).filter_map(|k| u32::try_from(k).ok()).map(|k| Self::Offset(i, k)));
+        }
+        for i in (0..equations.len()).filter(|&i| filtered.get(i).is_some_and(|&passes| passes)) {
+            all.extend(initial.impulses().map(|e| Self::Power(i, e)));
+        }
+        all
+    }
+
+    /// Whether it moves no body, only the filter of an output.
+    pub(super) fn is_impulse(&self) -> bool {
+        matches!(self, Self::Power(_, e) if is_impulse(*e))
+    }
+
+    /// The powers of t that a unit of it is, on the level of the outputs: equation, exponent, coefficient.
+    pub(super) fn powers(self, equations: &[Equation], links: &[Vec<Link>]) -> Vec<(usize, f64, f64)> {
+        // Caputo's derivative of a level is 0, so a term does not see it unless its order is 0.
+        let unseen = |output: usize, whole: f64| {
+            let mut all = vec![(output, whole, 1.0)];
+            for (i, row) in links.iter().enumerate() {
+                for link in row.iter().filter(|link| link.output == output && link.order > whole + ORDER_GRAIN) {
+                    let exponent = link.integration + whole;
+                    all.push((i, exponent, -link.coefficient / libm::tgamma(exponent + 1.0)));
+                }
+            }
+            all
+        };
+        match self {
+            Self::Level(i) => unseen(i, 0.0),
+            Self::Rate(i) => unseen(i, 1.0),
+            Self::Jump { at: (i, term), more } => {
+                let structure = &equations[i].structure;
+                vec![(i, structure.order - structure.terms[term].order + f64::from(more), 1.0)]
+            }
+            Self::Offset(i, more) => vec![(i, equations[i].structure.order + f64::from(more), 1.0)],
+            Self::Power(i, exponent) => vec![(i, exponent, 1.0)],
+        }
+    }
+}
+
+/// Powers of t of several states together by equation, equal exponents merged.
+pub(super) fn together(n: usize, parts: impl IntoIterator<Item = (usize, f64, f64)>) -> Vec<Vec<(f64, f64)>> {
+    let mut out: Vec<Vec<(f64, f64)>> = vec![Vec::new(); n];
+    for (i, exponent, value) in parts {
+        match out[i].iter_mut().find(|known| (known.0 - exponent).abs() < ORDER_GRAIN) {
+            Some(known) => known.1 += value,
+            None => out[i].push((exponent, value)),
+        }
+    }
+    out.iter_mut().for_each(|own| own.sort_by(|a, b| a.0.total_cmp(&b.0)));
+    out
+}

@@ -1,0 +1,186 @@
+//! Long columns against one another: orthonormal bases, projections, triangular factors, in the widest vectors at hand.
+
+use crate::error::Result;
+use crate::parallel::{self, Stop};
+use crate::simd::{dot, widest, Kernel};
+
+/// Rows that are taken into a triangular factor at a time: what fits a cache.
+const ROWS: usize = 1 << 10;
+
+/// Directions that are taken out of a column between two looks at whether to stop.
+const AT_ONCE: usize = 16;
+
+/// Squares of what is factored lie between these: beyond, sums of them are not what they should be.
+const LEAST: f64 = 1e-280;
+const MOST: f64 = 1e280;
+
+/// Upper triangle R of [R; rows] by Householder's reflections, column by column; false where a square leaves the numbers.
+struct Reflections<'a> {
+    columns: &'a mut [Vec<f64>],
+}
+
+impl Kernel for Reflections<'_> {
+    type Output = bool;
+
+    #[inline(always)]
+    fn run(self) -> bool {
+        let k = self.columns.len();
+        for j in 0..k {
+            let (before, later) = self.columns.split_at_mut(j + 1);
+            let reflected = &mut before[j][j..];
+            let square = dot(reflected, reflected);
+            if square == 0.0 && reflected.iter().all(|v| *v == 0.0) {
+                continue;
+            }
+            if !(LEAST..=MOST).contains(&square) {
+                return false;
+            }
+            let first = reflected[0];
+            let turned = -square.sqrt().copysign(first);
+            reflected[0] = first - turned;
+            let factor = 1.0 / (turned * (turned - first));
+            for column in later {
+                let below = &mut column[j..];
+                let along = factor * dot(reflected, below);
+                for (v, w) in below.iter_mut().zip(reflected.iter()) {
+                    *v -= along * w;
+                }
+            }
+            reflected[0] = turned;
+        }
+        true
+    }
+}
+
+/// Upper-triangular factor of the given columns, row-major k × k, part of the rows after part; none where squares leave the
+/// numbers. O(k²m).
+pub(crate) fn triangular_factor(columns: &[Vec<f64>]) -> Option<Vec<f64>> {
+    let k = columns.len();
+    let m = columns.iter().map(Vec::len).max().unwrap_or(0);
+    // R of what is done on top, the next rows below.
+    let mut stacked: Vec<Vec<f64>> = vec![Vec::with_capacity(k + ROWS.min(m)); k];
+    stacked.iter_mut().for_each(|column| column.resize(k, 0.0));
+    for from in (0..m).step_by(ROWS) {
+        for (j, (column, given)) in stacked.iter_mut().zip(columns).enumerate() {
+            // What a reflection leaves below the triangle is its own vector.
+            column.truncate(k);
+            column.iter_mut().skip(j + 1).for_each(|v| *v = 0.0);
+            let rows = given.get(from..given.len().min(from + ROWS)).unwrap_or_default();
+            column.extend_from_slice(rows);
+            column.resize(k + ROWS.min(m - from), 0.0);
+        }
+        if !widest(Reflections { columns: &mut stacked }) {
+            return None;
+        }
+    }
+    let mut out = vec![0.0; k * k];
+    for i in 0..k {
+        for j in i..k {
+            out[i * k + j] = stacked[j][i];
+        }
+    }
+    out.iter().all(|v| v.is_finite()).then_some(out)
+}
+
+/// Takes what lies along an orthonormal basis out of a column, `times` over.
+struct Projection<'a> {
+    basis: &'a [Vec<f64>],
+    column: &'a mut [f64],
+    times: usize,
+}
+
+impl Kernel for Projection<'_> {
+    type Output = ();
+
+    #[inline(always)]
+    fn run(self) {
+        for _ in 0..self.times {
+            for direction in self.basis {
+                let along = dot(direction, self.column);
+                for (v, q) in self.column.iter_mut().zip(direction) {
+                    *v -= along * q;
+                }
+            }
+        }
+    }
+}
+
+/// Takes what lies along an orthonormal basis out of a column of the same length. O(k m).
+pub fn project_out(basis: &[Vec<f64>], column: &mut [f64]) {
+    widest(Projection { basis, column, times: 1 });
+}
+
+/// Adds a column to an orthonormal basis unless less than this share of it lies outside the span. O(k m).
+pub fn extend_orthonormal(basis: &mut Vec<Vec<f64>>, mut column: Vec<f64>, share: f64) {
+    let whole = norm(&column);
+    // Twice is enough (Kahan, Parlett).
+    widest(Projection { basis, column: &mut column, times: 2 });
+    let left = norm(&column);
+    if left > share * whole && left.is_finite() {
+        column.iter_mut().for_each(|v| *v /= left);
+        basis.push(column);
+    }
+}
+
+/// Orthonormal directions of which less than this share of any of the columns is left over. O(k² m), on the threads of the
+/// pool at hand.
+///
+/// The column that is farthest from the directions before it comes next: what rounding does to columns is divided by the
+/// share once, not once a column. A column of noughts has no direction, nor has one whose squares are no numbers.
+///
+/// # Errors
+/// [`crate::error::Error::Interrupted`].
+pub(crate) fn orthonormal_basis(columns: Vec<Vec<f64>>, share: f64, stop: &Stop) -> Result<Vec<Vec<f64>>> {
+    let whole = |(): &mut (), mut column: Vec<f64>| {
+        let size = if stop.is_set() { 0.0 } else { norm(&column) };
+        let sound = size > 0.0 && size.is_finite();
+        column.iter_mut().for_each(|v| *v /= size);
+        sound.then_some((1.0, column))
+    };
+    let mut waiting: Vec<(f64, Vec<f64>)> = parallel::map(columns, || (), whole).into_iter().flatten().collect();
+    let mut basis: Vec<Vec<f64>> = Vec::with_capacity(waiting.len());
+    loop {
+        stop.check()?;
+        let farther = |a: &usize, b: &usize| waiting[*a].0.total_cmp(&waiting[*b].0).then(b.cmp(a));
+        let Some(next) = (0..waiting.len()).max_by(farther).filter(|&next| waiting[next].0 > share) else {
+            return Ok(basis);
+        };
+        let (_, mut direction) = waiting.remove(next);
+        // Twice is enough (Kahan, Parlett).
+        for before in basis.chunks(AT_ONCE) {
+            stop.check()?;
+            project_out(before, &mut direction);
+        }
+        let left = norm(&direction);
+        direction.iter_mut().for_each(|v| *v /= left);
+        basis.push(direction);
+        let last = &basis[basis.len() - 1..];
+        let without = |(): &mut (), (left, mut column): (f64, Vec<f64>)| {
+            // What is half done once it was told to stop is thrown away.
+            if stop.is_set() {
+                return (left, column);
+            }
+            project_out(last, &mut column);
+            (norm(&column), column)
+        };
+        waiting = parallel::map(waiting, || (), without);
+    }
+}
+
+/// √Σ v².
+struct Norm<'a>(&'a [f64]);
+
+impl Kernel for Norm<'_> {
+    type Output = f64;
+
+    #[inline(always)]
+    fn run(self) -> f64 {
+        dot(self.0, self.0).sqrt()
+    }
+}
+
+/// Euclidean length of a column whose squares are numbers.
+#[must_use]
+pub fn norm(column: &[f64]) -> f64 {
+    widest(Norm(column))
+}

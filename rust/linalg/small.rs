@@ -1,0 +1,292 @@
+//! Fixed-size solves and the recursions of the estimators; the only user of `nalgebra`.
+
+use nalgebra::{DMatrix, DVector, Dyn, FullPivLU};
+
+use crate::error::{check_length, Error, Result};
+use crate::simd::Lanes;
+
+/// A pivot of a correlation matrix below this marks a regressor that rounding cannot tell from the others:
+/// the Gram matrix of m = 2048 products carries about 1e−13.
+pub const PIVOT_FLOOR: f64 = 1e-13;
+
+/// Row-major inverse of a row-major n × n matrix.
+///
+/// # Errors
+/// [`Error::LeadingZero`] with the determinant where it is singular, [`Error::Length`].
+///
+/// ```
+/// # fn main() -> ftlm::error::Result<()> {
+/// assert_eq!(ftlm::linalg::small::inverse(&[2.0, 0.0, 0.0, 4.0], 2)?, [0.5, 0.0, 0.0, 0.25]);
+/// # Ok(())
+/// # }
+/// ```
+pub fn inverse(matrix: &[f64], n: usize) -> Result<Vec<f64>> {
+    check_length("matrix", n * n, matrix.len())?;
+    if n == 1 {
+        let value = matrix[0];
+        return if value != 0.0 && value.is_finite() {
+            Ok(vec![1.0 / value])
+        } else {
+            Err(Error::LeadingZero { leading: value })
+        };
+    }
+    let a = DMatrix::from_row_slice(n, n, matrix);
+    let determinant = a.determinant();
+    match a.try_inverse() {
+        Some(inverse) if inverse.iter().all(|v| v.is_finite()) => Ok(inverse.transpose().as_slice().to_vec()),
+        _ => Err(Error::LeadingZero { leading: determinant }),
+    }
+}
+
+/// A square matrix whose rows and columns may differ in scale by any factor, ready to be solved with.
+pub struct Scaled {
+    /// Largest element of each row, then of each column.
+    rows: Vec<f64>,
+    columns: Vec<f64>,
+    /// None of a matrix without rows.
+    factor: Option<FullPivLU<f64, Dyn, Dyn>>,
+}
+
+impl Scaled {
+    /// Of a row-major k × k matrix.
+    ///
+    /// # Errors
+    /// [`Error::Singular`] where rounding cannot tell its rows apart, [`Error::Length`].
+    ///
+    /// ```
+    /// let solved = ftlm::linalg::small::Scaled::new(&[2.0, 0.0, 0.0, 0.25], 2)?.solve(&[1.0, 1.0]);
+    /// assert_eq!(solved, [0.5, 4.0]);
+    /// # Ok::<(), ftlm::error::Error>(())
+    /// ```
+    pub fn new(matrix: &[f64], k: usize) -> Result<Self> {
+        check_length("matrix", k * k, matrix.len())?;
+        // Rows, then columns, to unit largest element: what is then nearly singular is so whatever the units.
+        let largest = |values: &mut dyn Iterator<Item = f64>| values.fold(0.0_f64, |a, v| a.max(v.abs()));
+        let mut a = DMatrix::from_row_slice(k, k, matrix);
+        let rows: Vec<f64> = (0..k).map(|i| largest(&mut a.row(i).iter().copied())).collect();
+        for (i, scale) in rows.iter().enumerate() {
+            a.row_mut(i).unscale_mut(*scale);
+        }
+        let columns: Vec<f64> = (0..k).map(|j| largest(&mut a.column(j).iter().copied())).collect();
+        for (j, scale) in columns.iter().enumerate() {
+            a.column_mut(j).unscale_mut(*scale);
+        }
+        let singular = |index| Error::Singular { index, count: k };
+        if let Some(bad) = rows.iter().chain(&columns).position(|s| !(*s > 0.0 && s.is_finite())) {
+            return Err(singular(bad % k.max(1)));
+        }
+        let factor = (k > 0).then(|| a.full_piv_lu());
+        let pivots = factor.iter().flat_map(|f| f.u().diagonal().iter().copied().collect::<Vec<f64>>());
+        if let Some(bad) = pivots.into_iter().position(|p| p.is_nan() || p.abs() <= PIVOT_FLOOR) {
+            return Err(singular(bad));
+        }
+        Ok(Self { rows, columns, factor })
+    }
+
+    /// The solution of a system with this right-hand side, one value a row.
+    #[must_use]
+    pub fn solve(&self, rhs: &[f64]) -> Vec<f64> {
+        let mut x = DVector::from_iterator(rhs.len(), rhs.iter().zip(&self.rows).map(|(v, scale)| v / scale));
+        if let Some(factor) = &self.factor {
+            factor.solve_mut(&mut x);
+        }
+        x.iter().zip(&self.columns).map(|(v, scale)| v / scale).collect()
+    }
+
+    /// The inverse, row-major.
+    #[must_use]
+    pub fn inverse(&self) -> Vec<f64> {
+        let k = self.rows.len();
+        let mut out = vec![0.0; k * k];
+        for j in 0..k {
+            let mut unit = vec![0.0; k];
+            unit[j] = 1.0;
+            self.solve(&unit).into_iter().enumerate().for_each(|(i, v)| out[i * k + j] = v);
+        }
+        out
+    }
+}
+
+/// Row-major inverse of a row-major k × k matrix whose rows and columns may differ in scale by any factor.
+///
+/// # Errors
+/// [`Error::Singular`] where rounding cannot tell its rows apart, [`Error::Length`].
+///
+/// ```
+/// assert_eq!(ftlm::linalg::small::scaled_inverse(&[2.0, 0.0, 0.0, 0.25], 2), Ok(vec![0.5, 0.0, 0.0, 4.0]));
+/// // Of nothing, nothing.
+/// assert_eq!(ftlm::linalg::small::scaled_inverse(&[], 0), Ok(vec![]));
+/// ```
+pub fn scaled_inverse(matrix: &[f64], k: usize) -> Result<Vec<f64>> {
+    Ok(Scaled::new(matrix, k)?.inverse())
+}
+
+/// Position of element (i, j), j ≤ i, of a symmetric matrix kept by its lower rows.
+#[inline(always)]
+#[must_use]
+pub const fn packed(i: usize, j: usize) -> usize {
+    i * (i + 1) / 2 + j
+}
+
+/// Solves L symmetric positive systems of k unknowns side by side, in place, by the factor L D Lᵀ.
+///
+/// `gram` holds the lower rows ([`packed`]) of correlation matrices: their diagonals are 1, or 0 for a column that is
+/// not there. `rhs` is overwritten with the solutions. The first `needed` unknowns must be independent: the returned
+/// flags say where they are not. Later ones that are combinations of those before them are dropped: their unknown is 0.
+/// O(k³). The operations of a lane do not depend on the others, nor on L.
+#[inline(always)]
+pub fn solve_lanes<const L: usize>(gram: &mut [Lanes<L>], rhs: &mut [Lanes<L>], needed: usize) -> [bool; L] {
+    // The usual sizes get loops of known length.
+    match rhs.len() {
+        1 => solve_sized(1, gram, rhs, needed),
+        2 => solve_sized(2, gram, rhs, needed),
+        3 => solve_sized(3, gram, rhs, needed),
+        4 => solve_sized(4, gram, rhs, needed),
+        5 => solve_sized(5, gram, rhs, needed),
+        k => solve_sized(k, gram, rhs, needed),
+    }
+}
+
+#[inline(always)]
+fn solve_sized<const L: usize>(k: usize, gram: &mut [Lanes<L>], rhs: &mut [Lanes<L>], needed: usize) -> [bool; L] {
+    let (gram, rhs) = (&mut gram[..packed(k, 0)], &mut rhs[..k]);
+    let mut singular = [false; L];
+    for i in 0..k {
+        let mut pivot = gram[packed(i, i)];
+        for j in 0..i {
+            // Row i of L D, then of L.
+            let mut sum = gram[packed(i, j)];
+            for l in 0..j {
+                let (a, b) = (gram[packed(i, l)], gram[packed(j, l)]);
+                for n in 0..L {
+                    sum[n] -= a[n] * b[n];
+                }
+            }
+            gram[packed(i, j)] = sum;
+        }
+        for j in 0..i {
+            let (u, inverse) = (gram[packed(i, j)], gram[packed(j, j)]);
+            let row = &mut gram[packed(i, j)];
+            for n in 0..L {
+                row[n] = u[n] * inverse[n];
+                pivot[n] -= u[n] * row[n];
+            }
+        }
+        let mut inverse = [0.0; L];
+        let mut all = true;
+        for n in 0..L {
+            let fits = pivot[n] > PIVOT_FLOOR;
+            inverse[n] = if fits { 1.0 / pivot[n] } else { 0.0 };
+            all &= fits;
+            singular[n] |= !fits && i < needed;
+        }
+        gram[packed(i, i)] = inverse;
+        let mut value = rhs[i];
+        for j in 0..i {
+            let (row, z) = (gram[packed(i, j)], rhs[j]);
+            for n in 0..L {
+                value[n] -= row[n] * z[n];
+            }
+        }
+        rhs[i] = value;
+        if !all {
+            for n in (0..L).filter(|&n| inverse[n] == 0.0) {
+                (0..i).for_each(|j| gram[packed(i, j)][n] = 0.0);
+                rhs[i][n] = 0.0;
+            }
+        }
+    }
+    for i in (0..k).rev() {
+        let mut value = rhs[i];
+        for n in 0..L {
+            value[n] *= gram[packed(i, i)][n];
+        }
+        for j in i + 1..k {
+            let (row, x) = (gram[packed(j, i)], rhs[j]);
+            for n in 0..L {
+                value[n] -= row[n] * x[n];
+            }
+        }
+        rhs[i] = value;
+    }
+    singular
+}
+
+/// Solution of a small symmetric row-major system; none where it is not positive definite. O(k³).
+#[must_use]
+pub fn positive_solve(matrix: &[f64], rhs: &[f64]) -> Option<Vec<f64>> {
+    let k = rhs.len();
+    let solved = DMatrix::from_row_slice(k, k, matrix).cholesky()?.solve(&DVector::from_column_slice(rhs));
+    Some(solved.iter().copied().collect())
+}
+
+/// Solves `R x = c` for upper-triangular row-major R (k × k with row stride `stride`).
+#[must_use]
+pub fn back_substitute(r: &[f64], stride: usize, rhs: &[f64]) -> Vec<f64> {
+    let k = rhs.len();
+    let mut x = rhs.to_vec();
+    for i in (0..k).rev() {
+        for j in i + 1..k {
+            x[i] -= r[i * stride + j] * x[j];
+        }
+        x[i] /= r[i * stride + i];
+    }
+    x
+}
+
+/// The state of recursion (44): the coefficients and the inverse covariance.
+#[derive(Debug, Clone)]
+pub struct Recursion {
+    coefficients: DVector<f64>,
+    information: DMatrix<f64>,
+}
+
+impl Recursion {
+    /// Starts at coefficients `start` with covariance `prior`·I.
+    ///
+    /// # Errors
+    /// [`Error::OutOfRange`] for a prior that is not positive and finite.
+    pub fn new(start: &[f64], prior: f64) -> Result<Self> {
+        let k = start.len();
+        if !(prior > 0.0 && prior.is_finite()) {
+            return Err(Error::OutOfRange {
+                name: "prior covariance K0".into(),
+                value: prior,
+                range: "(0, ∞)".into(),
+                remedy: "use a large number for a weak prior".into(),
+            });
+        }
+        Ok(Self {
+            coefficients: DVector::from_column_slice(start),
+            information: DMatrix::from_diagonal_element(k, k, 1.0 / prior),
+        })
+    }
+
+    /// One step of (44): the innovation of these rows (newest first or not: the sum does not know).
+    ///
+    /// # Errors
+    /// [`Error::Diverged`] where the covariance is no longer positive, [`Error::Length`] for a row of another length.
+    pub fn step<'a>(&mut self, rows: impl Iterator<Item = (&'a [f64], f64)> + Clone) -> Result<()> {
+        let k = self.coefficients.len();
+        let mut gain = DVector::zeros(k);
+        for (row, output) in rows.clone() {
+            check_length("row", k, row.len())?;
+            let q = DVector::from_column_slice(row);
+            gain += &q * (output - q.dot(&self.coefficients));
+            self.information.ger(1.0, &q, &q, 1.0);
+        }
+        let factor = self
+            .information
+            .clone()
+            .cholesky()
+            .ok_or_else(|| Error::Diverged { what: "covariance of the recursion".into(), index: 0 })?;
+        self.coefficients += factor.solve(&gain);
+        Ok(())
+    }
+
+    /// Coefficients after the last step.
+    #[must_use]
+    pub fn coefficients(&self) -> &[f64] {
+        self.coefficients.as_slice()
+    }
+}

@@ -1,0 +1,294 @@
+//! One order of a slab: what its values make of everything that the bound asks for, and how far from straight that runs.
+//!
+//! Column x of each value is taken to û, what the slab's other columns leave of it, of unit size. Over a stretch of
+//! values any quantity is its straight line between the ends, within an eighth of the stretch's length squared times
+//! the largest second difference between: f_i − l_i = −Σ_j G_ij Δ²f_j with 0 ≤ G and Σ_j G_ij = (i − lo)(hi − i)/2.
+
+use crate::order_search::candidate::normal_equations::Normal;
+use crate::order_search::dual_bound::test_vectors::{Probes, NONE};
+use crate::simd::WIDTH;
+
+/// One value for each of [`WIDTH`] test vectors.
+pub(super) type Wide = [f64; WIDTH];
+pub(super) const ZERO: Wide = [0.0; WIDTH];
+
+/// ⟨t, x⟩ and g‖t‖, real and imaginary parts.
+pub(super) type Seen = [Wide; 4];
+
+/// Of a stretch of 2^l values: what its inner ones differ from straight by, and its largest values.
+#[derive(Debug, Clone, Copy)]
+pub(super) struct Node {
+    /// Largest second differences of ⟨t, û⟩ and of g‖t‖, largest ‖Fᵀt − g t‖ and way from that of the partner.
+    pub(super) bent: [Wide; 4],
+}
+
+/// The same of numbers that no test vector enters.
+#[derive(Debug, Clone, Copy, Default)]
+pub(super) struct Plain {
+    /// Largest sum of the moduli of û's coefficients.
+    pub(super) sum: f64,
+}
+
+/// Stretches of one length.
+pub(super) struct Level {
+    pub(super) plain: Vec<Plain>,
+    /// Largest second differences of the coefficients of û on the other columns, k a stretch.
+    pub(super) mixed: Vec<f64>,
+    /// Groups of test vectors within stretches.
+    pub(super) nodes: Vec<Node>,
+}
+
+/// The other columns of a slab.
+pub(super) struct Others<'a> {
+    pub(super) normal: &'a Normal,
+    pub(super) probes: &'a [Probes],
+    /// Their columns and the inverse of their correlations.
+    pub(super) columns: &'a [usize],
+    pub(super) inverse: &'a [f64],
+    /// Sum of its diagonal.
+    pub(super) trace: f64,
+    /// What rounding may add to a product of unit columns.
+    pub(super) rounding: f64,
+    /// One of the columns that is the output's own, whose coefficient that of an own one of the sides may cancel.
+    pub(super) partner: Option<usize>,
+}
+
+impl Others<'_> {
+    /// Coefficients on the other columns of the column with these products.
+    pub(super) fn solve(&self, products: &[f64], out: &mut [f64]) {
+        let k = self.columns.len();
+        for (i, out) in out.iter_mut().enumerate() {
+            *out = (0..k).map(|j| self.inverse[i * k + j] * products[j]).sum();
+        }
+    }
+
+    /// How far an own column's Fᵀt − g t is from the partner's at most; nothing of another column, or without a partner.
+    #[inline(always)]
+    fn way(&self, record: usize, group: usize, column: usize) -> Wide {
+        let probes = &self.probes[record];
+        let (mut way, row) = (ZERO, probes.rows[column]);
+        if let Some(partner) = self.partner.filter(|_| row != NONE) {
+            let at = |row: usize| &probes.effects[row * probes.groups + group][3];
+            let (a, b) = (at(row), at(probes.rows[self.columns[partner]]));
+            for n in 0..WIDTH {
+                way[n] = (a[n] - b[n]).abs();
+            }
+        }
+        way
+    }
+
+    /// ⟨t, x⟩ and g‖t‖ of a column of unit size, and its ‖Fᵀt − g t‖.
+    #[inline(always)]
+    pub(super) fn seen(&self, record: usize, group: usize, column: usize) -> (Seen, Wide) {
+        let probes = &self.probes[record];
+        let inverse = self.normal.inverse()[column];
+        let [re, im] = &probes.products[column * probes.groups + group];
+        let row = probes.rows[column];
+        let (mut seen, mut rest) = ([ZERO; 4], ZERO);
+        for n in 0..WIDTH {
+            seen[0][n] = re[n] * inverse;
+            seen[1][n] = im[n] * inverse;
+        }
+        if row != NONE {
+            let [a, b, c, _] = &probes.effects[row * probes.groups + group];
+            for n in 0..WIDTH {
+                seen[2][n] = a[n] * inverse;
+                seen[3][n] = b[n] * inverse;
+                rest[n] = c[n] * inverse;
+            }
+        }
+        (seen, rest)
+    }
+}
+
+/// One order of a slab, over these values.
+pub(super) struct Side {
+    pub(super) columns: Vec<usize>,
+    /// 1/‖x − its part along the others‖, and û·y.
+    pub(super) scale: Vec<f64>,
+    pub(super) target: Vec<f64>,
+    /// Products with the other columns, and û's coefficients on them (to be subtracted), k a value.
+    pub(super) shared: Vec<f64>,
+    pub(super) mixed: Vec<f64>,
+    /// What is to be subtracted for û from the coefficient on the partner and that on the order's own column together,
+    /// as if both were the partner; nothing where there is none.
+    pub(super) paired: Vec<f64>,
+    /// Groups of test vectors within values.
+    pub(super) seen: Vec<Seen>,
+    pub(super) levels: Vec<Level>,
+}
+
+impl Side {
+    /// Over these columns; none where one of them is all but a combination of the others.
+    #[inline(always)]
+    pub(super) fn new(others: &Others<'_>, columns: Vec<usize>) -> Option<Self> {
+        let (k, n, normal) = (others.columns.len(), columns.len(), others.normal);
+        let (mut scale, mut target, mut shared) = (vec![0.0; n], vec![0.0; n], vec![0.0; n * k]);
+        let (mut mixed, mut raw) = (vec![0.0; n * k], vec![0.0; n * k]);
+        for (i, &column) in columns.iter().enumerate() {
+            let (shared, raw) = (&mut shared[i * k..(i + 1) * k], &mut raw[i * k..(i + 1) * k]);
+            for (g, &s) in shared.iter_mut().zip(others.columns) {
+                *g = normal.product(s, column);
+            }
+            others.solve(shared, raw);
+            let left = 1.0 - shared.iter().zip(raw.iter()).map(|(g, a)| g * a).sum::<f64>();
+            let sum = 1.0 + raw.iter().map(|a| a.abs()).sum::<f64>();
+            // What is not a number ends here too.
+            if left.is_nan() || left <= 1e3 * others.rounding * others.trace * sum * sum {
+                return None;
+            }
+            scale[i] = 1.0 / left.sqrt();
+            let along: f64 = raw.iter().zip(others.columns).map(|(a, &s)| a * normal.rhs()[s]).sum();
+            target[i] = (normal.rhs()[column] - along) * scale[i];
+            for (m, a) in mixed[i * k..(i + 1) * k].iter_mut().zip(raw.iter()) {
+                *m = a * scale[i];
+            }
+        }
+        let groups: usize = others.probes.iter().map(|p| p.groups).sum();
+        let mut seen = Vec::with_capacity(n * groups);
+        let mut rests = Vec::with_capacity(n * groups);
+        let mut sound = ZERO;
+        let mut paired = Vec::new();
+        if let Some(partner) = others.partner {
+            let inverse = normal.inverse();
+            let own = others.probes.first().is_some_and(|probes| columns.iter().all(|&p| probes.rows[p] != NONE));
+            paired.extend(columns.iter().enumerate().map(|(i, &p)| {
+                let alone = if own { scale[i] * inverse[p] / inverse[others.columns[partner]] } else { 0.0 };
+                mixed[i * k + partner] - alone
+            }));
+        }
+        let along: Vec<Vec<Seen>> = others
+            .columns
+            .iter()
+            .map(|&s| each_group(others.probes).map(|(r, g)| others.seen(r, g, s).0).collect())
+            .collect();
+        for (i, &column) in columns.iter().enumerate() {
+            for (at, (r, g)) in each_group(others.probes).enumerate() {
+                let (mut here, mut rest) = others.seen(r, g, column);
+                for (s, along) in along.iter().enumerate() {
+                    let a = raw[i * k + s];
+                    for (here, along) in here.iter_mut().zip(&along[at]) {
+                        for n in 0..WIDTH {
+                            here[n] -= a * along[n];
+                        }
+                    }
+                }
+                for here in &mut here {
+                    here.iter_mut().for_each(|v| *v *= scale[i]);
+                }
+                let mut way = others.way(r, g, column);
+                rest.iter_mut().for_each(|v| *v *= scale[i]);
+                way.iter_mut().for_each(|v| *v *= scale[i] * normal.inverse()[column]);
+                for values in here.iter().chain([&rest, &way]) {
+                    for n in 0..WIDTH {
+                        sound[n] += 0.0 * values[n];
+                    }
+                }
+                seen.push(here);
+                rests.push([rest, way]);
+            }
+        }
+        // What is not a number, or none that anything follows from, ends here: no multiple of it is 0.
+        if sound.iter().any(|v| v.is_nan()) {
+            return None;
+        }
+        let mut side = Self { columns, scale, target, shared, mixed, paired, seen, levels: Vec::new() };
+        side.build(k, groups, &rests);
+        Some(side)
+    }
+
+    /// Stretches of 1, 2, 4, … values.
+    #[inline(always)]
+    fn build(&mut self, k: usize, groups: usize, rests: &[[Wide; 2]]) {
+        let n = self.columns.len();
+        let apart = |values: &[f64], stride: usize, at: usize, i: usize| -> f64 {
+            let v = |i: usize| values[i * stride + at];
+            ((v(i - 1) - v(i)) + (v(i + 1) - v(i))).abs()
+        };
+        // Second differences at a value.
+        let bent = |i: usize, g: usize| -> [Wide; 2] {
+            let (a, b, c) =
+                (&self.seen[(i - 1) * groups + g], &self.seen[i * groups + g], &self.seen[(i + 1) * groups + g]);
+            let mut out = [ZERO; 2];
+            for half in 0..2 {
+                for n in 0..WIDTH {
+                    let re = (a[2 * half][n] - b[2 * half][n]) + (c[2 * half][n] - b[2 * half][n]);
+                    let im = (a[2 * half + 1][n] - b[2 * half + 1][n]) + (c[2 * half + 1][n] - b[2 * half + 1][n]);
+                    out[half][n] = (re * re + im * im).sqrt();
+                }
+            }
+            out
+        };
+        let mut levels = vec![Level {
+            plain: (0..n)
+                .map(|i| {
+                    let mixed: f64 = self.mixed[i * k..(i + 1) * k].iter().map(|m| m.abs()).sum();
+                    Plain { sum: self.scale[i] + mixed }
+                })
+                .collect(),
+            mixed: vec![0.0; n * k],
+            nodes: rests.iter().map(|&[rest, way]| Node { bent: [ZERO, ZERO, rest, way] }).collect(),
+        }];
+        let mut length = 1;
+        while length < n {
+            let below = &levels[levels.len() - 1];
+            let halves = n.div_ceil(length);
+            let count = n.div_ceil(2 * length);
+            let mut level = Level {
+                plain: Vec::with_capacity(count),
+                mixed: Vec::with_capacity(count * k),
+                nodes: Vec::with_capacity(count * groups),
+            };
+            for node in 0..count {
+                let (left, right) = (2 * node, 2 * node + 1);
+                let mut all = below.plain[left];
+                let start = level.mixed.len();
+                level.mixed.extend_from_slice(&below.mixed[left * k..(left + 1) * k]);
+                if right < halves {
+                    // The last of the left half and the first of the right one are now within, unless it is the end.
+                    let joint = right * length;
+                    let inner = |i: usize| i > left * length && i + 1 < n.min((right + 1) * length);
+                    all.sum = all.sum.max(below.plain[right].sum);
+                    for s in 0..k {
+                        let mut value = level.mixed[start + s].max(below.mixed[right * k + s]);
+                        for i in [joint - 1, joint] {
+                            if inner(i) {
+                                value = value.max(apart(&self.mixed, k, s, i));
+                            }
+                        }
+                        level.mixed[start + s] = value;
+                    }
+                    for g in 0..groups {
+                        let mut node = below.nodes[left * groups + g];
+                        let mut most = |part: usize, with: &Wide| {
+                            for (most, with) in node.bent[part].iter_mut().zip(with) {
+                                *most = most.max(*with);
+                            }
+                        };
+                        let other = &below.nodes[right * groups + g];
+                        (0..4).for_each(|part| most(part, &other.bent[part]));
+                        for i in [joint - 1, joint] {
+                            if inner(i) {
+                                let [a, b] = bent(i, g);
+                                most(0, &a);
+                                most(1, &b);
+                            }
+                        }
+                        level.nodes.push(node);
+                    }
+                } else {
+                    level.nodes.extend_from_slice(&below.nodes[left * groups..(left + 1) * groups]);
+                }
+                level.plain.push(all);
+            }
+            levels.push(level);
+            length *= 2;
+        }
+        self.levels = levels;
+    }
+}
+
+/// All groups of test vectors: record and number.
+pub(super) fn each_group(probes: &[Probes]) -> impl Iterator<Item = (usize, usize)> + '_ {
+    probes.iter().enumerate().flat_map(|(r, probes)| (0..probes.groups).map(move |g| (r, g)))
+}

@@ -1,0 +1,610 @@
+//! A lower bound of the errors of all candidates of a box.
+//!
+//! With û and v̂ the two columns that vary (of unit size, less their parts along the others) a candidate's coefficients on
+//! them solve p + B q = û·y, B p + q = v̂·y, B = û·v̂, so (p ± q)/2 = (û·y ± v̂·y)/(2(1 ± B)): they are made for all
+//! candidates ([`Strip`]), and how far they run from bilinear over a box is looked up. Over a box, −1 ≤ s, t ≤ 1, every
+//! other quantity is its straight line between the ends and a remainder
+//! ([`crate::order_search::branch_and_bound::axis_table`]). ⟨t, w⟩, 1 − Σ c g and coefficients are then bilinear in s
+//! and t but for remainders of second order, and what follows of bilinear functions at the corners follows over the
+//! box: |⟨t, w⟩| is at least its part along one direction, which is bilinear, less λ times moduli of bilinear
+//! functions, which is concave in s and in t, so least at a corner.
+//!
+//! Coefficients on the two varying columns of all candidates of some rows of a slab.
+
+use std::ops::Range;
+
+use crate::order_search::branch_and_bound::axis_table::{each_group, Others, Seen, Side, Wide, ZERO};
+use crate::order_search::dual_bound::test_vectors::NONE;
+use crate::order_search::options::Norm;
+use crate::simd::WIDTH;
+
+/// What rounding may change in coefficients, in units of ε and the sum of the diagonal of an inverse correlation
+/// matrix: sixteen times the square of the number of terms, far above what elimination loses.
+const ELIMINATED: f64 = 16.0 * f64::EPSILON;
+
+/// Where 1 − B² is no more than this, û and v̂ are one column as far as rounding tells.
+const NOTHING: f64 = 1e-12;
+
+/// Most other columns of a slab.
+pub(super) const MOST_OTHERS: usize = 16;
+
+/// What the boxes of all slabs share.
+pub(super) struct Common {
+    pub(super) norm: Norm,
+    /// Whether candidates are ranked by their squared equation error.
+    pub(super) squares: bool,
+    /// Largest moduli over all columns of unit size of ⟨t, x⟩ and of g‖t‖, by group of test vectors.
+    pub(super) tops: Vec<[Wide; 2]>,
+    /// Largest rounding of a column of unit size, by record.
+    pub(super) rounding: Vec<f64>,
+    /// Size of the output over all records.
+    pub(super) size: f64,
+    /// Largest over smallest inverse size of two columns.
+    pub(super) ratio: f64,
+}
+
+impl Common {
+    pub(super) fn new(others: &Others<'_>, norm: Norm, squares: bool, size: f64) -> Self {
+        let width = others.normal.inverse().len();
+        let tops = each_group(others.probes)
+            .map(|(r, g)| {
+                let mut tops = [ZERO; 2];
+                for p in 0..width {
+                    let (seen, _) = others.seen(r, g, p);
+                    for half in 0..2 {
+                        for n in 0..WIDTH {
+                            tops[half][n] = tops[half][n].max(seen[2 * half][n].hypot(seen[2 * half + 1][n]));
+                        }
+                    }
+                }
+                tops
+            })
+            .collect();
+        let sizes = || others.normal.inverse().iter().copied().filter(|&i| i > 0.0);
+        // What rounding leaves of one coefficient counts as so much of another, and of itself.
+        let ratio = 1.0 + sizes().fold(0.0, f64::max) / sizes().fold(f64::INFINITY, f64::min);
+        let most = |rounding: &[f64]| -> f64 {
+            rounding.iter().zip(others.normal.inverse()).map(|(r, i)| r * i).fold(0.0, f64::max)
+        };
+        Self { norm, squares, tops, rounding: others.probes.iter().map(|p| most(&p.rounding)).collect(), size, ratio }
+    }
+}
+
+/// A stretch of values of one order: node `at` of a level.
+#[derive(Debug, Clone, Copy)]
+pub(super) struct Stretch {
+    pub(super) level: usize,
+    pub(super) at: usize,
+}
+
+impl Stretch {
+    /// Its first and last value of so many.
+    #[inline(always)]
+    pub(super) fn ends(self, n: usize) -> (usize, usize) {
+        (self.at << self.level, n.min((self.at + 1) << self.level) - 1)
+    }
+}
+
+/// Middle, slope and remainder of a quantity over a stretch.
+#[derive(Debug, Clone, Copy)]
+pub(super) struct Line {
+    pub(super) middle: f64,
+    pub(super) slope: f64,
+    pub(super) rest: f64,
+}
+
+impl Line {
+    #[inline(always)]
+    pub(super) fn new(first: f64, last: f64, rest: f64) -> Self {
+        Self { middle: (first + last) / 2.0, slope: (last - first) / 2.0, rest }
+    }
+}
+
+/// Coefficients of 1, s, t, st from the values at (−1, −1), (1, −1), (−1, 1), (1, 1).
+#[inline(always)]
+fn bilinear([a, b, c, d]: [f64; 4]) -> [f64; 4] {
+    [(a + b + c + d) / 4.0, ((b + d) - (a + c)) / 4.0, ((c + d) - (a + b)) / 4.0, ((a + d) - (b + c)) / 4.0]
+}
+
+/// What the candidates of a box have in common.
+pub(super) struct Cell {
+    /// Rows and values at the corners.
+    pub(super) at: [(usize, usize); 4],
+    /// Eighths of the squares of the sides' lengths.
+    pub(super) wide: [f64; 2],
+    /// p and q at the corners and the largest over the box.
+    pub(super) ps: [f64; 4],
+    pub(super) qs: [f64; 4],
+    pub(super) most: [f64; 2],
+    /// How far from bilinear (p + q)/2 and (p − q)/2 run.
+    pub(super) off: [f64; 2],
+    /// Of p the coefficients of s and st, of q those of t and st, in moduli: what bends a product with a line in s or t.
+    pub(super) bends: [f64; 2],
+    /// Largest part of ‖y‖² that û and v̂ explain, where that ranks.
+    pub(super) explained: f64,
+    /// Size of the output and of all coefficients, and what rounding may change in one of these.
+    pub(super) all: f64,
+    pub(super) lost: f64,
+}
+
+impl Cell {
+    /// How far p times the first of these quantities along the sides and q times the second run from bilinear.
+    #[inline(always)]
+    pub(super) fn rest(&self, [a, b]: [Line; 2]) -> f64 {
+        let bent = self.bends[0] * a.slope.abs() + self.bends[1] * b.slope.abs();
+        let slopes = a.slope.abs() + b.slope.abs();
+        let (sum, difference) = (a.middle + b.middle, a.middle - b.middle);
+        bent + self.most[0] * a.rest
+            + self.most[1] * b.rest
+            + self.off[0] * (sum.abs() + slopes)
+            + self.off[1] * (difference.abs() + slopes)
+    }
+}
+
+/// Moduli of the coefficients on the other columns at the corners of a box, and how far from bilinear what they are
+/// moduli of runs.
+pub(super) struct Moduli {
+    others: [[f64; 4]; MOST_OTHERS],
+    rests: [f64; MOST_OTHERS],
+    /// Of the coefficients on the partner and on the own column of a side the sum, whose moduli may cancel.
+    sums: [f64; 4],
+    sums_rest: f64,
+}
+
+/// What a group of test vectors holds against the candidates of a box.
+pub(super) struct Held {
+    /// ⟨t, w⟩ and the divisor ‖t‖(1 − Σ c g) at the corners: real and imaginary part of each.
+    pub(super) values: [[Wide; 4]; 4],
+    /// What is added to the divisor at the corners: Σ|c|‖Fᵀt − g t‖.
+    pub(super) slack: [Wide; 4],
+    /// How far the first of these, and the other two together, run from bilinear.
+    pub(super) rough: [Wide; 2],
+}
+
+/// A slab, ready for its boxes.
+pub(super) struct Slab<'a> {
+    pub(super) others: &'a Others<'a>,
+    pub(super) common: &'a Common,
+    /// The order that changes from row to row, and the one that runs along rows.
+    pub(super) sides: [Side; 2],
+    /// Which of them is one of the output's own signal.
+    own: Option<usize>,
+    /// Coefficients of the output on the other columns.
+    pub(super) along: Vec<f64>,
+    /// Squared size of the output less its part along the others.
+    unexplained: f64,
+    /// Of the output less its part along the others: ⟨t, y⟩ and ‖t‖, by group.
+    base: Vec<Seen>,
+    /// ‖Fᵀt − g t‖ of the other columns, k a group.
+    rests: Vec<Wide>,
+}
+
+impl<'a> Slab<'a> {
+    #[inline(always)]
+    pub(super) fn new(others: &'a Others<'a>, common: &'a Common, sides: [Side; 2]) -> Self {
+        let k = others.columns.len();
+        let mut along = vec![0.0; k];
+        let rhs: Vec<f64> = others.columns.iter().map(|&s| others.normal.rhs()[s]).collect();
+        others.solve(&rhs, &mut along);
+        let (mut base, mut rests) = (Vec::new(), Vec::new());
+        for (r, g) in each_group(others.probes) {
+            let probes = &others.probes[r];
+            let mut here = [probes.target[g][0], probes.target[g][1], probes.size[g], ZERO];
+            for (c, &s) in along.iter().zip(others.columns) {
+                let (seen, rest) = others.seen(r, g, s);
+                for (here, seen) in here.iter_mut().zip(&seen) {
+                    for n in 0..WIDTH {
+                        here[n] -= c * seen[n];
+                    }
+                }
+                rests.push(rest);
+            }
+            base.push(here);
+        }
+        let explained: f64 = along.iter().zip(&rhs).map(|(c, g)| c * g).sum();
+        let of = |side: &Side| others.probes.first().is_some_and(|p| side.columns.iter().all(|&c| p.rows[c] != NONE));
+        let own = (0..2).find(|&n| of(&sides[n]));
+        Self { others, common, sides, own, along, unexplained: common.size * common.size - explained, base, rests }
+    }
+
+    /// The coefficients of all candidates of some rows.
+    #[inline(always)]
+    pub(super) fn lay(&self, strip: &mut Strip, rows: Range<usize>) {
+        let (k, len) = (self.others.columns.len(), self.sides[1].columns.len());
+        let [u, v] = &self.sides;
+        (strip.start, strip.len) = (rows.start, len);
+        let Strip { plus, minus, left, product, .. } = strip;
+        for all in [&mut *plus, minus, left] {
+            all.resize(rows.len() * len, 0.0);
+        }
+        product.resize((k + 1) * len, 0.0);
+        let (product, shared) = product.split_at_mut(len);
+        for (s, shared) in shared.chunks_exact_mut(len).enumerate() {
+            for (j, shared) in shared.iter_mut().enumerate() {
+                *shared = v.shared[j * k + s];
+            }
+        }
+        for (at, row) in rows.enumerate() {
+            let (with, scale, y) = (self.others.normal.products(u.columns[row]), u.scale[row], u.target[row]);
+            for (product, &column) in product.iter_mut().zip(&v.columns) {
+                *product = with[column] * scale;
+            }
+            for (shared, mixed) in shared.chunks_exact(len).zip(&u.mixed[row * k..(row + 1) * k]) {
+                for (product, shared) in product.iter_mut().zip(shared) {
+                    *product -= mixed * shared;
+                }
+            }
+            let at = at * len..(at + 1) * len;
+            let (plus, minus, left) = (&mut plus[at.clone()], &mut minus[at.clone()], &mut left[at]);
+            let (scales, targets) = (&v.scale[..len], &v.target[..len]);
+            for j in 0..len {
+                let (b, z) = (product[j] * scales[j], targets[j]);
+                let (above, below) = (1.0 + b, 1.0 - b);
+                let both = above * below;
+                let sound = both > NOTHING;
+                let half = if sound { 0.5 / both } else { 0.0 };
+                left[j] = if sound { both } else { 0.0 };
+                plus[j] = (y + z) * below * half;
+                minus[j] = (y - z) * above * half;
+            }
+        }
+    }
+
+    /// What the candidates of a box have in common; none where nothing is proved of it.
+    #[inline(always)]
+    pub(super) fn cell(&self, strip: &Strip, [su, sv]: [Stretch; 2]) -> Option<Cell> {
+        let [u, v] = &self.sides;
+        let ((u0, u1), (v0, v1)) = (su.ends(u.columns.len()), sv.ends(v.columns.len()));
+        let (wu, wv) = (eighth(u1 - u0), eighth(v1 - v0));
+        let (pu, pv) = (u.levels[su.level].plain[su.at], v.levels[sv.level].plain[sv.at]);
+        let sums = pu.sum + pv.sum;
+        let at = [(u0, v0), (u1, v0), (u0, v1), (u1, v1)];
+        let places = at.map(|(i, j)| strip.at(i, j));
+        let halves = [places.map(|place| strip.plus[place]), places.map(|place| strip.minus[place])];
+        let (mut ps, mut qs) = ([0.0; 4], [0.0; 4]);
+        for c in 0..4 {
+            ps[c] = halves[0][c] + halves[1][c];
+            qs[c] = halves[0][c] - halves[1][c];
+        }
+        let (off, left, explained) = if self.common.squares {
+            let (left, explained) = strip.explained([(u0, u1), (v0, v1)], [&u.target, &v.target]);
+            ([0.0; 2], left, explained)
+        } else {
+            let (off, left) = strip.off([(u0, u1), (v0, v1)], halves.map(bilinear));
+            (off, left, 0.0)
+        };
+        let left = left - 2.0 * self.others.rounding * self.others.trace * sums * sums;
+        // What is not a number proves nothing.
+        if left.is_nan() || left <= 0.0 {
+            return None;
+        }
+        let largest = |x: &[f64; 4]| x.iter().fold(0.0_f64, |m, v| m.max(v.abs()));
+        let both = off[0] + off[1];
+        let (p, q, p_most, q_most) = (bilinear(ps), bilinear(qs), largest(&ps) + both, largest(&qs) + both);
+
+        // Sizes of coefficients, and what rounding may change in them.
+        let trace = self.others.trace + sums * sums / left;
+        let all =
+            self.common.size + self.along.iter().map(|c| c.abs()).sum::<f64>() + p_most * pu.sum + q_most * pv.sum;
+        let terms = count(self.others.columns.len() + 2);
+        let lost = ELIMINATED * terms * terms * trace * all;
+        let bends = [p[1].abs() + p[3].abs(), q[2].abs() + q[3].abs()];
+        Some(Cell { at, wide: [wu, wv], ps, qs, most: [p_most, q_most], off, bends, explained, all, lost })
+    }
+
+    /// Lower bound of the raw scores of all candidates of a box; ends as soon as it exceeds the limit.
+    #[inline(always)]
+    pub(super) fn bound(&self, both: [Stretch; 2], cell: &Cell, limit: f64) -> f64 {
+        if self.common.squares {
+            self.squares(cell)
+        } else {
+            self.errors(both, cell, limit)
+        }
+    }
+
+    /// Lower bound of their squared equation errors.
+    #[inline(always)]
+    fn squares(&self, cell: &Cell) -> f64 {
+        let rounding = self.others.rounding * cell.all + count(self.others.columns.len() + 2) * cell.lost;
+        let bound = self.unexplained - cell.explained - 4.0 * rounding * cell.all;
+        // Neither NaN nor an overflow proves anything.
+        if bound > 0.0 && bound < f64::MAX && cell.explained > f64::MIN {
+            bound
+        } else {
+            0.0
+        }
+    }
+
+    /// Lower bound of their output errors.
+    #[inline(always)]
+    fn errors(&self, both: [Stretch; 2], cell: &Cell, limit: f64) -> f64 {
+        let moduli = self.moduli(both, cell);
+        let (mut sum, mut first) = (0.0, 0);
+        for (r, probes) in self.others.probes.iter().enumerate() {
+            let mut best = 0.0;
+            for group in first..first + probes.groups {
+                let together = self.together(both, cell, &moduli, group);
+                let Held { values, slack, rough } = self.held(both, cell, &moduli, (r, group), together);
+                // All are looked at along the middle's direction.
+                let mut along = [ZERO; 2];
+                for n in 0..WIDTH {
+                    let re = values[0][0][n] + values[1][0][n] + values[2][0][n] + values[3][0][n];
+                    let im = values[0][1][n] + values[1][1][n] + values[2][1][n] + values[3][1][n];
+                    let size = (re * re + im * im).sqrt();
+                    let inverse = if size > 0.0 { 1.0 / size } else { 0.0 };
+                    along[0][n] = re * inverse;
+                    along[1][n] = im * inverse;
+                }
+                let mut bounds = [f64::MAX; WIDTH];
+                for (value, slack) in values.iter().zip(&slack) {
+                    for n in 0..WIDTH {
+                        let seen = value[0][n] * along[0][n] + value[1][n] * along[1][n] - rough[0][n];
+                        let size = (value[2][n] * value[2][n] + value[3][n] * value[3][n]).sqrt();
+                        // A hair more, for the rounding of the divisor and of the score itself.
+                        let bound = seen / ((size + slack[n] + rough[1][n]) * (1.0 + probes.unit));
+                        // Neither NaN nor an overflow proves anything.
+                        let bound = if bound > 0.0 && bound < f64::MAX { bound } else { 0.0 };
+                        bounds[n] = if bound < bounds[n] { bound } else { bounds[n] };
+                    }
+                }
+                for bound in bounds {
+                    if bound > best {
+                        best = bound;
+                    }
+                }
+                if sum + self.raw(best) > limit {
+                    break;
+                }
+            }
+            first += probes.groups;
+            sum += self.raw(best);
+        }
+        sum
+    }
+
+    /// Moduli of the coefficients on the other columns over a box.
+    #[inline(always)]
+    pub(super) fn moduli(&self, [su, sv]: [Stretch; 2], cell: &Cell) -> Moduli {
+        let k = self.others.columns.len();
+        let [u, v] = &self.sides;
+        let Cell { at, wide: [wu, wv], ps, qs, lost, .. } = *cell;
+        let ((u0, v0), (u1, v1)) = (at[0], at[3]);
+        let (lu, lv) = (&u.levels[su.level], &v.levels[sv.level]);
+        let (mut others, mut rests) = ([[0.0; 4]; MOST_OTHERS], [0.0; MOST_OTHERS]);
+        for s in 0..k {
+            for (c, (i, j)) in at.into_iter().enumerate() {
+                others[s][c] = (self.along[s] - ps[c] * u.mixed[i * k + s] - qs[c] * v.mixed[j * k + s]).abs();
+            }
+            let a = Line::new(u.mixed[u0 * k + s], u.mixed[u1 * k + s], wu * lu.mixed[su.at * k + s]);
+            let b = Line::new(v.mixed[v0 * k + s], v.mixed[v1 * k + s], wv * lv.mixed[sv.at * k + s]);
+            rests[s] = cell.rest([a, b]) + lost;
+        }
+        let (mut sums, mut sums_rest) = ([0.0; 4], 0.0);
+        if let Some(partner) = self.partner() {
+            for (c, (i, j)) in at.into_iter().enumerate() {
+                sums[c] = (self.along[partner] - ps[c] * u.paired[i] - qs[c] * v.paired[j]).abs();
+            }
+            let bent = |values: &[f64], first: usize, last: usize| {
+                let inner =
+                    (first + 1..last).map(|i| ((values[i - 1] - values[i]) + (values[i + 1] - values[i])).abs());
+                inner.fold(0.0, f64::max)
+            };
+            let a = Line::new(u.paired[u0], u.paired[u1], wu * bent(&u.paired, u0, u1));
+            let b = Line::new(v.paired[v0], v.paired[v1], wv * bent(&v.paired, v0, v1));
+            sums_rest = cell.rest([a, b]) + lost * self.common.ratio;
+        }
+        Moduli { others, rests, sums, sums_rest }
+    }
+
+    /// The other column whose coefficient may cancel against that of a side's own column.
+    #[inline(always)]
+    fn partner(&self) -> Option<usize> {
+        self.others.partner.filter(|_| self.own.is_some())
+    }
+
+    /// The partner, where a group of test vectors proves more with its column and the own one looked at together.
+    #[inline(always)]
+    pub(super) fn together(&self, [su, sv]: [Stretch; 2], cell: &Cell, moduli: &Moduli, group: usize) -> Option<usize> {
+        let partner = self.partner()?;
+        let (k, groups) = (self.others.columns.len(), self.base.len());
+        let [u, v] = &self.sides;
+        let bu = &u.levels[su.level].nodes[su.at * groups + group].bent;
+        let bv = &v.levels[sv.level].nodes[sv.at * groups + group].bent;
+        let own = if self.own == Some(0) { &cell.ps } else { &cell.qs };
+        let rest = &self.rests[group * k + partner];
+        let (mut apart, mut joint) = (0.0, 0.0);
+        for n in 0..WIDTH {
+            apart += moduli.others[partner][0] * rest[n] + own[0].abs() * (bu[2][n] + bv[2][n]);
+            joint += moduli.sums[0] * rest[n] + own[0].abs() * (bu[3][n] + bv[3][n]);
+        }
+        (joint < apart).then_some(partner)
+    }
+
+    /// What a group of test vectors, of a record, holds against the candidates of a box.
+    #[inline(always)]
+    pub(super) fn held(
+        &self,
+        [su, sv]: [Stretch; 2],
+        cell: &Cell,
+        moduli: &Moduli,
+        (record, group): (usize, usize),
+        together: Option<usize>,
+    ) -> Held {
+        let (k, groups) = (self.others.columns.len(), self.base.len());
+        let [u, v] = &self.sides;
+        let Cell { at, wide: [wu, wv], ps, qs, most: [p_most, q_most], off, bends, all, lost, .. } = *cell;
+        let both = off[0] + off[1];
+        let ((u0, v0), (u1, v1)) = (at[0], at[3]);
+        let bu = &u.levels[su.level].nodes[su.at * groups + group].bent;
+        let bv = &v.levels[sv.level].nodes[sv.at * groups + group].bent;
+        let (a, b) = (&u.seen[u0 * groups + group], &u.seen[u1 * groups + group]);
+        let (c, d) = (&v.seen[v0 * groups + group], &v.seen[v1 * groups + group]);
+        let (base, tops) = (&self.base[group], &self.common.tops[group]);
+        let mut rough = [[0.0; WIDTH]; 2];
+        for half in 0..2 {
+            for n in 0..WIDTH {
+                let mut sizes = [0.0; 4];
+                for part in 2 * half..2 * half + 2 {
+                    let (mu, mv) = ((a[part][n] + b[part][n]) * 0.5, (c[part][n] + d[part][n]) * 0.5);
+                    sizes[0] += (mu + mv).abs();
+                    sizes[1] += (mu - mv).abs();
+                    sizes[2] += (b[part][n] - a[part][n]).abs() * 0.5;
+                    sizes[3] += (d[part][n] - c[part][n]).abs() * 0.5;
+                }
+                rough[half][n] = bends[0] * sizes[2]
+                    + bends[1] * sizes[3]
+                    + off[0] * sizes[0]
+                    + off[1] * sizes[1]
+                    + both * (sizes[2] + sizes[3])
+                    + wu * bu[half][n] * p_most
+                    + wv * bv[half][n] * q_most
+                    + lost * tops[half][n];
+            }
+        }
+        let rounding = self.others.probes[record].target_rounding + (all + lost) * self.common.rounding[record];
+        rough[0].iter_mut().for_each(|rough| *rough += rounding);
+        // Of the varying columns (a scale is at least 1), then of the others.
+        let mut slack = [ZERO; 4];
+        let part = if together.is_some() { 3 } else { 2 };
+        for n in 0..WIDTH {
+            rough[1][n] += (both + lost) * (bu[part][n] + bv[part][n]);
+            for corner in 0..4 {
+                slack[corner][n] = ps[corner].abs() * bu[part][n] + qs[corner].abs() * bv[part][n];
+            }
+        }
+        let rest_of = &self.rests[group * k..(group + 1) * k];
+        for (s, rest) in rest_of.iter().enumerate() {
+            let paired = together == Some(s);
+            let (sizes, beyond) =
+                if paired { (&moduli.sums, moduli.sums_rest) } else { (&moduli.others[s], moduli.rests[s]) };
+            for n in 0..WIDTH {
+                rough[1][n] += beyond * rest[n];
+                for corner in 0..4 {
+                    slack[corner][n] += sizes[corner] * rest[n];
+                }
+            }
+        }
+        let mut values = [[ZERO; 4]; 4];
+        for (corner, value) in values.iter_mut().enumerate() {
+            let (of_u, of_v) = ([a, b][corner % 2], [c, d][corner / 2]);
+            for part in 0..4 {
+                for n in 0..WIDTH {
+                    value[part][n] = base[part][n] - ps[corner] * of_u[part][n] - qs[corner] * of_v[part][n];
+                }
+            }
+        }
+        Held { values, slack, rough }
+    }
+
+    #[inline(always)]
+    pub(super) fn raw(&self, norm: f64) -> f64 {
+        match self.common.norm {
+            Norm::L1 => norm,
+            Norm::L2 => norm * norm,
+        }
+    }
+}
+
+/// An eighth of a length squared.
+#[inline(always)]
+fn eighth(length: usize) -> f64 {
+    let length = count(length);
+    length * length / 8.0
+}
+/// Candidates of a row that are looked at side by side.
+const LANES: usize = 4;
+const PLACES: [f64; LANES] = [0.0, 1.0, 2.0, 3.0];
+
+/// Coefficients on û and v̂ of all candidates of some rows of a slab.
+#[derive(Default)]
+pub(super) struct Strip {
+    /// Their first row, and how many values a row has.
+    pub(super) start: usize,
+    /// See `start`.
+    pub(super) len: usize,
+    /// (p + q)/2, (p − q)/2 and 1 − B²; all of them 0 where that is next to nothing, or no number.
+    pub(super) plus: Vec<f64>,
+    pub(super) minus: Vec<f64>,
+    pub(super) left: Vec<f64>,
+    /// B, and products with the other columns one after the other, of a row.
+    pub(super) product: Vec<f64>,
+}
+
+impl Strip {
+    #[inline(always)]
+    pub(super) fn at(&self, row: usize, value: usize) -> usize {
+        (row - self.start) * self.len + value
+    }
+
+    /// How far from bilinear functions (p + q)/2 and (p − q)/2 run over a box, and the least 1 − B².
+    #[inline(always)]
+    pub(super) fn off(
+        &self,
+        [(u0, u1), (v0, v1)]: [(usize, usize); 2],
+        [plus, minus]: [[f64; 4]; 2],
+    ) -> ([f64; 2], f64) {
+        let (mut far, mut left) = ([[0.0_f64; LANES]; 2], [f64::INFINITY; LANES]);
+        let width = v1 - v0 + 1;
+        let [down, across] = [(u0, u1), (v0, v1)].map(|(a, b)| if b > a { 2.0 / count(b - a) } else { 0.0 });
+        for row in 0..=u1 - u0 {
+            let s = count(row) * down - 1.0;
+            let (x, y) = (plus[2] + plus[3] * s, minus[2] + minus[3] * s);
+            let (first, second) = (plus[0] + plus[1] * s - x, minus[0] + minus[1] * s - y);
+            let (x, y, start) = (x * across, y * across, self.at(u0 + row, v0));
+            let plus = self.plus[start..start + width].chunks_exact(LANES);
+            let minus = self.minus[start..start + width].chunks_exact(LANES);
+            let lefts = self.left[start..start + width].chunks_exact(LANES);
+            let rest = [plus.remainder(), minus.remainder(), lefts.remainder()];
+            let mut place = PLACES;
+            for ((plus, minus), lefts) in plus.zip(minus).zip(lefts) {
+                for n in 0..LANES {
+                    let a = (plus[n] - (first + x * place[n])).abs();
+                    let b = (minus[n] - (second + y * place[n])).abs();
+                    far[0][n] = if a > far[0][n] { a } else { far[0][n] };
+                    far[1][n] = if b > far[1][n] { b } else { far[1][n] };
+                    left[n] = if lefts[n] < left[n] { lefts[n] } else { left[n] };
+                    place[n] += PLACES[LANES - 1] + 1.0;
+                }
+            }
+            for n in 0..rest[0].len() {
+                let a = (rest[0][n] - (first + x * place[n])).abs();
+                let b = (rest[1][n] - (second + y * place[n])).abs();
+                far[0][n] = if a > far[0][n] { a } else { far[0][n] };
+                far[1][n] = if b > far[1][n] { b } else { far[1][n] };
+                left[n] = if rest[2][n] < left[n] { rest[2][n] } else { left[n] };
+            }
+        }
+        let most = |x: [f64; LANES]| x.into_iter().fold(0.0_f64, f64::max);
+        ([most(far[0]), most(far[1])], left.into_iter().fold(f64::INFINITY, f64::min))
+    }
+
+    /// The least 1 − B² over a box, and the most of ‖y‖² that û and v̂ explain.
+    #[inline(always)]
+    pub(super) fn explained(&self, [(u0, u1), (v0, v1)]: [(usize, usize); 2], [y, z]: [&[f64]; 2]) -> (f64, f64) {
+        let (mut left, mut most) = ([f64::INFINITY; LANES], [f64::NEG_INFINITY; LANES]);
+        let width = v1 - v0 + 1;
+        for row in u0..u1 + 1 {
+            let (y, start) = (y[row], self.at(row, v0));
+            let here = [&self.plus, &self.minus, &self.left].map(|from| &from[start..start + width]);
+            let z = &z[v0..v0 + width];
+            let mut at = 0;
+            while at < width {
+                let lanes = LANES.min(width - at);
+                for n in 0..lanes {
+                    let explained = here[0][at + n] * (y + z[at + n]) + here[1][at + n] * (y - z[at + n]);
+                    most[n] = if explained > most[n] { explained } else { most[n] };
+                    left[n] = if here[2][at + n] < left[n] { here[2][at + n] } else { left[n] };
+                }
+                at += lanes;
+            }
+        }
+        (left.into_iter().fold(f64::INFINITY, f64::min), most.into_iter().fold(f64::NEG_INFINITY, f64::max))
+    }
+}
+
+/// So many, to reckon with.
+#[inline(always)]
+#[allow(clippy::cast_precision_loss)]
+pub(super) fn count(n: usize) -> f64 {
+    n as f64
+}

@@ -1,0 +1,137 @@
+//! The regressors that the candidates of a search need, each once.
+//!
+//! Columns of a bank that several candidates name side by side.
+
+use std::collections::HashSet;
+
+use crate::equation::{grains, Initial, ORDER_GRAIN};
+use crate::regressors::{Index, Key};
+use crate::simd::Lanes;
+
+/// Collects the regressors of candidates from their orders.
+pub(crate) struct Needed<'a> {
+    initial: &'a Initial,
+    index: Index,
+    alphas: HashSet<i64>,
+    orders: HashSet<(i64, usize, i64)>,
+}
+
+impl<'a> Needed<'a> {
+    pub(crate) fn new(initial: &'a Initial) -> Self {
+        Self { initial, index: Index::default(), alphas: HashSet::new(), orders: HashSet::new() }
+    }
+
+    /// Adds the initial terms that every structure of this α needs.
+    pub(crate) fn alpha(&mut self, alpha: f64) {
+        if !self.alphas.insert(grains(alpha)) {
+            return;
+        }
+        for exponent in self.initial.offset_exponents(alpha).into_iter().chain(self.initial.impulses()) {
+            self.index.insert(Key::initial(exponent));
+        }
+        match self.initial.under() {
+            Initial::Rest | Initial::Offset { .. } | Initial::Filtered { .. } => {}
+            Initial::Powers(powers) => powers.iter().for_each(|&e| {
+                self.index.insert(Key::initial(e));
+            }),
+            Initial::Caputo => self.powers(0.0, alpha),
+        }
+    }
+
+    /// Adds all regressors that a term of this order needs under this α.
+    pub(crate) fn term(&mut self, alpha: f64, signal: usize, order: f64) {
+        if self.orders.insert((grains(alpha), signal, grains(order))) {
+            self.index.insert(Key::integral(signal, alpha - order));
+            if *self.initial.under() == Initial::Caputo {
+                self.powers(alpha - order, order);
+            }
+        }
+    }
+
+    /// Adds t^{from + i} for i = 0, 1, … below an order.
+    fn powers(&mut self, from: f64, order: f64) {
+        let mut i = 0.0;
+        while i < order - ORDER_GRAIN {
+            self.index.insert(Key::initial(from + i));
+            i += 1.0;
+        }
+    }
+
+    /// All of them, neighbours on a lattice beside each other.
+    pub(crate) fn index(mut self) -> Index {
+        self.index.sort();
+        self.index
+    }
+}
+
+/// Columns of one term of L candidates.
+#[derive(Debug, Clone, Copy)]
+pub(crate) struct Columns<const L: usize> {
+    pub(crate) at: [usize; L],
+    /// Whether they are all one, and whether each is the next one.
+    same: bool,
+    run: bool,
+}
+
+impl<const L: usize> Columns<L> {
+    pub(crate) fn new(at: [usize; L]) -> Self {
+        Self { at, same: L == 1, run: false }
+    }
+
+    /// One column for all candidates.
+    #[inline(always)]
+    pub(crate) fn one(at: usize) -> Self {
+        Self { at: [at; L], same: true, run: false }
+    }
+
+    /// Columns that ascend.
+    #[inline(always)]
+    pub(super) fn ascending(at: [usize; L]) -> Self {
+        Self { at, same: L == 1, run: at[L - 1] - at[0] == L - 1 }
+    }
+
+    #[inline(always)]
+    pub(crate) fn compare(&mut self) {
+        let first = self.at[0];
+        self.same = self.at.iter().all(|&p| p == first);
+        self.run = !self.same && self.at.iter().enumerate().all(|(n, &p)| p == first + n);
+    }
+
+    /// Elements of a vector at these columns.
+    #[inline(always)]
+    pub(super) fn of(&self, vector: &[f64]) -> Lanes<L> {
+        if self.same {
+            [vector[self.at[0]]; L]
+        } else if self.run {
+            part_of(&vector[self.at[0]..])
+        } else {
+            let mut out = [0.0; L];
+            out.iter_mut().zip(&self.at).for_each(|(x, &p)| *x = vector[p]);
+            out
+        }
+    }
+
+    /// Elements of a symmetric matrix (row-major) at these columns and those rows.
+    #[inline(always)]
+    pub(super) fn with(&self, rows: &Self, matrix: &[f64], stride: usize) -> Lanes<L> {
+        if rows.same {
+            self.of(&matrix[rows.at[0] * stride..(rows.at[0] + 1) * stride])
+        } else if self.same {
+            rows.of(&matrix[self.at[0] * stride..(self.at[0] + 1) * stride])
+        } else {
+            let mut out = [0.0; L];
+            for n in 0..L {
+                out[n] = matrix[rows.at[n] * stride + self.at[n]];
+            }
+            out
+        }
+    }
+}
+
+/// The first L elements.
+#[inline(always)]
+pub(crate) fn part_of<T: Copy, const L: usize>(values: &[T]) -> [T; L] {
+    let mut out = [values[0]; L];
+    out.copy_from_slice(&values[..L]);
+    out
+}

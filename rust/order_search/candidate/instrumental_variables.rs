@@ -1,0 +1,104 @@
+//! The coefficient step of an order search by refined instrumental variables: spectra of every regressor, made once for
+//! all candidates.
+
+use crate::error::{Error, Result};
+use crate::estimation::instrumental_variables::{low_pass, power_frequency, refine, Scratch, Settings, Source};
+use crate::order_search::result::Failure;
+use crate::parallel::{self, Stop};
+use crate::regressors::{Bank, Index, Record};
+use crate::series::Kernel;
+
+/// Low-pass behind which the first coefficients are estimated, in units of the output's own band.
+const START_BAND: f64 = 2.0;
+
+/// What the refinement of any candidate reads of one record.
+struct Shelf {
+    /// Spectrum of each column of the bank.
+    columns: Vec<Kernel>,
+    /// Spectrum of the kernel of each column of the output itself.
+    kernels: Vec<Option<Kernel>>,
+    target: Kernel,
+}
+
+/// Refines the coefficients of candidates.
+pub(crate) struct Refiner {
+    shelves: Vec<Shelf>,
+    settings: Settings,
+}
+
+impl Refiner {
+    /// Spectra of the columns of `banks`, which are those of the records' clean signals; of no use once it was told to stop.
+    pub(crate) fn new(records: &[Record], output: usize, banks: &[Bank], settings: Settings, stop: &Stop) -> Self {
+        let shelves = records
+            .iter()
+            .zip(banks)
+            .map(|(record, bank)| {
+                let all = || (0..bank.len()).collect();
+                let spectrum = |x: &[f64]| Kernel::new(if stop.is_set() { &[] } else { x });
+                Shelf {
+                    columns: parallel::map(all(), || (), |(), p| spectrum(bank.column(p))),
+                    kernels: parallel::map(
+                        all(),
+                        || (),
+                        |(), p| Some(bank.kernel(p)).filter(|k| !k.is_empty()).map(spectrum),
+                    ),
+                    target: spectrum(record.signal(output)),
+                }
+            })
+            .collect();
+        Self { shelves, settings }
+    }
+
+    /// Refines coefficients in place: of the terms, then of the initial terms record by record. What it comes to once it was
+    /// told to stop is of no use.
+    pub(crate) fn refine(
+        &self,
+        (banks, targets): (&[Bank], &[Vec<f64>]),
+        (positions, initial): (&[usize], &[usize]),
+        fixed: &[Option<f64>],
+        coefficients: &mut [f64],
+        weights: &mut [f64],
+        stop: &Stop,
+    ) -> std::result::Result<(), Failure> {
+        let sources: Vec<Source<'_>> = self
+            .shelves
+            .iter()
+            .zip(banks)
+            .zip(targets)
+            .map(|((shelf, bank), target)| Source {
+                own: positions.iter().map(|&p| shelf.kernels[p].as_ref().map(|k| (bank.kernel(p), k))).collect(),
+                measured: positions.iter().map(|&p| &shelf.columns[p]).collect(),
+                clean: positions.iter().map(|&p| &shelf.columns[p]).collect(),
+                initial: initial.iter().map(|&p| &shelf.columns[p]).collect(),
+                target: &shelf.target,
+                output: target,
+            })
+            .collect();
+        let start: Vec<f64> = coefficients.iter().chain(weights.iter()).copied().collect();
+        // An initial term that the start left out is a combination of others.
+        let n = initial.len();
+        let dropped: Vec<(usize, usize)> =
+            weights.iter().enumerate().filter(|(_, w)| **w == 0.0).map(|(i, _)| (i / n, i % n)).collect();
+        match refine(&sources, fixed, &dropped, &start, self.settings, &mut Scratch::until(stop)) {
+            Ok((solution, _, _)) if solution.iter().all(|x| x.is_finite()) => {
+                let (terms, rest) = solution.split_at(coefficients.len());
+                coefficients.copy_from_slice(terms);
+                weights.copy_from_slice(rest);
+                Ok(())
+            }
+            Ok(_) | Err(Error::Diverged { .. }) => Err(Failure::Diverged),
+            Err(_) => Err(Failure::Singular),
+        }
+    }
+}
+
+/// Bank and target behind which the first coefficients are estimated: clean signals, low-passed.
+///
+/// # Errors
+/// As [`Bank::counted`].
+pub(crate) fn start_bank(record: &Record, output: usize, index: &Index, stop: &Stop) -> Result<(Bank, Vec<f64>)> {
+    let band = START_BAND * power_frequency(record.signal(output), record.step());
+    let smooth = record.cleaned().through(&low_pass(band, record)?)?;
+    let target = smooth.signal(output).to_vec();
+    Ok((Bank::counted(index, &smooth, output, stop)?, target))
+}

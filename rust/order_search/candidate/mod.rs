@@ -1,0 +1,8 @@
+//! One candidate of a search: its coefficients, then its error.
+
+pub(crate) mod columns;
+mod instrumental_variables;
+pub(crate) mod normal_equations;
+pub(crate) mod problem;
+pub(crate) mod row_bound;
+pub(crate) mod simulation;

@@ -1,0 +1,334 @@
+//! Coefficients of candidates from normal equations that are made once, several candidates side by side.
+//!
+//! The squared equation error of candidates from a Gram matrix alone.
+
+use crate::error::Result;
+use crate::estimation::multi_innovation::{Innovation, Rows};
+use crate::fractional::operational_matrices;
+use crate::linalg::dense;
+use crate::linalg::small::{packed, solve_lanes, PIVOT_FLOOR};
+use crate::order_search::candidate::columns::Columns;
+use crate::parallel::Stop;
+use crate::regressors::Bank;
+use crate::simd::Lanes;
+
+/// Normal equations over a bank's columns, weighted as the estimator asks, scaled to a diagonal of ones.
+pub(crate) struct Normal {
+    width: usize,
+    /// Correlation matrix, row-major width × width; rows of columns that vanish are 0.
+    correlation: Vec<f64>,
+    rhs: Vec<f64>,
+    /// Size of each column, and its inverse or 0.
+    size: Vec<f64>,
+    inverse: Vec<f64>,
+}
+
+impl Normal {
+    /// From a Gram matrix over columns and target, (width + 1)² row-major, and what the prior adds to its diagonal.
+    pub(super) fn new(gram: &[f64], width: usize, prior: f64) -> Self {
+        let stride = width + 1;
+        let diagonal = |p: usize| gram[p * stride + p] + prior;
+        let size: Vec<f64> = (0..width)
+            .map(|p| if diagonal(p) > 0.0 && diagonal(p).is_finite() { diagonal(p).sqrt() } else { 0.0 })
+            .collect();
+        let inverse: Vec<f64> = size.iter().map(|&s| if s > 0.0 { 1.0 / s } else { 0.0 }).collect();
+        let mut correlation = vec![0.0; width * width];
+        for p in 0..width {
+            for q in (0..width).filter(|&q| inverse[p] > 0.0 && inverse[q] > 0.0) {
+                correlation[p * width + q] = if p == q { 1.0 } else { gram[p * stride + q] * inverse[p] * inverse[q] };
+            }
+        }
+        let rhs = (0..width).map(|p| gram[p * stride + width] * inverse[p]).collect();
+        Self { width, correlation, rhs, size, inverse }
+    }
+
+    /// Correlation of two columns.
+    #[inline(always)]
+    pub(crate) fn product(&self, a: usize, b: usize) -> f64 {
+        self.correlation[a * self.width + b]
+    }
+
+    /// Correlations of one column with all.
+    #[inline(always)]
+    pub(crate) fn products(&self, a: usize) -> &[f64] {
+        &self.correlation[a * self.width..(a + 1) * self.width]
+    }
+
+    /// Products of the columns, of unit size, with the target.
+    pub(crate) fn rhs(&self) -> &[f64] {
+        &self.rhs
+    }
+
+    /// Inverse size of each column, 0 for one that vanishes.
+    pub(crate) fn inverse(&self) -> &[f64] {
+        &self.inverse
+    }
+}
+
+/// Memory of a solve of L candidates side by side.
+pub(crate) struct Solve<const L: usize> {
+    gram: Vec<Lanes<L>>,
+    /// Right-hand side, then the scaled solution.
+    rhs: Vec<Lanes<L>>,
+    pub(crate) coefficients: Vec<Lanes<L>>,
+    /// Coefficients of the initial terms, record by record.
+    pub(crate) initial: Vec<Lanes<L>>,
+}
+
+impl<const L: usize> Solve<L> {
+    pub(crate) fn new() -> Self {
+        Self { gram: Vec::new(), rhs: Vec::new(), coefficients: Vec::new(), initial: Vec::new() }
+    }
+}
+
+/// The normal equations of all candidates: over all records for their terms, over each for its initial terms.
+pub(crate) struct NormalEquations {
+    terms: Normal,
+    /// Per record, for its initial terms; empty at rest.
+    parts: Vec<Normal>,
+    /// Known coefficients of terms, and the terms whose coefficients are estimated.
+    fixed: Vec<Option<f64>>,
+    free: Vec<usize>,
+}
+
+impl NormalEquations {
+    /// From the equations of all records together and, where there are initial terms, those of each.
+    pub(super) fn new(terms: Normal, parts: Vec<Normal>, fixed: &[Option<f64>]) -> Self {
+        let free = (0..fixed.len()).filter(|&k| fixed[k].is_none()).collect();
+        Self { terms, parts, fixed: fixed.to_vec(), free }
+    }
+
+    /// The equations over all records where no coefficient is known and there are no initial terms.
+    pub(crate) fn whole(&self) -> Option<&Normal> {
+        (self.parts.is_empty() && self.free.len() == self.fixed.len()).then_some(&self.terms)
+    }
+
+    /// Known coefficients of the terms.
+    pub(super) fn fixed(&self) -> &[Option<f64>] {
+        &self.fixed
+    }
+
+    /// Coefficients of L candidates; flags those that are singular.
+    ///
+    /// `positions` gives the column of each term per candidate; the initial terms are those of all.
+    #[inline(always)]
+    pub(crate) fn solve<const L: usize>(
+        &self,
+        positions: &[Columns<L>],
+        initial: &[usize],
+        solve: &mut Solve<L>,
+    ) -> [bool; L] {
+        let normal = &self.terms;
+        let (free, width) = (self.free.len(), normal.width);
+        let k = free + initial.len() * self.parts.len();
+        let zero = [0.0; L];
+        let Solve { gram, rhs, coefficients, initial: weights } = solve;
+        gram.clear();
+        gram.resize(packed(k, 0), zero);
+        rhs.clear();
+        rhs.resize(k, zero);
+        for (a, &ta) in self.free.iter().enumerate() {
+            let rows = &positions[ta];
+            for (b, &tb) in self.free[..=a].iter().enumerate() {
+                gram[packed(a, b)] = rows.with(&positions[tb], &normal.correlation, width);
+            }
+            rhs[a] = rows.of(&normal.rhs);
+            for (columns, fixed) in positions.iter().zip(&self.fixed) {
+                if let Some(value) = *fixed {
+                    let (size, known) = (columns.of(&normal.size), rows.with(columns, &normal.correlation, width));
+                    (0..L).for_each(|n| rhs[a][n] -= value * size[n] * known[n]);
+                }
+            }
+        }
+        for (r, part) in self.parts.iter().enumerate() {
+            for (i, &e) in initial.iter().enumerate() {
+                let a = free + r * initial.len() + i;
+                let row = &part.correlation[e * width..(e + 1) * width];
+                for (b, &tb) in self.free.iter().enumerate() {
+                    // This record's share of a term's column, against the size that the column has on all.
+                    let columns = &positions[tb];
+                    let (c, size, all) = (columns.of(row), columns.of(&part.size), columns.of(&normal.inverse));
+                    gram[packed(a, b)] = std::array::from_fn(|n| c[n] * size[n] * all[n]);
+                }
+                for (j, &f) in initial[..=i].iter().enumerate() {
+                    gram[packed(a, free + r * initial.len() + j)] = [row[f]; L];
+                }
+                rhs[a] = [part.rhs[e]; L];
+                for (columns, fixed) in positions.iter().zip(&self.fixed) {
+                    if let Some(value) = *fixed {
+                        let (size, known) = (columns.of(&part.size), columns.of(row));
+                        (0..L).for_each(|n| rhs[a][n] -= value * size[n] * known[n]);
+                    }
+                }
+            }
+        }
+        let singular = solve_lanes(gram, rhs, free);
+        coefficients.clear();
+        let mut next = 0;
+        for (columns, fixed) in positions.iter().zip(&self.fixed) {
+            coefficients.push(match *fixed {
+                Some(value) => [value; L],
+                None => {
+                    let scale = columns.of(&normal.inverse);
+                    let x = rhs[next];
+                    next += 1;
+                    let mut out = [0.0; L];
+                    for n in 0..L {
+                        out[n] = x[n] * scale[n];
+                    }
+                    out
+                }
+            });
+        }
+        weights.clear();
+        for (r, part) in self.parts.iter().enumerate() {
+            for (i, &e) in initial.iter().enumerate() {
+                let x = rhs[free + r * initial.len() + i];
+                weights.push(std::array::from_fn(|n| x[n] * part.inverse[e]));
+            }
+        }
+        singular
+    }
+}
+
+/// Gram matrix of a bank's columns and the target, (columns + 1)² row-major; of no use once it was told to stop.
+pub(super) fn plain_gram(bank: &Bank, target: &[f64], stop: &Stop) -> Vec<f64> {
+    dense::gram(bank.columns(), target, stop)
+}
+
+/// Gives a Gram matrix multi-innovation weights: p on all rows but the last p − 1.
+#[allow(clippy::cast_precision_loss)]
+pub(super) fn weigh(gram: &mut [f64], bank: &Bank, target: &[f64], innovation: Innovation) -> Result<()> {
+    let width = bank.len() + 1;
+    // Φ is orthogonal: the unweighted Gram matrix is the same in Haar coordinates.
+    let m = target.len();
+    let tail = innovation.length.min(m) - 1;
+    gram.iter_mut().for_each(|g| *g *= innovation.length.min(m) as f64);
+    let mut rows = vec![vec![0.0; width]; tail];
+    for j in 0..width {
+        let mut values = if j < bank.len() { bank.column(j) } else { target }.to_vec();
+        if innovation.rows == Rows::Haar {
+            operational_matrices::transform(&mut values)?;
+        }
+        for (t, row) in rows.iter_mut().enumerate() {
+            row[j] = values[m - 1 - t];
+        }
+    }
+    for (t, row) in rows.iter().enumerate() {
+        // Row m−1−t is used by t+1 steps instead of p.
+        let excess = (innovation.length.min(m) - 1 - t) as f64;
+        for (i, &x) in row.iter().enumerate() {
+            for (j, &y) in row.iter().enumerate() {
+                gram[i * width + j] -= excess * x * y;
+            }
+        }
+    }
+    Ok(())
+}
+
+/// Gram matrix of columns and target summed over records, and the norms on its diagonal.
+pub(crate) struct Squares {
+    stride: usize,
+    gram: Vec<f64>,
+    /// Its diagonal, and the roots of that.
+    diagonal: Vec<f64>,
+    norms: Vec<f64>,
+    /// What rounding may add to a squared sum, per unit of the squared sum of norms.
+    unit: f64,
+    /// The same where the least sum over all coefficients is asked for, and the least eigenvalue of the terms' correlation
+    /// matrix from which on it holds (docs/mathematics.md, stretches of one term).
+    slack: f64,
+    flat: f64,
+}
+
+impl Squares {
+    /// From a Gram matrix over so many columns and the target, row-major, how many samples it sums over, of how many terms
+    /// a candidate is and how many times another a row may weigh in the equations that give its coefficients.
+    #[allow(clippy::cast_precision_loss)]
+    pub(super) fn new(gram: Vec<f64>, width: usize, samples: usize, terms: usize, weights: usize) -> Self {
+        let slack = 4.0 * f64::EPSILON * (samples + 8 * terms + 16) as f64;
+        Self {
+            stride: width + 1,
+            diagonal: (0..=width).map(|p| gram[p * (width + 2)]).collect(),
+            norms: (0..=width).map(|p| gram[p * (width + 2)].max(0.0).sqrt()).collect(),
+            gram,
+            unit: 4.0 * f64::EPSILON * samples as f64,
+            slack,
+            // Whose columns lie this far apart is not singular in the weighted equations either.
+            flat: (2.0 * terms as f64 * slack).max(16.0 * weights as f64 * PIVOT_FLOOR),
+        }
+    }
+
+    /// Place of the target.
+    #[inline(always)]
+    pub(super) fn target(&self) -> usize {
+        self.stride - 1
+    }
+
+    /// Products of all columns and the target with one of them.
+    #[inline(always)]
+    pub(super) fn row(&self, column: usize) -> &[f64] {
+        &self.gram[column * self.stride..(column + 1) * self.stride]
+    }
+
+    /// One product.
+    #[inline(always)]
+    pub(super) fn product(&self, a: usize, b: usize) -> f64 {
+        self.gram[a * self.stride + b]
+    }
+
+    /// Squared norms of columns and target.
+    #[inline(always)]
+    pub(super) fn diagonal(&self) -> &[f64] {
+        &self.diagonal
+    }
+
+    /// Norms of columns and target.
+    #[inline(always)]
+    pub(super) fn norms(&self) -> &[f64] {
+        &self.norms
+    }
+
+    /// What rounding may add to a least squared sum, per unit of the squared sum of norms.
+    #[inline(always)]
+    pub(super) fn slack(&self) -> f64 {
+        self.slack
+    }
+
+    /// The least eigenvalue of a correlation matrix of which anything is proved.
+    #[inline(always)]
+    pub(super) fn flat(&self) -> f64 {
+        self.flat
+    }
+
+    /// Lower bounds of the squared equation error of L candidates, rounding allowed for, and its values.
+    #[inline(always)]
+    pub(crate) fn error<const L: usize>(
+        &self,
+        positions: &[Columns<L>],
+        coefficients: &[Lanes<L>],
+    ) -> (Lanes<L>, Lanes<L>) {
+        let (stride, target) = (self.stride, self.stride - 1);
+        let mut sum = [self.gram[target * stride + target]; L];
+        let mut size = [self.norms[target]; L];
+        for (i, (rows, c)) in positions.iter().zip(coefficients).enumerate() {
+            let norms = rows.of(&self.norms);
+            // c·(c·G_ii + 2 Σ_{j<i} c_j G_ij − 2 b_i)
+            let mut inner = rows.of(&self.gram[target * stride..]);
+            for (columns, d) in positions[..i].iter().zip(coefficients) {
+                let g = rows.with(columns, &self.gram, stride);
+                (0..L).for_each(|n| inner[n] -= d[n] * g[n]);
+            }
+            let diagonal = rows.of(&self.diagonal);
+            for n in 0..L {
+                sum[n] += c[n] * (c[n] * diagonal[n] - 2.0 * inner[n]);
+                size[n] += c[n].abs() * norms[n];
+            }
+        }
+        let mut least = [0.0; L];
+        for n in 0..L {
+            least[n] = sum[n] - self.unit * size[n] * size[n];
+        }
+        (least, sum)
+    }
+}

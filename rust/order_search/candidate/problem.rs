@@ -1,0 +1,476 @@
+//! What all candidates of one equation share, and the way of one candidate through it: coefficients, bound, error.
+
+use crate::equation::{Initial, Structure};
+use crate::error::{check_finite, Error, Result};
+use crate::estimation::multi_innovation::Rows;
+use crate::fractional::operational_matrices;
+use crate::order_search::candidate::columns::Columns;
+use crate::order_search::candidate::instrumental_variables::{start_bank, Refiner};
+use crate::order_search::candidate::normal_equations::{plain_gram, weigh, Normal, NormalEquations, Solve, Squares};
+use crate::order_search::candidate::simulation::March;
+use crate::order_search::control::Control;
+use crate::order_search::dual_bound::infeasibility::Reach;
+use crate::order_search::dual_bound::linearized_vectors::{Held, Tangent, Tangents};
+use crate::order_search::dual_bound::lower_bound::Bound;
+use crate::order_search::dual_bound::tailored_vectors::{Adapted, Fitted, Memory};
+use crate::order_search::dual_bound::unstable_zeros::Roots;
+use crate::order_search::options::{Criterion, Estimator, Options};
+use crate::order_search::result::{Failure, Row, Verdict};
+use crate::parallel::Stop;
+use crate::regressors::{Bank, Index, Key, Record};
+use crate::simd::{self, WIDTH};
+
+/// Transforms that following one candidate is worth; making test vectors must stay below a fraction of all that.
+const TRANSFORMS: u64 = 6;
+/// The same where coefficients are refined: a few steps of a division and a dozen transforms each.
+const REFINING: u64 = 100;
+
+/// Columns and coefficients of a candidate.
+pub(crate) type Known = (Vec<usize>, Vec<f64>);
+
+/// Everything the candidates of one equation share.
+pub(crate) struct Problem {
+    index: Index,
+    banks: Vec<Bank>,
+    targets: Vec<Vec<f64>>,
+    pub(crate) equations: NormalEquations,
+    /// Where the equation error in squares ranks: its own Gram matrix, without weights and prior.
+    pub(crate) squares: Option<Squares>,
+    pub(crate) bound: Option<Bound>,
+    /// Test vectors made for candidates of the search, where these pay.
+    pub(crate) adapted: Option<Adapted>,
+    /// What proves that free runs explode, and test vectors that follow coefficients, where candidates are to be proved
+    /// closely.
+    pub(crate) roots: Option<Roots>,
+    pub(crate) tangents: Option<Tangents>,
+    refiner: Option<Refiner>,
+    /// Where coefficients are refined: the banks that the bound speaks of, until it is made.
+    bound_banks: Vec<Bank>,
+    options: Options,
+    samples: usize,
+}
+
+/// [`Bound::evaluate`] as a kernel.
+struct Bounding<'a, F> {
+    bound: &'a Bound,
+    limit: f64,
+    columns: F,
+}
+
+impl<'a, F> simd::Kernel for Bounding<'a, F>
+where
+    F: Fn(usize) -> (&'a [usize], &'a [f64], &'a [usize], &'a [f64]),
+{
+    type Output = (f64, f64);
+
+    #[inline(always)]
+    fn run(self) -> (f64, f64) {
+        self.bound.evaluate(self.limit, self.columns)
+    }
+}
+
+/// [`Bound::excludes`] as a kernel.
+struct Excluding<'a> {
+    bound: &'a Bound,
+    limit: f64,
+    terms: &'a [usize],
+    fixed: &'a [Option<f64>],
+    initial: &'a [usize],
+    start: &'a [f64],
+    reach: &'a mut Reach,
+}
+
+impl simd::Kernel for Excluding<'_> {
+    type Output = bool;
+
+    #[inline(always)]
+    fn run(self) -> bool {
+        self.bound.excludes(self.limit, self.terms, self.fixed, self.initial, self.start, self.reach)
+    }
+}
+
+/// [`Adapted::exclude`] as a kernel.
+struct Adapting<'a> {
+    adapted: &'a Adapted,
+    limit: f64,
+    terms: &'a [usize],
+    coefficients: &'a [f64],
+    memory: &'a mut Memory,
+}
+
+impl simd::Kernel for Adapting<'_> {
+    type Output = bool;
+
+    #[inline(always)]
+    fn run(self) -> bool {
+        self.adapted.exclude(self.terms, self.coefficients, self.limit, self.memory)
+    }
+}
+
+/// [`Tangents::exclude`] as a kernel.
+struct Following<'a> {
+    tangents: &'a Tangents,
+    limit: f64,
+    terms: &'a [usize],
+    coefficients: &'a [f64],
+    held: &'a mut Held,
+}
+
+impl simd::Kernel for Following<'_> {
+    type Output = bool;
+
+    #[inline(always)]
+    fn run(self) -> bool {
+        self.tangents.exclude(self.terms, self.coefficients, self.limit, self.held)
+    }
+}
+
+/// Memory of one thread.
+pub(crate) struct Scratch {
+    memory: Memory,
+    held: Held,
+    reach: Reach,
+    start: Vec<f64>,
+    one: Solve<1>,
+    march: March,
+    /// Coefficients of the last candidate's terms, and of its initial terms by record.
+    coefficients: Vec<f64>,
+    weights: Vec<f64>,
+    /// Columns of the candidate at hand.
+    pub(crate) positions: Vec<usize>,
+    pub(crate) initial: Vec<usize>,
+}
+
+impl Default for Scratch {
+    fn default() -> Self {
+        Self {
+            memory: Memory::default(),
+            held: Held::default(),
+            reach: Reach::default(),
+            start: Vec::new(),
+            one: Solve::new(),
+            march: March::default(),
+            coefficients: Vec::new(),
+            weights: Vec::new(),
+            positions: Vec::new(),
+            initial: Vec::new(),
+        }
+    }
+}
+
+impl Problem {
+    /// Builds banks and Gram matrices for the regressors in `index`, whose memory was counted.
+    pub(crate) fn new(
+        records: &[Record],
+        output: usize,
+        index: Index,
+        fixed: &[Option<f64>],
+        options: &Options,
+        stop: &Stop,
+    ) -> Result<Self> {
+        if records.is_empty() {
+            return Err(Error::Length { name: "records".into(), expected: 1, found: 0 });
+        }
+        options.check()?;
+        check_finite("fixed coefficients", &fixed.iter().flatten().copied().collect::<Vec<_>>())?;
+        if matches!(options.estimator, Estimator::MultiInnovation(innovation) if innovation.rows == Rows::Haar) {
+            for record in records {
+                operational_matrices::check_power_of_two(record.m())?;
+            }
+        }
+        let width = index.keys().len();
+        let refined = options.refines();
+        // Noise of a measured output that drives an equation would rank like a fault of the equation.
+        let banks = records
+            .iter()
+            .map(|r| {
+                if refined {
+                    Bank::counted(&index, &r.cleaned(), output, stop)
+                } else {
+                    Bank::counted(&index, r, output, stop)
+                }
+            })
+            .collect::<Result<Vec<_>>>()?;
+        let targets: Vec<Vec<f64>> = records.iter().map(|r| r.signal(output).to_vec()).collect();
+        let samples = records.iter().map(Record::m).sum();
+        let elements = (width + 1) * (width + 1);
+        let mut sum = vec![0.0; elements];
+        let mut unweighted = if options.scored_by_products() { vec![0.0; elements] } else { Vec::new() };
+        let prior = match options.estimator {
+            Estimator::LeastSquares | Estimator::InstrumentalVariables(_) => 0.0,
+            Estimator::MultiInnovation(innovation) => 1.0 / innovation.prior_covariance,
+        };
+        let mut parts = Vec::new();
+        for ((bank, target), record) in banks.iter().zip(&targets).zip(records) {
+            let mut gram = if refined {
+                let (bank, target) = start_bank(record, output, &index, stop)?;
+                plain_gram(&bank, &target, stop)
+            } else {
+                plain_gram(bank, target, stop)
+            };
+            stop.check()?;
+            unweighted.iter_mut().zip(&gram).for_each(|(s, g)| *s += g);
+            if let Estimator::MultiInnovation(innovation) = options.estimator {
+                weigh(&mut gram, bank, target, innovation)?;
+            }
+            sum.iter_mut().zip(&gram).for_each(|(s, g)| *s += g);
+            if options.initial != Initial::Rest {
+                parts.push(Normal::new(&gram, width, prior));
+            }
+        }
+        let refiner = match options.estimator {
+            Estimator::InstrumentalVariables(settings) => Some(Refiner::new(records, output, &banks, settings, stop)),
+            _ => None,
+        };
+        // D e = w holds for integrals of the output as it was measured.
+        let bound_banks = if refined && options.early_stopping && options.criterion == Criterion::OutputError {
+            records
+                .iter()
+                .map(|r| Bank::counted(&index, &r.cleaned_but(output), output, stop))
+                .collect::<Result<_>>()?
+        } else {
+            Vec::new()
+        };
+        Ok(Self {
+            index,
+            banks,
+            targets,
+            equations: NormalEquations::new(Normal::new(&sum, width, prior), parts, fixed),
+            squares: options
+                .scored_by_products()
+                .then(|| Squares::new(unweighted, width, samples, fixed.len(), options.weights())),
+            bound: None,
+            adapted: None,
+            roots: None,
+            tangents: None,
+            refiner,
+            bound_banks,
+            options: options.clone(),
+            samples,
+        })
+    }
+
+    /// Makes test vectors for about this many candidates, as far as they pay; on the current thread pool.
+    pub(crate) fn with_bound(mut self, candidates: u64, stop: &Stop) -> Self {
+        let banks = std::mem::take(&mut self.bound_banks);
+        let (banks, transforms) = if self.refines() { (&banks, 4 * REFINING) } else { (&self.banks, TRANSFORMS) };
+        if self.options.early_stopping && self.squares.is_none() && !banks.is_empty() {
+            let output_error = self.options.criterion == Criterion::OutputError;
+            let own = (0..self.index.keys().len()).filter(|&p| !banks[0].kernel(p).is_empty()).count() as u64;
+            // Two transforms for each own column and test vector; the products cost as much as a transform or so.
+            let each = 2 * own + 4;
+            #[allow(clippy::cast_possible_truncation)]
+            let groups = (candidates.saturating_mul(transforms) / 4 / (each * WIDTH as u64))
+                .min((Bound::POOL / WIDTH) as u64) as usize;
+            if groups > 0 {
+                let data = (&banks[..], &self.targets[..]);
+                self.bound = Some(Bound::new(data, self.options.norm, output_error, groups * WIDTH, stop));
+            }
+        }
+        self
+    }
+
+    /// Whether coefficients are refined after a first estimate.
+    pub(crate) fn refines(&self) -> bool {
+        self.refiner.is_some()
+    }
+
+    /// No test vectors of candidates yet, and the bytes that each will take.
+    pub(crate) fn no_adapted(&self) -> (Adapted, u64) {
+        (Adapted::new(&self.banks, &self.targets, self.options.norm), Adapted::bytes(&self.banks))
+    }
+
+    /// The test vector of the candidate with these columns and its least-squares coefficients, at rest.
+    pub(crate) fn fit(&self, adapted: &Adapted, positions: &[usize]) -> Option<Fitted> {
+        let coefficients = self.alone(positions)?;
+        adapted.fit(&self.banks, &self.targets, positions, &coefficients)
+    }
+
+    /// Whether these test vectors exclude that candidate.
+    pub(crate) fn excluded_by(&self, adapted: &Adapted, positions: &[usize], limit: f64) -> bool {
+        let Some(coefficients) = self.alone(positions) else { return false };
+        let mut memory = Memory::default();
+        simd::widest(Adapting { adapted, limit, terms: positions, coefficients: &coefficients, memory: &mut memory })
+    }
+
+    /// No test vectors that follow coefficients yet.
+    pub(crate) fn no_tangents(&self) -> Tangents {
+        Tangents::new(&self.banks, &self.targets, self.options.norm)
+    }
+
+    /// The one of the candidate with these columns and coefficients, at rest.
+    pub(crate) fn tangent(&self, tangents: &Tangents, terms: &[usize], c: &[f64], limit: f64) -> Option<Tangent> {
+        tangents.fit((&self.banks, &self.targets), terms, c, limit)
+    }
+
+    /// Those of some candidates, by columns and coefficients, that it does not exclude.
+    pub(crate) fn left_by(&self, tangents: &Tangents, made: &Tangent, all: &[Known], limit: f64) -> Vec<Known> {
+        all.iter().filter(|(terms, c)| !tangents.excludes(made, terms, c, limit)).cloned().collect()
+    }
+
+    /// Makes what proves that free runs explode, where its tables fit into so many bytes: how many they take. Runs on the
+    /// current thread pool.
+    pub(crate) fn with_roots(&mut self, spare: u64) -> u64 {
+        let bytes = Roots::bytes(&self.banks);
+        if bytes > spare || !Roots::pay(&self.targets) {
+            return 0;
+        }
+        self.roots = Some(Roots::new(&self.banks, &self.targets, self.options.norm));
+        bytes
+    }
+
+    /// Least-squares coefficients of the candidate with these columns, at rest; none where it is singular.
+    pub(crate) fn alone(&self, positions: &[usize]) -> Option<Vec<f64>> {
+        let sources: Vec<Columns<1>> = positions.iter().map(|&p| Columns::new([p])).collect();
+        let mut one = Solve::new();
+        let [singular] = self.equations.solve(&sources, &[], &mut one);
+        (!singular).then(|| one.coefficients.iter().map(|c| c[0]).collect())
+    }
+
+    /// Size of the output over all records.
+    pub(crate) fn size(&self) -> f64 {
+        self.targets.iter().flatten().map(|y| y * y).sum::<f64>().sqrt()
+    }
+
+    /// Samples of all records.
+    pub(crate) fn samples(&self) -> usize {
+        self.samples
+    }
+
+    /// Position of I^{α−ν} s in the banks.
+    pub(crate) fn position(&self, signal: usize, eta: f64) -> Result<usize> {
+        self.index
+            .get(Key::integral(signal, eta))
+            .ok_or_else(|| Error::Internal { what: format!("no regressor of signal {signal} at order {eta}") })
+    }
+
+    /// Positions of the initial terms of a structure.
+    pub(crate) fn initial_positions(&self, structure: &Structure, out: &mut Vec<usize>) {
+        out.clear();
+        out.extend(
+            structure
+                .initial_exponents(&self.options.initial)
+                .into_iter()
+                .filter_map(|e| self.index.get(Key::initial(e))),
+        );
+    }
+
+    /// Evaluates a structure given the positions of its terms; leaves its coefficients in the scratch.
+    ///
+    /// `bounded` tells whether the bound, where there is one, is asked first.
+    pub(crate) fn evaluate(
+        &self,
+        positions: &[usize],
+        initial: &[usize],
+        limit: f64,
+        bounded: bool,
+        scratch: &mut Scratch,
+        control: &Control,
+    ) -> Verdict {
+        let sources: Vec<Columns<1>> = positions.iter().map(|&p| Columns::new([p])).collect();
+        let Scratch { memory, held, reach, start, one, march, coefficients, weights, .. } = scratch;
+        let [singular] = self.equations.solve(&sources, initial, one);
+        if singular {
+            return Verdict::Failed(Failure::Singular);
+        }
+        coefficients.clear();
+        coefficients.extend(one.coefficients.iter().map(|c| c[0]));
+        weights.clear();
+        weights.extend(one.initial.iter().map(|c| c[0]));
+        if let (Some(_), Some(bound), true) = (&self.refiner, &self.bound, limit < f64::INFINITY) {
+            // The refinement may change the coefficients in any way: only what holds of all of them excludes.
+            start.clear();
+            start.extend(coefficients.iter().chain(weights.iter()));
+            let (terms, fixed) = (positions, self.equations.fixed());
+            if simd::widest(Excluding { bound, limit, terms, fixed, initial, start, reach }) {
+                return Verdict::Bounded(limit);
+            }
+        }
+        if let Some(refiner) = &self.refiner {
+            let (data, places) = ((&self.banks[..], &self.targets[..]), (positions, initial));
+            let fixed = self.equations.fixed();
+            if let Err(failure) = refiner.refine(data, places, fixed, coefficients, weights, &control.stop) {
+                // What was told to stop has found nothing.
+                return if control.stopped() { Verdict::Stopped(0.0) } else { Verdict::Failed(failure) };
+            }
+        }
+        let (coefficients, weights) = (&coefficients[..], &weights[..]);
+        let of_record = |r: usize| &weights[r * initial.len()..(r + 1) * initial.len()];
+        if let (true, Some(bound)) = (bounded && limit < f64::INFINITY, &self.bound) {
+            let columns = |r: usize| (positions, coefficients, initial, of_record(r));
+            let (lowest, _) = simd::widest(Bounding { bound, limit, columns });
+            if lowest > limit {
+                return Verdict::Bounded(lowest);
+            }
+        }
+        if let (Some(adapted), true) = (&self.adapted, limit < f64::INFINITY) {
+            if simd::widest(Adapting { adapted, limit, terms: positions, coefficients, memory }) {
+                return Verdict::Bounded(limit);
+            }
+        }
+        if let (Some(tangents), true) = (&self.tangents, limit < f64::INFINITY) {
+            if simd::widest(Following { tangents, limit, terms: positions, coefficients, held }) {
+                return Verdict::Bounded(limit);
+            }
+        }
+        let norm = self.options.norm;
+        let mut raw = 0.0;
+        for (r, (bank, target)) in self.banks.iter().zip(&self.targets).enumerate() {
+            let terms = positions.iter().copied().zip(coefficients.iter().copied());
+            let starts = initial.iter().copied().zip(of_record(r).iter().copied());
+            let column = |(p, c): (usize, f64)| (bank.column(p), c);
+            let verdict = match self.options.criterion {
+                Criterion::EquationError => march.residuals(target, terms.chain(starts).map(column), norm, raw, limit),
+                Criterion::OutputError => {
+                    let own = terms.clone().map(|(p, c)| (bank.kernel(p), c)).filter(|(kernel, _)| !kernel.is_empty());
+                    let driven = terms.filter(|&(p, _)| bank.kernel(p).is_empty()).chain(starts).map(column);
+                    march.run(target, own, driven, norm, raw, limit, control)
+                }
+            };
+            match verdict {
+                Verdict::Score(sum) => raw = sum,
+                other => return other,
+            }
+        }
+        Verdict::Score(raw)
+    }
+
+    /// A raw sum in the norm asked for.
+    pub(crate) fn score(&self, raw: f64) -> f64 {
+        self.options.norm.score(raw, self.samples)
+    }
+
+    /// The row of the candidate that was evaluated last, with so many initial terms a record.
+    pub(crate) fn row(&self, index: u64, raw: f64, initial: usize, scratch: &Scratch) -> Row {
+        Row {
+            index,
+            score: raw,
+            coefficients: scratch.coefficients.clone(),
+            initial: (0..self.banks.len()).map(|r| scratch.weights[r * initial..(r + 1) * initial].to_vec()).collect(),
+        }
+    }
+
+    /// Evaluates a structure on its own: the row it makes.
+    pub(crate) fn evaluate_structure(
+        &self,
+        structure: &Structure,
+        limit: f64,
+        scratch: &mut Scratch,
+        control: &Control,
+    ) -> Result<(Verdict, Row)> {
+        let positions = (0..structure.terms.len())
+            .map(|k| self.position(structure.terms[k].signal, structure.integration(k)))
+            .collect::<Result<Vec<_>>>()?;
+        let mut initial = Vec::new();
+        self.initial_positions(structure, &mut initial);
+        let verdict = self.evaluate(&positions, &initial, limit, true, scratch, control);
+        let raw = if let Verdict::Score(raw) = verdict { raw } else { f64::INFINITY };
+        let row = match verdict {
+            Verdict::Failed(Failure::Singular) => {
+                Row { index: 0, score: raw, coefficients: Vec::new(), initial: Vec::new() }
+            }
+            _ => self.row(0, raw, initial.len(), scratch),
+        };
+        Ok((verdict, row))
+    }
+}

@@ -1,0 +1,273 @@
+//! Lower bounds of the squared equation error along a stretch of candidates that differ in one term: this term comes last
+//! in the factorisation of the products, and the factor of the others is shared.
+
+use crate::order_search::candidate::columns::{part_of, Columns};
+use crate::order_search::candidate::normal_equations::Squares;
+use crate::simd::Lanes;
+
+/// Most terms but the one that changes.
+const MOST: usize = 7;
+
+/// The factor L D Lᵀ of the products of all terms but one, and what these alone leave of the target.
+pub(crate) struct Shared<'a> {
+    squares: &'a Squares,
+    count: usize,
+    columns: [usize; MOST],
+    /// Rows of L below its diagonal of ones, and D⁻¹.
+    lower: [[f64; MOST]; MOST],
+    inverse: [f64; MOST],
+    /// Products with the target behind L⁻¹, and the coefficients of these terms alone.
+    values: [f64; MOST],
+    alone: [f64; MOST],
+    norms: [f64; MOST],
+    /// What these terms leave of the target's squared norm.
+    left: f64,
+    /// Trace of the inverse of their correlation matrix, which no inverse of an eigenvalue exceeds.
+    trace: f64,
+}
+
+impl<'a> Shared<'a> {
+    /// Of the terms with these columns but for one of them; none where they are too many, or so nearly dependent that
+    /// nothing is proved of any candidate.
+    #[inline(always)]
+    pub(crate) fn new(squares: &'a Squares, columns: &[usize], but: usize) -> Option<Self> {
+        let count = columns.len().checked_sub(1).filter(|count| *count <= MOST)?;
+        let zero = [0.0; MOST];
+        let mut shared = Self {
+            squares,
+            count,
+            columns: [0; MOST],
+            lower: [zero; MOST],
+            inverse: zero,
+            values: zero,
+            alone: zero,
+            norms: zero,
+            left: squares.product(squares.target(), squares.target()),
+            trace: 0.0,
+        };
+        for i in 0..count {
+            shared.columns[i] = columns[i + usize::from(i >= but)];
+            shared.extend(i);
+        }
+        // Also where it is not a number.
+        (shared.trace * squares.flat() <= 1.0).then_some(shared)
+    }
+
+    /// Takes term `i` into the factor.
+    #[inline(always)]
+    #[allow(clippy::needless_range_loop)] // triangles, whose elements are told by their places
+    fn extend(&mut self, i: usize) {
+        let (squares, column) = (self.squares, self.columns[i]);
+        let whole = squares.product(column, column);
+        let (mut pivot, mut value) = (whole, squares.product(squares.target(), column));
+        let mut row = [0.0; MOST];
+        for j in 0..i {
+            row[j] = squares.product(column, self.columns[j]);
+            for l in 0..j {
+                row[j] -= row[l] * self.lower[j][l];
+            }
+        }
+        for j in 0..i {
+            self.lower[i][j] = row[j] * self.inverse[j];
+            pivot -= row[j] * self.lower[i][j];
+            value -= self.lower[i][j] * self.values[j];
+        }
+        self.inverse[i] = if pivot > 0.0 { 1.0 / pivot } else { f64::INFINITY };
+        self.values[i] = value;
+        self.norms[i] = squares.norms()[column];
+        let last = value * self.inverse[i];
+        self.left -= value * last;
+        // What the others make of this column, from the last one back; so much less is left for them to do.
+        let mut sum = whole;
+        for j in (0..i).rev() {
+            row[j] = self.lower[i][j];
+            for l in j + 1..i {
+                row[j] -= self.lower[l][j] * row[l];
+            }
+            sum += row[j] * row[j] * self.norms[j] * self.norms[j];
+            self.alone[j] -= row[j] * last;
+        }
+        self.alone[i] = last;
+        self.trace += sum * self.inverse[i];
+    }
+
+    /// Appends the positions among `columns`, which ascend, of those that this bound does not exclude where they stand
+    /// for the term that changes.
+    #[inline(always)]
+    pub(crate) fn open<const L: usize>(&self, columns: &[usize], limit: f64, open: &mut Vec<usize>) {
+        // The usual sizes get loops of known length.
+        match self.count {
+            0 => self.open_sized::<L>(0, columns, limit, open),
+            1 => self.open_sized::<L>(1, columns, limit, open),
+            2 => self.open_sized::<L>(2, columns, limit, open),
+            3 => self.open_sized::<L>(3, columns, limit, open),
+            4 => self.open_sized::<L>(4, columns, limit, open),
+            count => self.open_sized::<L>(count, columns, limit, open),
+        }
+    }
+
+    #[inline(always)]
+    fn open_sized<const L: usize>(&self, count: usize, columns: &[usize], limit: f64, open: &mut Vec<usize>) {
+        let mut from = 0;
+        while from + L <= columns.len() {
+            let changing = Columns::<L>::ascending(part_of(&columns[from..]));
+            self.append(count, &changing, (from, L), limit, open);
+            from += L;
+        }
+        if from < columns.len() {
+            let rest = &columns[from..];
+            let mut at = [rest[0]; L];
+            at[..rest.len()].copy_from_slice(rest);
+            let mut changing = Columns::new(at);
+            changing.compare();
+            self.append(count, &changing, (from, rest.len()), limit, open);
+        }
+    }
+
+    /// Appends those of so many lanes, from this position on, that are not excluded.
+    #[inline(always)]
+    fn append<const L: usize>(
+        &self,
+        count: usize,
+        changing: &Columns<L>,
+        (from, lanes): (usize, usize),
+        limit: f64,
+        open: &mut Vec<usize>,
+    ) {
+        let excluded = self.excluded(count, changing, limit);
+        if excluded == [true; L] {
+            return;
+        }
+        open.extend((from..from + lanes).zip(excluded).filter(|(_, excluded)| !excluded).map(|(at, _)| at));
+    }
+
+    /// Whether no coefficients at all bring the squared error of each of L candidates down to the limit.
+    #[inline(always)]
+    #[allow(clippy::needless_range_loop)] // triangles of lanes, whose elements are told by their places
+    fn excluded<const L: usize>(&self, count: usize, changing: &Columns<L>, limit: f64) -> [bool; L] {
+        let squares = self.squares;
+        let whole = changing.of(squares.diagonal());
+        let norms = changing.of(squares.norms());
+        let (mut pivot, mut value) = (whole, changing.of(squares.row(squares.target())));
+        // Row of L D of the changing term, then of L.
+        let mut row: [Lanes<L>; MOST] = [[0.0; L]; MOST];
+        for j in 0..count {
+            let mut sum = changing.of(squares.row(self.columns[j]));
+            for l in 0..j {
+                for n in 0..L {
+                    sum[n] -= row[l][n] * self.lower[j][l];
+                }
+            }
+            row[j] = sum;
+        }
+        for j in 0..count {
+            for n in 0..L {
+                let scaled = row[j][n] * self.inverse[j];
+                pivot[n] -= row[j][n] * scaled;
+                value[n] -= scaled * self.values[j];
+                row[j][n] = scaled;
+            }
+        }
+        let (mut error, mut size, mut sum) = ([0.0; L], [0.0; L], whole);
+        let (mut inverse, mut last) = ([0.0; L], [0.0; L]);
+        for n in 0..L {
+            inverse[n] = 1.0 / pivot[n];
+            last[n] = value[n] * inverse[n];
+            error[n] = self.left - value[n] * last[n];
+            size[n] = squares.norms()[squares.target()] + last[n].abs() * norms[n];
+        }
+        // What the others make of the changing column, from the last one back; so much less is left for them to do.
+        for j in (0..count).rev() {
+            for l in j + 1..count {
+                for n in 0..L {
+                    row[j][n] -= self.lower[l][j] * row[l][n];
+                }
+            }
+            for n in 0..L {
+                let share = row[j][n] * self.norms[j];
+                sum[n] += share * share;
+                size[n] += (self.alone[j] - row[j][n] * last[n]).abs() * self.norms[j];
+            }
+        }
+        let (slack, flat) = (squares.slack(), squares.flat());
+        let mut excluded = [false; L];
+        for n in 0..L {
+            // Written so that what is not a number excludes nothing.
+            let known = (pivot[n] > 0.0) & ((self.trace + sum[n] * inverse[n]) * flat <= 1.0);
+            excluded[n] = known & (error[n] - slack * size[n] * size[n] > limit);
+        }
+        excluded
+    }
+}
+
+#[cfg(test)]
+mod tests {
+    use super::*;
+    use crate::estimation::least_squares;
+    use crate::linalg::dense;
+    use crate::parallel::Stop;
+
+    /// Numbers in [−1, 1), always the same ones.
+    fn noise(state: &mut u64, count: usize) -> Vec<f64> {
+        let mut next = || {
+            *state = state.wrapping_mul(6_364_136_223_846_793_005).wrapping_add(1_442_695_040_888_963_407);
+            #[allow(clippy::cast_precision_loss)]
+            let value = (*state >> 11) as f64 / (1_u64 << 52) as f64 - 1.0;
+            value
+        };
+        (0..count).map(|_| next()).collect()
+    }
+
+    /// Columns that differ from one of their kind by this share, in units of their own.
+    fn alike(state: &mut u64, count: usize, m: usize, share: f64) -> Vec<Vec<f64>> {
+        let base = noise(state, m);
+        let mut one = |i: usize| {
+            let unit = libm::pow(10.0, (i % 5) as f64 - 2.0);
+            base.iter().zip(noise(state, m)).map(|(b, v)| unit * (b + share * v)).collect()
+        };
+        (0..count).map(&mut one).collect()
+    }
+
+    #[test]
+    fn nothing_within_a_limit_is_excluded_however_alike_the_columns() {
+        let state = &mut 5;
+        let (mut proved, mut kept, mut none) = (0, 0, 0);
+        for case in 0..240_u32 {
+            let (m, terms, along) = (30 + case as usize % 170, 1 + case as usize % 6, 3 + case as usize % 23);
+            let share = libm::pow(10.0, -f64::from(case % 15) / 2.0);
+            let columns = alike(state, terms - 1 + along, m, share);
+            let level = libm::pow(10.0, -f64::from(case % 8));
+            let sum: Vec<f64> = (0..m).map(|t| columns[..terms].iter().map(|c| c[t]).sum()).collect();
+            let target: Vec<f64> = sum.iter().zip(noise(state, m)).map(|(s, v)| s + level * v).collect();
+            let squares =
+                Squares::new(dense::gram(&columns.concat(), &target, &Stop::default()), columns.len(), m, terms, 1);
+            let but = case as usize % terms;
+            let others: Vec<usize> = (0..terms - 1).collect();
+            let changing: Vec<usize> = (terms - 1..columns.len()).collect();
+            let mut named = others.clone();
+            named.insert(but, changing[0]);
+            let Some(shared) = Shared::new(&squares, &named, but) else {
+                none += 1;
+                continue;
+            };
+            for (n, &column) in changing.iter().enumerate() {
+                let fitted: Vec<Vec<f64>> = others.iter().chain([&column]).map(|&c| columns[c].clone()).collect();
+                let Ok((c, _)) = least_squares::solve(&fitted, &target, terms) else { continue };
+                let error = |t: usize| target[t] - fitted.iter().zip(&c).map(|(x, c)| c * x[t]).sum::<f64>();
+                let score: f64 = (0..m).map(|t| error(t) * error(t)).sum();
+                let mut open = Vec::new();
+                shared.open::<8>(&changing, score, &mut open);
+                assert!(open.contains(&n), "case {case}: {n} of {along} has score {score:e}");
+                assert!(open.windows(2).all(|pair| pair[0] < pair[1]) && open.iter().all(|&at| at < along));
+                let mut one = Vec::new();
+                shared.open::<1>(&changing, score, &mut one);
+                assert_eq!(one, open, "one at a time");
+                open.clear();
+                shared.open::<8>(&changing, 0.5 * score, &mut open);
+                *(if open.contains(&n) { &mut kept } else { &mut proved }) += 1;
+            }
+        }
+        println!("{proved} excluded at half their score, {kept} not; {none} stretches without a factor");
+        assert!(proved > 1000 && proved > kept && none > 10);
+    }
+}

@@ -1,0 +1,117 @@
+//! The free run ŷ = N/D of one candidate, marched block by block beside the measurement.
+
+use crate::order_search::control::Control;
+use crate::order_search::options::Norm;
+use crate::order_search::result::{Failure, Verdict};
+use crate::series::{Division, BLOCK};
+
+/// A column with its coefficient.
+type Weighted<'a> = (&'a [f64], f64);
+
+/// Memory of free runs, one after the other.
+pub(crate) struct March {
+    divisor: Vec<f64>,
+    block: Vec<f64>,
+    division: Option<Division>,
+}
+
+impl Default for March {
+    fn default() -> Self {
+        Self { divisor: Vec::new(), block: vec![0.0; BLOCK], division: None }
+    }
+}
+
+impl March {
+    /// Adds the error of a free run to a raw sum, leaving as soon as this passes the limit or the caller stops.
+    ///
+    /// D = 1 − Σ c F over the kernels in `own`, N = Σ c x over the columns in `driven`; a kernel is read no further than
+    /// the division has come.
+    #[allow(clippy::too_many_arguments)]
+    pub(crate) fn run<'a>(
+        &mut self,
+        target: &[f64],
+        own: impl Iterator<Item = Weighted<'a>> + Clone,
+        driven: impl Iterator<Item = Weighted<'a>> + Clone,
+        norm: Norm,
+        mut raw: f64,
+        limit: f64,
+        control: &Control,
+    ) -> Verdict {
+        let m = target.len();
+        let Self { divisor, block, division } = self;
+        // Records may differ in length; a division is kept for one.
+        let division = match division {
+            Some(d) if d.terms() == m => {
+                d.reset();
+                d
+            }
+            other => other.insert(Division::new(1, m)),
+        };
+        divisor.clear();
+        let mut inverse = [0.0];
+        while division.solved() < m {
+            let lo = division.solved();
+            let hi = (lo + BLOCK).min(m);
+            let from = divisor.len();
+            let needed = division.reads().max(from);
+            divisor.resize(needed, 0.0);
+            for (kernel, c) in own.clone() {
+                divisor[from..].iter_mut().zip(&kernel[from..needed]).for_each(|(d, v)| *d -= c * v);
+            }
+            if from == 0 {
+                divisor[0] += 1.0;
+                if divisor[0] == 0.0 || !divisor[0].is_finite() {
+                    return Verdict::Failed(Failure::Singular);
+                }
+                inverse[0] = 1.0 / divisor[0];
+            }
+            let block = &mut block[..hi - lo];
+            combine(block, lo, driven.clone());
+            division.add(0, lo, block);
+            division.solve_block(&inverse, |_, _, len| &divisor[..len]);
+            raw = norm.add(raw, &target[lo..hi], &division.quotient(0)[lo..hi]);
+            if !raw.is_finite() {
+                return Verdict::Failed(Failure::Diverged);
+            }
+            // Written so that the interrupted candidate is never taken for a scored one.
+            if raw > limit || control.stopped() {
+                return Verdict::Stopped(raw);
+            }
+            division.join(|_, _, len| &divisor[..len]);
+        }
+        Verdict::Score(raw)
+    }
+
+    /// Adds the residuals y − Σ c x to a raw sum, leaving as soon as this passes the limit.
+    pub(crate) fn residuals<'a>(
+        &mut self,
+        target: &[f64],
+        columns: impl Iterator<Item = Weighted<'a>> + Clone,
+        norm: Norm,
+        mut raw: f64,
+        limit: f64,
+    ) -> Verdict {
+        for (i, target) in target.chunks(BLOCK).enumerate() {
+            let block = &mut self.block[..target.len()];
+            combine(block, i * BLOCK, columns.clone());
+            raw = norm.add(raw, target, block);
+            if !raw.is_finite() {
+                return Verdict::Failed(Failure::Diverged);
+            }
+            if raw > limit {
+                return Verdict::Stopped(raw);
+            }
+        }
+        Verdict::Score(raw)
+    }
+}
+
+/// Σ c x over one block that begins at `lo`.
+#[inline]
+fn combine<'a>(block: &mut [f64], lo: usize, columns: impl Iterator<Item = Weighted<'a>>) {
+    block.fill(0.0);
+    let hi = lo + block.len();
+    for (column, c) in columns {
+        block.iter_mut().zip(&column[lo..hi]).for_each(|(b, v)| *b += c * v);
+    }
+}

@@ -1,0 +1,324 @@
+//! Cells are halved until each is known to hold nothing much better than the best.
+
+use std::sync::atomic::Ordering;
+
+use rayon::prelude::*;
+
+use crate::error::{Error, Result};
+use crate::order_search::certificate::cell_bound::{about, check, Bounded};
+use crate::order_search::certificate::gram_tables::{width, Cell, Region, Tables, DEEPEST};
+use crate::order_search::certificate::regressor_expansion::MOST;
+use crate::order_search::control::Control;
+use crate::parallel::pool;
+use crate::regressors::Record;
+
+/// Cells that a thread bounds at a time, and those of which it is known at a time what they came to.
+const CHUNK: usize = 256;
+const AT_ONCE: usize = 1 << 16;
+/// Bytes that cells take of which some are halved.
+const HELD: u64 = 4 * size_of::<Cell>() as u64;
+
+/// Most orders that are tried on the way down from the best.
+const POLISHED: usize = 400;
+/// Middles near which orders are looked for at a time.
+const LIKELY: usize = 4;
+
+/// How much is asked for.
+#[derive(Debug, Clone, Copy, PartialEq)]
+pub struct Asked {
+    /// No orders are to have an error below the best one found times one less this.
+    pub within: f64,
+    /// How many times the size of the output the terms of an equation have together at most: Σ ‖c x‖ ≤ largest·‖y‖.
+    pub largest: f64,
+    /// Cells after which the sweep ends with what it has proved.
+    pub cells: u64,
+    /// Threads, and bytes of memory.
+    pub threads: usize,
+    /// See `threads`.
+    pub memory: u64,
+}
+
+/// What is proved of all orders of a region.
+#[derive(Debug, Clone, PartialEq)]
+pub struct Certificate {
+    /// No orders, with coefficients whose terms are not larger than asked for, give a smaller root of the mean squared
+    /// equation error; 0 where nothing is proved.
+    pub at_least: f64,
+    /// The smallest found, with the order of the equation and those of its terms; infinite where none was.
+    pub best: f64,
+    /// See `best`.
+    pub order: f64,
+    /// See `best`.
+    pub orders: Vec<f64>,
+    /// Cells that were bounded.
+    pub cells: u64,
+    /// Cells that are left: not far enough above the best, and too small to be halved or one too many.
+    pub open: u64,
+}
+
+/// Proves that no orders of a region have an equation error, in squares, with coefficients that suit them best, much
+/// below the best that is found on the way; terms that cancel but for next to nothing are left out.
+///
+/// The same bits for any number of threads.
+///
+/// # Errors
+/// No region, or one that holds no orders; records without its signals, a setting out of range, too many cells, memory
+/// that is not there, [`Error::Interrupted`].
+///
+/// ```
+/// # use ftlm::order_search::certificate::bisection::{certify, Asked};
+/// # use ftlm::order_search::certificate::gram_tables::{Range, Region};
+/// # use ftlm::order_search::control::Control;
+/// # use ftlm::regressors::Record;
+/// # let input: Vec<f64> = (0..64).map(|k| if k % 16 < 8 { 1.0 } else { -1.0 }).collect();
+/// # let output: Vec<f64> = Record::new(0.1, vec![input.clone()], None)?.integral(0, 0.83);
+/// # let output = output.iter().enumerate().map(|(k, y)| y + 0.01 * f64::from((k * k % 7) as u32)).collect();
+/// let record = Record::new(0.1, vec![output, input], None)?;
+/// // y is nearly the integral of order 0.83 of u.
+/// let region = Region {
+///     output: 0,
+///     alpha: (0.5, 1.5),
+///     terms: vec![Range { signal: 1, lowest: 0.0, highest: 0.0 }],
+///     apart: 0.05,
+/// };
+/// let asked = Asked { within: 0.05, largest: 1e3, cells: 1_000_000, threads: 1, memory: 1 << 28 };
+/// let found = certify(&[record], &region, &asked, &Control::default())?;
+/// assert!((found.order - 0.83).abs() < 0.02 && found.open == 0);
+/// assert!(0.95 * found.best <= found.at_least && found.at_least <= found.best);
+/// # Ok::<(), ftlm::error::Error>(())
+/// ```
+pub fn certify(records: &[Record], region: &Region, asked: &Asked, control: &Control) -> Result<Certificate> {
+    check(records, region.output, region.terms.iter().map(|t| t.signal))?;
+    region.check()?;
+    if !(asked.within > 0.0 && asked.within < 1.0) {
+        return Err(Error::OutOfRange {
+            name: "within".into(),
+            value: asked.within,
+            range: "(0, 1)".into(),
+            remedy: "0.05 asks for a proof that nothing is better by more than 5 %".into(),
+        });
+    }
+    if !(asked.largest >= 1.0 && asked.largest <= 1e9) {
+        return Err(Error::OutOfRange {
+            name: "largest".into(),
+            value: asked.largest,
+            range: "[1, 1e9]".into(),
+            remedy: "100 leaves out terms that cancel but for a hundredth".into(),
+        });
+    }
+    let pool = pool(asked.threads)?;
+    pool.install(|| {
+        let tables = Tables::new(records, region, asked.memory, control)?;
+        Sweep { tables, region, asked, control }.run(records)
+    })
+}
+
+/// One at work.
+struct Sweep<'a> {
+    tables: Tables,
+    region: &'a Region,
+    asked: &'a Asked,
+    control: &'a Control,
+}
+
+impl Sweep<'_> {
+    fn run(&self, records: &[Record]) -> Result<Certificate> {
+        let mut cells = self.largest()?;
+        if cells.is_empty() {
+            return Err(Error::EmptyLattice {
+                why: format!("no orders in these intervals are {} below alpha and apart", self.region.apart),
+            });
+        }
+        let (mut best, mut place) = (f64::INFINITY, Vec::new());
+        let (mut proved, mut bounded, mut open) = (f64::INFINITY, 0_u64, 0_u64);
+        let target = |best: f64| (1.0 - self.asked.within).powi(2) * best;
+        let most = self.asked.cells.min(self.asked.memory.saturating_sub(self.tables.bytes) / HELD);
+        // What is known beforehand saves halving.
+        for cells in cells.chunks(AT_ONCE) {
+            let found = self.bounds(cells, 0.0)?;
+            self.better(records, (cells, &found), &mut best, &mut place)?;
+        }
+        self.polish(records, &mut best, &mut place)?;
+        while !cells.is_empty() {
+            if bounded + cells.len() as u64 > most {
+                open += cells.len() as u64;
+                proved = cells.iter().fold(proved, |least, cell| least.min(cell.least));
+                break;
+            }
+            // What is known of; halves will come.
+            self.control.total.store(bounded + cells.len() as u64, Ordering::Relaxed);
+            let mut next = Vec::new();
+            for cells in cells.chunks(AT_ONCE) {
+                let found = self.bounds(cells, target(best))?;
+                self.control.count(cells.len() as u64, 0);
+                self.better(records, (cells, &found), &mut best, &mut place)?;
+                let goal = target(best);
+                for (cell, found) in cells.iter().zip(&found) {
+                    let least = found.least.max(cell.least);
+                    if least >= goal {
+                        proved = proved.min(least);
+                    } else if let Some(halves) = self.halved(cell, least, &found.costs) {
+                        next.extend(halves.into_iter().flatten());
+                    } else {
+                        open += 1;
+                        proved = proved.min(least);
+                    }
+                }
+            }
+            bounded += cells.len() as u64;
+            cells = next;
+        }
+        self.polish(records, &mut best, &mut place)?;
+        #[allow(clippy::cast_precision_loss)]
+        let mean = {
+            let squares: f64 = records.iter().flat_map(|r| r.signal(self.region.output)).map(|y| y * y).sum();
+            squares / records.iter().map(Record::m).sum::<usize>() as f64
+        };
+        let (order, orders) = self.region.orders(&place).unwrap_or((f64::NAN, Vec::new()));
+        let root = |share: f64| if share.is_finite() { (share * mean).sqrt() } else { f64::INFINITY };
+        let at_least = if proved.is_finite() { root(proved) * (1.0 - 1e-9) } else { 0.0 };
+        Ok(Certificate { at_least, best: root(best), order, orders, cells: bounded, open })
+    }
+
+    /// What is known of some cells.
+    fn bounds(&self, cells: &[Cell], goal: f64) -> Result<Vec<Bounded>> {
+        let bounds = |chunk: &'_ [Cell]| -> Vec<Bounded> {
+            let all = chunk.iter().take(if self.control.stopped() { 0 } else { CHUNK });
+            all.map(|cell| self.bound(cell, goal)).collect()
+        };
+        let found = cells.par_chunks(CHUNK).flat_map_iter(bounds).collect();
+        self.control.check_stop()?;
+        Ok(found)
+    }
+
+    /// Takes the best orders of the region near the best middles of some cells.
+    fn better(
+        &self,
+        records: &[Record],
+        (cells, found): (&[Cell], &[Bounded]),
+        best: &mut f64,
+        place: &mut Vec<f64>,
+    ) -> Result<()> {
+        let mut likely: Vec<usize> = (0..cells.len()).filter(|&n| found[n].middle < *best).collect();
+        likely.sort_by(|&a, &b| found[a].middle.total_cmp(&found[b].middle).then(a.cmp(&b)));
+        for n in likely.into_iter().take(LIKELY) {
+            let Some(there) = self.region.near(&self.all_within(&cells[n])) else { continue };
+            let left = self.left(records, &there)?;
+            if left < *best {
+                (*best, *place) = (left, there);
+            }
+        }
+        Ok(())
+    }
+
+    /// What is known of a cell: by its space too where that may help.
+    fn bound(&self, cell: &Cell, goal: f64) -> Bounded {
+        let mut found = self.tables.local(cell).bound();
+        if found.least.max(cell.least) < goal {
+            found.least = found.least.max(self.tables.span(cell).bound(self.asked.largest, goal));
+        }
+        found
+    }
+
+    /// What orders of integration leave themselves, not read off a table.
+    fn left(&self, records: &[Record], etas: &[f64]) -> Result<f64> {
+        let terms = self.region.terms.iter().zip(etas).map(|(term, eta)| (term.signal, *eta, 0.0));
+        Ok(about(records, self.region.output, &terms.collect::<Vec<_>>(), &self.control.stop)?.0.bound().middle)
+    }
+
+    /// Goes down from the best orders, one or two of them at a time: to edges of the region too, where no middle is.
+    fn polish(&self, records: &[Record], best: &mut f64, place: &mut Vec<f64>) -> Result<()> {
+        if place.is_empty() {
+            return Ok(());
+        }
+        // The equation's own order comes last.
+        let k = place.len();
+        let vary: Vec<usize> = (0..k)
+            .filter(|&term| self.region.terms[term].lowest < self.region.terms[term].highest)
+            .chain((self.region.alpha.0 < self.region.alpha.1).then_some(k))
+            .collect();
+        let ways = [-1.0, 0.0, 1.0];
+        let pairs = vary.iter().enumerate().flat_map(|(n, &i)| vary[n..].iter().map(move |&j| (i, j)));
+        let moves: Vec<[(usize, f64); 2]> = pairs
+            .flat_map(|(i, j)| ways.into_iter().flat_map(move |a| ways.into_iter().map(move |b| [(i, a), (j, b)])))
+            .filter(|[(i, a), (j, b)]| *a != 0.0 && (i == j) == (*b == 0.0))
+            .collect();
+        let (mut step, mut tried) = (width(1), 0);
+        while step > width(DEEPEST) && tried < POLISHED {
+            let before = *best;
+            for moves in &moves {
+                self.control.check_stop()?;
+                let Some((alpha, mut orders)) = self.region.orders(place) else { return Ok(()) };
+                orders.push(alpha);
+                moves.iter().for_each(|(term, way)| orders[*term] += way * step);
+                let Some(there) = self.region.of_orders(orders[k], &orders[..k]).filter(|there| there != place) else {
+                    continue;
+                };
+                tried += 1;
+                let left = self.left(records, &there)?;
+                if left < *best {
+                    (*best, *place) = (left, there);
+                }
+            }
+            if *best >= before {
+                step /= 2.0;
+            }
+        }
+        Ok(())
+    }
+
+    fn all_within(&self, cell: &Cell) -> Vec<(f64, f64)> {
+        (0..self.region.terms.len()).map(|term| self.tables.within(self.region, cell, term)).collect()
+    }
+
+    fn holds_orders(&self, cell: &Cell) -> bool {
+        self.region.alphas(&self.all_within(cell)).is_some()
+    }
+
+    /// The largest cells that hold orders of the region.
+    ///
+    /// # Errors
+    /// [`Error::Structure`] where they are too many.
+    fn largest(&self) -> Result<Vec<Cell>> {
+        let mut cells = vec![Cell { level: [0; MOST], at: [0; MOST], least: 0.0 }];
+        for term in 0..self.region.terms.len() {
+            let (first, count) = self.tables.largest(self.region, term);
+            let all = cells.len() as u128 * count as u128;
+            if all > 4 * u128::from(self.asked.cells) {
+                return Err(Error::Structure {
+                    what: format!(
+                        "these intervals hold up to {all} cells of orders, but {} are allowed",
+                        self.asked.cells
+                    ),
+                    remedy: "narrow them, or allow more cells".into(),
+                });
+            }
+            let mut next = Vec::new();
+            for cell in &cells {
+                for at in first..first + count {
+                    let mut cell = *cell;
+                    cell.at[term] = u32::try_from(at).unwrap_or(u32::MAX);
+                    let within: Vec<(f64, f64)> =
+                        (0..=term).map(|t| self.tables.within(self.region, &cell, t)).collect();
+                    if self.region.alphas(&within).is_some() {
+                        next.push(cell);
+                    }
+                }
+            }
+            cells = next;
+        }
+        Ok(cells)
+    }
+
+    /// Both halves along the order that costs most, as far as they hold orders; none where all are too short.
+    fn halved(&self, cell: &Cell, least: f64, costs: &[f64; MOST]) -> Option<[Option<Cell>; 2]> {
+        let may = (0..self.region.terms.len()).filter(|&term| !self.tables.known(term) && cell.level[term] < DEEPEST);
+        let term = may.max_by(|&a, &b| costs[a].total_cmp(&costs[b]).then(b.cmp(&a)))?;
+        Some([0, 1].map(|half| {
+            let mut part = Cell { least, ..*cell };
+            part.level[term] += 1;
+            part.at[term] = 2 * part.at[term] + half;
+            self.holds_orders(&part).then_some(part)
+        }))
+    }
+}

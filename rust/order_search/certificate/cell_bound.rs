@@ -1,0 +1,301 @@
+//! A lower bound of the least squared equation error over a cell of orders.
+//!
+//! With X the columns at the middle, G = XᵀX and any coefficients c₀ there, e = y − Xc₀. At other orders of the cell the
+//! columns are X + U; what of U lies in the span of X is XA, the rest P is orthogonal to X. For any coefficients c, with
+//! h = c + Ac − c₀, τ = Xᵀe and γ = Uᵀe,
+//!
+//!   ‖y − (X + U)c‖² = ‖e − Xh − Pc‖² ≥ ‖e‖² − 2τᵀh − 2(γ − Aᵀτ)ᵀc + ‖Xh‖².
+//!
+//! c = (I + A)⁻¹(c₀ + h), so with (I + Aᵀ)β = γ − Aᵀτ the least over h is ‖e‖² − 2βᵀc₀ − (β + τ)ᵀG⁻¹(β + τ). Moduli of U's
+//! products, hence of γ and A, are bounded by the series of the columns; B bounds |β| where B ≥ |γ| + |A|ᵀ(|τ| + B).
+
+use crate::error::{check_length, Error, Result};
+use crate::linalg::dense::inner_products;
+use crate::order_search::certificate::regressor_expansion::{series, unit, Curve, ALL, MOST};
+use crate::order_search::certificate::subspace_bound::Span;
+use crate::parallel::Stop;
+use crate::regressors::Record;
+
+type Row = [f64; MOST];
+
+/// What a bound adds to B and takes for granted of inverses: far more than rounding does to either.
+const HAIR: f64 = 1e-6;
+const SIXTEENTH: f64 = 1.0 / 16.0;
+
+/// Inner products of the columns about the middle of a cell, all of the k terms: first of unit size, as is the target.
+#[derive(Debug, Clone, Copy)]
+pub(super) struct Local {
+    pub(super) k: usize,
+    /// x_i·x_j⁽ᵐ⁾, by m, then i, then j.
+    pub(super) products: [[Row; MOST]; ALL],
+    /// x_j⁽ᵐ⁾·y and ‖x_j⁽ᵐ⁾‖.
+    pub(super) target: [Row; ALL],
+    pub(super) sizes: [Row; ALL],
+    /// What the series leave out, and half the cell's widths.
+    pub(super) rests: Row,
+    pub(super) halves: Row,
+    /// What rounding may add to a product of two unit columns.
+    pub(super) rounding: f64,
+}
+
+impl Local {
+    pub(super) fn new(k: usize, samples: usize) -> Self {
+        Self {
+            k,
+            products: [[[0.0; MOST]; MOST]; ALL],
+            target: [[0.0; MOST]; ALL],
+            sizes: [[0.0; MOST]; ALL],
+            rests: [0.0; MOST],
+            halves: [0.0; MOST],
+            // Products of columns that are kept as they are lose an eighth of what a chain of transforms does.
+            rounding: unit(samples) / 8.0,
+        }
+    }
+}
+
+/// What is known of a cell: shares of the squared size of the target.
+#[derive(Debug, Clone, Copy)]
+pub(super) struct Bounded {
+    /// No orders of the cell leave less; 0 where nothing is proved.
+    pub(super) least: f64,
+    /// What the middle leaves; infinite where that is not told.
+    pub(super) middle: f64,
+    /// What each order costs the bound.
+    pub(super) costs: Row,
+}
+
+impl Local {
+    #[allow(clippy::cast_precision_loss)]
+    pub(super) fn bound(&self) -> Bounded {
+        let k = self.k;
+        let mut found = Bounded { least: 0.0, middle: f64::INFINITY, costs: self.halves };
+        let Some(inverse) = inverse(self.products[0], k) else { return found };
+        let trace: f64 = (0..k).map(|i| inverse[i][i]).sum();
+        let terms = (k * k) as f64;
+        let lost = self.rounding * terms;
+        let elimination = 64.0 * f64::EPSILON * terms * terms * trace * trace;
+        // What is not a number ends here too.
+        if !(trace * lost < SIXTEENTH * SIXTEENTH && elimination < SIXTEENTH * SIXTEENTH) {
+            return found;
+        }
+        let mut c = [0.0; MOST];
+        for i in 0..k {
+            c[i] = (0..k).map(|j| inverse[i][j] * self.target[0][j]).sum();
+        }
+        let all = 1.0 + (0..k).map(|i| c[i].abs() * self.sizes[0][i]).sum::<f64>();
+        let along = |m: usize, j: usize| -> f64 {
+            self.target[m][j] - (0..k).map(|i| c[i] * self.products[m][i][j]).sum::<f64>()
+        };
+        // ‖e‖² by the form itself, right for any coefficients.
+        let explained: f64 = (0..k).map(|i| c[i] * (self.target[0][i] + along(0, i))).sum();
+        let square = 1.0 - explained;
+        let error = self.rounding * all * all;
+        if !(square.is_finite() && square > error) {
+            return found;
+        }
+        found.middle = square;
+        let size = (square + error).sqrt();
+        let (mut tau, mut gamma, mut a) = ([0.0; MOST], [0.0; MOST], [[0.0; MOST]; MOST]);
+        for j in 0..k {
+            let half = self.halves[j];
+            tau[j] = along(0, j).abs() + self.rounding * all;
+            gamma[j] =
+                series(half, |m| along(m, j).abs() + self.rounding * all * self.sizes[m][j]) + size * self.rests[j];
+            for i in 0..k {
+                let part = |m: usize| -> (f64, f64) {
+                    let terms = (0..k).map(|l| inverse[i][l] * self.products[m][l][j]);
+                    terms.fold((0.0, 0.0), |(sum, all), x| (sum + x, all + x.abs()))
+                };
+                let rounded = lost * trace;
+                let within = series(half, |m| {
+                    let (sum, all) = part(m);
+                    sum.abs() + rounded * (all + (1.0 + trace) * self.sizes[m][j])
+                });
+                let beyond = (inverse[i][i].max(0.0) * (1.0 + SIXTEENTH)).sqrt() * self.rests[j];
+                a[i][j] = within + beyond;
+            }
+        }
+        let costs = |j: usize| (0..k).map(|i| a[i][j]).sum::<f64>();
+        (0..k).for_each(|j| found.costs[j] = costs(j));
+        let Some(b) = dominating(&a, &gamma, &tau, k) else { return found };
+        let (mut first, mut second) = (0.0, 0.0);
+        for i in 0..k {
+            let cost = 2.0 * c[i].abs() * b[i];
+            found.costs[i] = cost;
+            first += cost;
+            for j in 0..k {
+                second += (b[i] + tau[i]) * inverse[i][j].abs() * (b[j] + tau[j]);
+            }
+        }
+        let least = (square - error - first - second * (1.0 + SIXTEENTH)) * (1.0 - HAIR * HAIR);
+        // Neither NaN nor an overflow proves anything.
+        if least > 0.0 && least.is_finite() {
+            found.least = least;
+        }
+        found
+    }
+}
+
+/// Inverse of a positive definite matrix.
+fn inverse(mut matrix: [Row; MOST], k: usize) -> Option<[Row; MOST]> {
+    let mut out = [[0.0; MOST]; MOST];
+    (0..k).for_each(|i| out[i][i] = 1.0);
+    for i in 0..k {
+        let pivot = matrix[i][i];
+        if !(pivot > 0.0 && pivot.is_finite()) {
+            return None;
+        }
+        for j in 0..k {
+            matrix[i][j] /= pivot;
+            out[i][j] /= pivot;
+        }
+        for l in (0..k).filter(|l| *l != i) {
+            let factor = matrix[l][i];
+            for j in 0..k {
+                matrix[l][j] -= factor * matrix[i][j];
+                out[l][j] -= factor * out[i][j];
+            }
+        }
+    }
+    Some(out)
+}
+
+/// Some B with B > γ + Aᵀ(τ + B), which also shows that I + A is regular; none where it is not found.
+fn dominating(a: &[Row; MOST], gamma: &Row, tau: &Row, k: usize) -> Option<Row> {
+    let (mut matrix, mut right) = ([[0.0; MOST]; MOST], [0.0; MOST]);
+    for i in 0..k {
+        right[i] = gamma[i] + (0..k).map(|j| a[j][i] * tau[j]).sum::<f64>() + f64::MIN_POSITIVE.sqrt();
+        for j in 0..k {
+            matrix[i][j] = f64::from(u8::from(i == j)) - a[j][i];
+        }
+    }
+    let wanted = right;
+    for i in 0..k {
+        let pivot = matrix[i][i];
+        if !(pivot > 0.0 && pivot.is_finite()) {
+            return None;
+        }
+        for l in i + 1..k {
+            let (factor, row) = (matrix[l][i] / pivot, matrix[i]);
+            matrix[l].iter_mut().zip(&row).skip(i).for_each(|(x, y)| *x -= factor * y);
+            right[l] -= factor * right[i];
+        }
+    }
+    let mut b = [0.0; MOST];
+    for i in (0..k).rev() {
+        let sum: f64 = (i + 1..k).map(|j| matrix[i][j] * b[j]).sum();
+        b[i] = (right[i] - sum) / matrix[i][i];
+    }
+    b[..k].iter_mut().for_each(|b| *b *= 1.0 + HAIR);
+    // Believed only where it does what is asked of it.
+    let proved = |i: usize| (wanted[i] + (0..k).map(|j| a[j][i] * b[j]).sum::<f64>()) * (1.0 + 1e-3 * HAIR) <= b[i];
+    (0..k).all(proved).then_some(b)
+}
+
+/// What is proved of a cell: at least so much is Σε² of the equation errors, at rest, of every equation whose terms are
+/// integrals of these signals of orders within half widths of middles, (signal, middle, half width) by term; 0 where
+/// nothing is.
+///
+/// The first holds for any coefficients; the second, which a goal is tried for, for those whose terms have together at
+/// most `largest` times the size of the output.
+///
+/// # Errors
+/// No records or terms, too many of these, a signal that is not there or is zero, middles below their half widths.
+///
+/// ```
+/// # use ftlm::order_search::certificate::cell_bound::cell_bounds;
+/// # use ftlm::regressors::Record;
+/// # let input: Vec<f64> = (0..64).map(|k| if k % 16 < 8 { 1.0 } else { -1.0 }).collect();
+/// # let output = Record::new(0.1, vec![input.clone()], None)?.integral(0, 0.8);
+/// let record = Record::new(0.1, vec![output, input], None)?;
+/// // y is the integral of order 0.8 of u: that order leaves nothing, orders near 0.5 leave something.
+/// let proved = |middle: f64| cell_bounds(&[record.clone()], 0, &[(1, middle, 0.01)], (10.0, 1.0));
+/// assert!(proved(0.8)? == (0.0, 0.0) && proved(0.5)?.0 > 0.0 && proved(0.5)?.1 > 0.0);
+/// # Ok::<(), ftlm::error::Error>(())
+/// ```
+pub fn cell_bounds(
+    records: &[Record],
+    output: usize,
+    terms: &[(usize, f64, f64)],
+    (largest, goal): (f64, f64),
+) -> Result<(f64, f64)> {
+    check(records, output, terms.iter().map(|t| t.0))?;
+    for &(_, middle, half) in terms {
+        if !(half >= 0.0 && half <= middle && middle < 20.0) {
+            return Err(Error::OutOfRange {
+                name: "half width".into(),
+                value: half,
+                range: format!("[0, {middle}], the middle of the orders"),
+                remedy: "orders of integration are not negative".into(),
+            });
+        }
+    }
+    let (local, span, square) = about(records, output, terms, &Stop::default())?;
+    Ok((local.bound().least * square, span.bound(largest, goal / square) * square))
+}
+
+/// What a cell with these middles and half widths is bounded from, and the squares of the output.
+pub(super) fn about(
+    records: &[Record],
+    output: usize,
+    terms: &[(usize, f64, f64)],
+    stop: &Stop,
+) -> Result<(Local, Span, f64)> {
+    let target: Vec<f64> = records.iter().flat_map(|r| r.signal(output)).copied().collect();
+    let square = target.iter().map(|v| v * v).sum::<f64>();
+    let curves = terms
+        .iter()
+        .map(|&(s, middle, half)| Curve::new(records, s, middle, half, stop))
+        .collect::<Result<Vec<_>>>()?;
+    let all: Vec<&[f64]> = curves.iter().flat_map(|c| c.columns.iter().map(Vec::as_slice)).collect();
+    let (products, along) = (inner_products(&all, &all, stop), inner_products(&[&target], &all, stop));
+    stop.check()?;
+    let product = |(i, n): (usize, usize), (j, m): (usize, usize)| products[(i * ALL + n) * all.len() + j * ALL + m];
+    let target_product = |(j, m): (usize, usize)| along[j * ALL + m] / square.sqrt();
+    let (mut local, mut span) = (Local::new(terms.len(), target.len()), Span::new(target.len()));
+    for (j, (curve, &(_, _, half))) in curves.iter().zip(terms).enumerate() {
+        for m in 0..ALL {
+            for i in 0..terms.len() {
+                local.products[m][i][j] = product((i, 0), (j, m));
+            }
+            local.target[m][j] = target_product((j, m));
+            local.sizes[m][j] = curve.sizes[m];
+        }
+        local.rests[j] = curve.rest;
+        local.halves[j] = half;
+        span.add(half, curve.sizes, curve.rest);
+    }
+    span.fill(product, target_product);
+    Ok((local, span, square))
+}
+
+/// Refuses records and signals of which nothing can be made.
+pub(super) fn check(records: &[Record], output: usize, signals: impl Iterator<Item = usize>) -> Result<()> {
+    let Some(first) = records.first() else {
+        return Err(Error::Structure { what: "no record is given".into(), remedy: "give at least one run".into() });
+    };
+    for record in records {
+        check_length("signals of a record", first.len(), record.len())?;
+    }
+    let signals: Vec<usize> = signals.collect();
+    if let Some(signal) = signals.iter().chain([&output]).find(|s| **s >= first.len()) {
+        return Err(Error::Structure {
+            what: format!("the equation names signal {signal}, but the record holds {}", first.len()),
+            remedy: "give the record all signals of the equation".into(),
+        });
+    }
+    let size: f64 = records.iter().flat_map(|r| r.signal(output)).map(|v| v * v).sum();
+    if !(size > 0.0 && size < f64::MAX) {
+        return Err(Error::Structure {
+            what: format!("the squares of the output sum up to {size}"),
+            remedy: "scale it so that its squares are positive numbers".into(),
+        });
+    }
+    if !(1..=MOST).contains(&signals.len()) {
+        return Err(Error::Structure {
+            what: format!("an equation of {} terms", signals.len()),
+            remedy: format!("certificates are of 1 to {MOST} terms"),
+        });
+    }
+    Ok(())
+}

@@ -1,0 +1,229 @@
+//! The regressor I^η s of a signal near one order: its values, its derivatives in the order, and what they leave out.
+//!
+//! v_n = Δ²n^{η+1} is differentiated term by term (`crate::fractional::kernels`). Columns may be scaled as one likes,
+//! also by e^{−λ(η−η₀)}: with λ the mean logarithmic slope of the column at η₀ what is left turns, but hardly grows.
+//! Beyond the third derivative the fourth is bounded: it is a mean of d²/dt² t^{η+1}(ln t − λ)⁴ over two pulses, whose
+//! terms grow with η from t = 1 on.
+
+use crate::error::{Error, Result};
+use crate::parallel::Stop;
+use crate::regressors::Record;
+use crate::series::{Buffers, Kernel};
+
+/// Most terms of an equation.
+pub(super) const MOST: usize = 6;
+/// Derivatives that are made.
+pub(super) const MADE: usize = 3;
+/// The value and these.
+pub(super) const ALL: usize = MADE + 1;
+
+/// Terms of the binomial sum below [`NEAR`] pulses' distance, where it converges slowly, and from there on: 4^−26 and
+/// 64^−10 are below the rounding error.
+const TERMS: [usize; 2] = [26, 10];
+const NEAR: usize = 8;
+
+/// Factorials.
+const FACTORIAL: [f64; 5] = [1.0, 1.0, 2.0, 6.0, 24.0];
+
+/// The columns of one signal about one order, records one after the other, the first of unit size.
+pub(super) struct Curve {
+    pub(super) columns: [Vec<f64>; ALL],
+    /// Their sizes.
+    pub(super) sizes: [f64; ALL],
+    /// Within the half width no column is farther than this from the series that the columns make.
+    pub(super) rest: f64,
+}
+
+/// Σ_k C(η+1, 2k) n^{−2k} and its derivatives over their factorials, and n^{η+1} and ln n, by distance n from 2 on.
+struct Sums {
+    eta: f64,
+    sums: Vec<[f64; ALL]>,
+    powers: Vec<(f64, f64)>,
+}
+
+impl Sums {
+    #[allow(clippy::cast_precision_loss)]
+    fn new(eta: f64, m: usize) -> Self {
+        // Derivatives of binomial coefficients, as truncated series in what is added to η.
+        let mut coefficients = [[0.0; ALL]; TERMS[0]];
+        let mut c = [0.0; ALL];
+        c[0] = 1.0;
+        for (k, kept) in coefficients.iter_mut().enumerate() {
+            for j in [2 * k, 2 * k + 1] {
+                let factor = if j == 0 { eta + 1.0 } else { eta - (j as f64 - 1.0) };
+                let divisor = (j + 1) as f64;
+                for i in (0..ALL).rev() {
+                    c[i] = (c[i] * factor + if i > 0 { c[i - 1] } else { 0.0 }) / divisor;
+                }
+            }
+            *kept = c;
+        }
+        let distances = 2..m.max(2);
+        let sums = distances.clone().map(|n| {
+            let shrink = 1.0 / (n * n) as f64;
+            let terms = TERMS[usize::from(n >= NEAR)];
+            let mut sum = [0.0; ALL];
+            for c in coefficients[..terms].iter().rev() {
+                for (sum, c) in sum.iter_mut().zip(c) {
+                    *sum = (*sum + c) * shrink;
+                }
+            }
+            sum
+        });
+        let powers = distances.clone().map(|n| (libm::pow(n as f64, eta + 1.0), libm::log(n as f64)));
+        Self { eta, sums: sums.collect(), powers: powers.collect() }
+    }
+
+    /// (∂/∂η − μ)^j v_n, n = 1 … m.
+    fn derivative(&self, j: usize, mu: f64, m: usize) -> Vec<f64> {
+        let power = |x: f64| x.powi(i32::try_from(j).unwrap_or(0));
+        let double = libm::exp2(self.eta + 1.0);
+        let second = match j {
+            0 => 2.0 * libm::expm1(self.eta * std::f64::consts::LN_2),
+            _ => double * power(std::f64::consts::LN_2 - mu) - 2.0 * power(-mu),
+        };
+        let rest = self.sums.iter().zip(&self.powers).map(|(sums, (lead, logarithm))| {
+            let (mut value, mut turn) = (0.0, 1.0);
+            for i in 0..=j {
+                value += turn / FACTORIAL[i] * sums[j - i];
+                turn *= logarithm - mu;
+            }
+            2.0 * FACTORIAL[j] * lead * value
+        });
+        [power(-mu), second].into_iter().chain(rest).take(m).collect()
+    }
+}
+
+/// Σ_n of what |(∂/∂η − μ)⁴ v_n| is at most, for all orders up to `highest`.
+#[allow(clippy::cast_precision_loss)]
+fn fourth(highest: f64, mu: f64, m: usize) -> f64 {
+    let b = highest;
+    let far = |t: f64| (libm::log(t) - mu).abs();
+    let mut sum = mu.powi(4);
+    if m > 1 {
+        sum += libm::exp2(b + 1.0) * far(2.0).powi(4) + 2.0 * mu.powi(4);
+    }
+    let (mut before, mut here) = ((1.0, far(1.0)), (libm::pow(2.0, b - 1.0), far(2.0)));
+    for n in 2..m {
+        let t = (n + 1) as f64;
+        let after = (libm::pow(t, b - 1.0), far(t));
+        let (power, l) = (f64::max(before.0, after.0), f64::max(before.1, after.1));
+        sum += power * l * l * (((b + 1.0) * b * l + (2.0 * b + 1.0) * 4.0) * l + 12.0);
+        (before, here) = (here, after);
+    }
+    sum
+}
+
+fn dot(a: &[f64], b: &[f64]) -> f64 {
+    a.iter().zip(b).map(|(a, b)| a * b).sum()
+}
+
+impl Curve {
+    /// About I^eta of a signal, for orders of integration within `half` of it.
+    ///
+    /// # Errors
+    /// [`Error::Structure`] where its size is no positive number, [`Error::Interrupted`].
+    pub(super) fn new(records: &[Record], signal: usize, eta: f64, half: f64, stop: &Stop) -> Result<Self> {
+        let mut columns: [Vec<f64>; ALL] = Default::default();
+        let mut errors = [0.0; ALL];
+        let mut made = Vec::with_capacity(records.len());
+        // The unit of time is the first record's pulse.
+        let first = records.first().map_or(1.0, Record::step);
+        for record in records {
+            stop.check()?;
+            let (m, pace) = (record.m(), record.step() / first);
+            let (sums, spectrum) = (Sums::new(eta, m), Kernel::new(record.signal(signal)));
+            let (scale, slope) = (libm::pow(pace, eta), libm::log(pace));
+            made.push((sums, spectrum, scale, slope));
+        }
+        let mut buffers = Buffers::default();
+        for (j, column) in columns.iter_mut().enumerate().take(2) {
+            for (record, (sums, spectrum, scale, slope)) in records.iter().zip(&made) {
+                stop.check()?;
+                column.extend(product(&sums.derivative(j, -slope, record.m()), spectrum, *scale, &mut buffers));
+            }
+        }
+        let lambda = dot(&columns[0], &columns[1]) / dot(&columns[0], &columns[0]);
+        let mut rest = 0.0;
+        for (j, column) in columns.iter_mut().enumerate() {
+            if j > 0 {
+                column.clear();
+            }
+            let mut squares = 0.0;
+            for (record, (sums, spectrum, scale, slope)) in records.iter().zip(&made) {
+                stop.check()?;
+                let (m, mu) = (record.m(), lambda - slope);
+                let kernel = sums.derivative(j, mu, m);
+                if j > 0 {
+                    column.extend(product(&kernel, spectrum, *scale, &mut buffers));
+                }
+                let size = dot(record.signal(signal), record.signal(signal)).sqrt();
+                // Derivatives are sums of terms that the logarithms of all distances enter with either sign.
+                let lost = unit(m) * scale * size * sums.moduli(j, mu);
+                squares += lost * lost;
+                if j == 0 {
+                    let beyond = libm::exp(mu.abs() * half) * fourth(eta + half, mu, m) * scale * size;
+                    rest += beyond * beyond;
+                }
+            }
+            errors[j] = squares.sqrt();
+        }
+        let size = dot(&columns[0], &columns[0]).sqrt();
+        if !(size > 0.0 && size < f64::MAX && lambda.is_finite()) {
+            return Err(Error::Structure {
+                what: format!("the integral of order {eta} of signal {signal} has the size {size}"),
+                remedy: "leave out a signal that is zero all along, and scale one whose squares are no numbers".into(),
+            });
+        }
+        let inverse = 1.0 / size;
+        columns.iter_mut().flatten().for_each(|v| *v *= inverse);
+        let mut left_out = rest.sqrt() * half.powi(4) / FACTORIAL[4];
+        for j in 0..ALL {
+            left_out += errors[j] * half.powi(i32::try_from(j).unwrap_or(0)) / FACTORIAL[j];
+        }
+        let hair = 1.0 + unit(columns[0].len());
+        let sizes = std::array::from_fn(|j| dot(&columns[j], &columns[j]).sqrt() * hair);
+        Ok(Self { columns, sizes, rest: left_out * inverse * hair })
+    }
+}
+
+impl Sums {
+    /// Σ_n of the moduli of what [`Sums::derivative`] adds up.
+    fn moduli(&self, j: usize, mu: f64) -> f64 {
+        let power = |x: f64| x.abs().powi(i32::try_from(j).unwrap_or(0));
+        let near = power(mu) + libm::exp2(self.eta + 1.0) * power(std::f64::consts::LN_2 - mu) + 2.0 * power(mu);
+        let far = self.sums.iter().zip(&self.powers).map(|(sums, (lead, logarithm))| {
+            let (mut value, mut turn) = (0.0, 1.0);
+            for i in 0..=j {
+                value += turn / FACTORIAL[i] * sums[j - i].abs();
+                turn *= (logarithm - mu).abs();
+            }
+            2.0 * FACTORIAL[j] * lead * value
+        });
+        near + far.sum::<f64>()
+    }
+}
+
+/// What rounding may add to a sum of so many terms, per unit: a generous multiple.
+#[allow(clippy::cast_precision_loss)]
+pub(super) fn unit(m: usize) -> f64 {
+    16.0 * f64::EPSILON * (m.max(64) as f64)
+}
+
+fn product(kernel: &[f64], spectrum: &Kernel, scale: f64, buffers: &mut Buffers) -> Vec<f64> {
+    let mut out = vec![0.0; kernel.len()];
+    Kernel::new(kernel).times(spectrum, &mut out, buffers);
+    out.iter_mut().for_each(|v| *v *= scale);
+    out
+}
+
+/// Σ over the powers up to the third of `half`^j/j! times a number each.
+pub(super) fn series(half: f64, of: impl Fn(usize) -> f64) -> f64 {
+    let mut power = 1.0;
+    let mut sum = 0.0;
+    for (j, factorial) in FACTORIAL.iter().enumerate().take(ALL).skip(1) {
+        power *= half;
+        sum += power / factorial * of(j);
+    }
+    sum
+}

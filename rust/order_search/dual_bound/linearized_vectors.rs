@@ -1,0 +1,453 @@
+//! Test vectors that follow the coefficients: each made for one candidate, corrected for others of the same own orders.
+//!
+//! With divisor D₀ and output error e₀ of the candidate that it is made for, t₀ = D₀⁻ᵀ sign(e₀). A candidate of the same
+//! own orders has D = D₀ − Σ x_m G_m, with G_m combinations of its F_i, and one step of Newton's method for D⁻ᵀ sign(e₀)
+//! is t = t₀ + Σ x_m v_m, v_m = D₀⁻ᵀ G_mᵀ t₀. Then Dᵀt = D₀ᵀt₀ − Σ x_m x_n G_nᵀ v_m but for rounding: what is lost is of
+//! second order, and all of it is known from a few numbers that are made once.
+
+use std::collections::BTreeMap;
+
+use crate::equation::Equation;
+use crate::error::{check_length, Error, Result};
+use crate::order_search::dual_bound::tailored_vectors::{modulus, Losses};
+use crate::order_search::dual_bound::test_vectors::NONE;
+use crate::order_search::options::Norm;
+use crate::regressors::{Bank, Index, Key, Record};
+use crate::series::{divide, reciprocal, Buffers, Kernel, SumOfProducts};
+use crate::simd;
+
+/// Most own terms of a candidate.
+pub(crate) const MOST_OWN: usize = 4;
+/// A candidate whose error is this many times the limit has neighbours that are as far beyond it; what is made for it
+/// reaches none of those that are not.
+const BEYOND: f64 = 4.0;
+/// Products of numbers below this do not overflow.
+const HUGE: f64 = 1e100;
+
+/// Whether the test vector made for one equation, corrected for another with the same orders of its output, proves that
+/// the other's output error at rest exceeds `limit`: Σ|y − ŷ| or Σ(y − ŷ)².
+///
+/// # Errors
+/// Orders or signals that make no equation, coefficients that are not one a term, other orders of the output.
+///
+/// ```
+/// # use ftlm::equation::{Equation, Structure, Term};
+/// # use ftlm::order_search::dual_bound::linearized_vectors::excluded_along;
+/// # use ftlm::order_search::options::Norm;
+/// # use ftlm::regressors::Record;
+/// # let input: Vec<f64> = (0..64).map(|k| if k % 16 < 8 { 1.0 } else { -1.0 }).collect();
+/// # let output = Record::new(0.1, vec![input.clone()], None)?.integral(0, 0.8);
+/// let record = Record::new(0.1, vec![output, input], None)?;
+/// let terms = vec![Term { signal: 0, order: 0.0 }, Term { signal: 1, order: 0.0 }];
+/// let structure = Structure { output: 0, order: 0.8, terms };
+/// let equation = |a: f64, b: f64| Equation { structure: structure.clone(), coefficients: vec![a, b] };
+/// // y is the integral of order 0.8 of u: D^0.8 y = u.
+/// let proved = |limit: f64| excluded_along(&record, &equation(-0.5, 2.0), &equation(-0.4, 2.1), Norm::L1, limit);
+/// assert!(proved(1.0)? && !proved(1e3)?);
+/// # Ok::<(), ftlm::error::Error>(())
+/// ```
+pub fn excluded_along(
+    record: &Record,
+    made_for: &Equation,
+    equation: &Equation,
+    norm: Norm,
+    limit: f64,
+) -> Result<bool> {
+    let mut index = Index::default();
+    let mut positions = Vec::new();
+    for Equation { structure, coefficients } in [made_for, equation] {
+        structure.check(record.len(), |_| true)?;
+        check_length("coefficients", structure.terms.len(), coefficients.len())?;
+        let keys = (0..structure.terms.len())
+            .map(|k| index.insert(Key::integral(structure.terms[k].signal, structure.integration(k))));
+        positions.push(keys.collect::<Vec<_>>());
+    }
+    let bank = Bank::new(&index, record, equation.structure.output)?;
+    let (banks, targets) = ([bank], [record.signal(equation.structure.output).to_vec()]);
+    let mut tangents = Tangents::new(&banks, &targets, norm);
+    let own = tangents.own(&positions[0]);
+    if own != tangents.own(&positions[1]) || own.is_empty() || own.len() > MOST_OWN {
+        return Err(Error::OutOfRange {
+            name: "own terms".into(),
+            value: 0.0,
+            range: format!("1 to {MOST_OWN} terms of the output, of the same orders in both equations"),
+            remedy: "give both equations these".into(),
+        });
+    }
+    let made = tangents.fit((&banks, &targets), &positions[0], &made_for.coefficients, f64::INFINITY);
+    tangents.add(own, made.into_iter().collect());
+    Ok(tangents.exclude(&positions[1], &equation.coefficients, limit, &mut Held::default()))
+}
+
+/// One test vector and its corrections, over all records.
+pub(crate) struct Tangent {
+    /// Coefficients of the own terms of the candidate that it was made for.
+    centre: Vec<f64>,
+    /// F_i = G_i + Σ_{j<i} mix[i·k + j] G_j.
+    mix: Vec<f64>,
+    /// Of each v_m: its largest value, and ‖D₀ᵀv_m − G_mᵀt₀‖.
+    sizes: Vec<f64>,
+    rests: Vec<f64>,
+    /// At least Σ|g_m| of the series of G_m, and of all that it is made of, times the largest norm.
+    lengths: Vec<f64>,
+    /// ‖G_nᵀv_m + G_mᵀv_n‖ for n < m and ‖G_mᵀv_m‖, packed by rows.
+    bends: Vec<f64>,
+    /// ‖D₀ᵀt₀‖, and (1 + Σ|c|Σ|f|) of D₀, times the largest norm.
+    norm: f64,
+    around: f64,
+    /// ⟨t₀, ·⟩, ⟨v_m, ·⟩ of the target, the own columns and all driven ones, k + 1 by k + 1 + all.
+    products: Vec<f64>,
+}
+
+/// Those of a search, by the own columns of the candidates that they serve.
+pub(crate) struct Tangents {
+    losses: Losses,
+    /// Number among the driven columns; [`NONE`] of an own one.
+    driven: Vec<usize>,
+    width: usize,
+    of: BTreeMap<Vec<usize>, (usize, usize)>,
+    each: Vec<Tangent>,
+}
+
+/// What a thread remembers from one candidate to the next.
+#[derive(Default)]
+pub(crate) struct Held {
+    own: Vec<usize>,
+    next: Vec<usize>,
+    range: (usize, usize),
+    last: usize,
+}
+
+impl Tangents {
+    /// None yet.
+    pub(crate) fn new(banks: &[Bank], targets: &[Vec<f64>], norm: Norm) -> Self {
+        let mut driven = Vec::new();
+        let mut width = 0;
+        if let Some(bank) = banks.first() {
+            for p in 0..bank.len() {
+                driven.push(if bank.kernel(p).is_empty() { width } else { NONE });
+                width += usize::from(bank.kernel(p).is_empty());
+            }
+        }
+        Self { losses: Losses::new(banks, targets, norm), driven, width, of: BTreeMap::new(), each: Vec::new() }
+    }
+
+    /// Bytes of one for candidates of so many own terms.
+    pub(crate) fn bytes(&self, own: usize) -> u64 {
+        8 * ((own + 1) * (own + 1 + self.width) + own * (2 * own + 4) + 8) as u64
+    }
+
+    /// Those of a candidate's columns that are integrals of the output.
+    pub(crate) fn own(&self, terms: &[usize]) -> Vec<usize> {
+        terms.iter().copied().filter(|&p| self.driven[p] == NONE).collect()
+    }
+
+    /// Takes what was made for candidates with these own columns.
+    pub(crate) fn add(&mut self, own: Vec<usize>, made: Vec<Tangent>) {
+        let from = self.each.len();
+        self.each.extend(made);
+        self.of.insert(own, (from, self.each.len()));
+    }
+
+    pub(crate) fn len(&self) -> usize {
+        self.each.len()
+    }
+
+    /// Bytes of all.
+    pub(crate) fn held(&self) -> u64 {
+        self.of.iter().map(|(own, (from, to))| self.bytes(own.len()) * (to - from) as u64).sum()
+    }
+
+    /// The one of the candidate with these columns and coefficients; none where it is far beyond the limit, or where
+    /// something leaves the range of floating point.
+    pub(crate) fn fit(
+        &self,
+        (banks, targets): (&[Bank], &[Vec<f64>]),
+        terms: &[usize],
+        c: &[f64],
+        limit: f64,
+    ) -> Option<Tangent> {
+        let own: Vec<(usize, f64)> =
+            terms.iter().zip(c).map(|(&p, &c)| (p, c)).filter(|(p, _)| self.driven[*p] == NONE).collect();
+        let k = own.len();
+        let mut parts: Vec<Part> = Vec::new();
+        let mut raw = 0.0;
+        for (bank, target) in banks.iter().zip(targets) {
+            let (mut divisor, mut driven) = (vec![0.0; target.len()], vec![0.0; target.len()]);
+            divisor[0] = 1.0;
+            for (&p, &c) in terms.iter().zip(c) {
+                let (sum, values, c) = match bank.kernel(p) {
+                    [] => (&mut driven, bank.column(p), c),
+                    kernel => (&mut divisor, kernel, -c),
+                };
+                sum.iter_mut().zip(values).for_each(|(sum, x)| *sum += c * x);
+            }
+            let error: Vec<f64> = divide(&driven, &divisor).ok()?.iter().zip(target).map(|(v, y)| y - v).collect();
+            let wanted: Vec<f64> = match self.losses.norm {
+                Norm::L1 => error.iter().map(|e| if *e < 0.0 { -1.0 } else { 1.0 }).collect(),
+                Norm::L2 => error.clone(),
+            };
+            raw += match self.losses.norm {
+                Norm::L1 => modulus(&error),
+                Norm::L2 => error.iter().map(|e| e * e).sum(),
+            };
+            // Written so that what is not a number ends here too.
+            if !(raw <= BEYOND * limit && raw < f64::MAX) {
+                return None;
+            }
+            // Vectors are kept read backwards, where transposed operators are the operators themselves.
+            let vector = divide(&backwards(&wanted), &divisor).ok()?;
+            parts.push(Part { divisor, vectors: vec![vector], steps: Vec::new(), series: Vec::new() });
+        }
+        let top = largest(parts.iter().flat_map(|part| &part.vectors[0]));
+        if !(f64::MIN_POSITIVE..HUGE).contains(&top) {
+            return None;
+        }
+        parts.iter_mut().flat_map(|part| &mut part.vectors[0]).for_each(|v| *v /= top);
+        let mut mix = vec![0.0; k * k];
+        let mut buffers = Buffers::default();
+        for (part, bank) in parts.iter_mut().zip(banks) {
+            let vector = Kernel::new(&part.vectors[0]);
+            for &(p, _) in &own {
+                let mut step = vec![0.0; part.divisor.len()];
+                Kernel::new(bank.kernel(p)).times(&vector, &mut step, &mut buffers);
+                part.steps.push(step);
+                part.series.push(bank.kernel(p).to_vec());
+            }
+        }
+        // The steps are made orthogonal, for they are nearly the same and coefficients of opposite sign.
+        for i in 0..k {
+            for j in 0..i {
+                let inner = |a: usize, b: usize| -> f64 {
+                    parts.iter().map(|part| simd::dot(&part.steps[a], &part.steps[b])).sum()
+                };
+                let square = inner(j, j);
+                let share = if square > 0.0 { inner(i, j) / square } else { 0.0 };
+                mix[i * k + j] = share;
+                for part in &mut parts {
+                    for rows in [&mut part.steps, &mut part.series] {
+                        let (before, after) = rows.split_at_mut(i);
+                        after[0].iter_mut().zip(&before[j]).for_each(|(x, y)| *x -= share * y);
+                    }
+                }
+            }
+        }
+        let mut made = Sized::new(self.losses.norm, k);
+        for part in &mut parts {
+            part.correct(&mut made, &mut buffers);
+        }
+        let mut lengths: Vec<f64> = Vec::new();
+        for (i, &(p, _)) in own.iter().enumerate() {
+            let mixed: f64 = (0..i).map(|j| mix[i * k + j].abs() * lengths[j]).sum();
+            lengths.push(self.losses.lengths[p] + mixed);
+        }
+        let sizes: Vec<f64> = (1..=k).map(|m| largest(parts.iter().flat_map(|part| &part.vectors[m]))).collect();
+        let products = self.products(&parts, banks, targets, &own);
+        let around = self.losses.size + own.iter().map(|&(p, c)| c.abs() * self.losses.lengths[p]).sum::<f64>();
+        let Sized { norm, rests, bends, .. } = made.done();
+        let sound = [&lengths, &sizes, &products, &rests, &bends, &mix].into_iter().flatten().all(|v| v.abs() < HUGE);
+        let centre = own.iter().map(|(_, c)| *c).collect();
+        (sound && norm < HUGE && around < HUGE).then_some(Tangent {
+            centre,
+            mix,
+            sizes,
+            rests,
+            lengths,
+            bends,
+            norm,
+            around,
+            products,
+        })
+    }
+
+    /// ⟨t₀, ·⟩ and ⟨v_m, ·⟩.
+    fn products(&self, parts: &[Part], banks: &[Bank], targets: &[Vec<f64>], own: &[(usize, f64)]) -> Vec<f64> {
+        let row = own.len() + 1 + self.width;
+        let mut products = vec![0.0; (own.len() + 1) * row];
+        for ((part, bank), target) in parts.iter().zip(banks).zip(targets) {
+            let vectors: Vec<Vec<f64>> = part.vectors.iter().map(|v| backwards(v)).collect();
+            let driven = (0..bank.len()).filter(|&p| self.driven[p] != NONE);
+            let columns = std::iter::once(&target[..]).chain(own.iter().map(|&(p, _)| bank.column(p)));
+            let columns: Vec<&[f64]> = columns.chain(driven.map(|p| bank.column(p))).collect();
+            simd::widest(Products { vectors: &vectors, columns: &columns, out: &mut products });
+        }
+        products
+    }
+
+    /// Whether some vector proves that a candidate's raw score exceeds the limit.
+    #[inline(always)]
+    pub(crate) fn exclude(&self, terms: &[usize], coefficients: &[f64], limit: f64, held: &mut Held) -> bool {
+        let Held { own, next, range, last } = held;
+        next.clear();
+        next.extend(terms.iter().copied().filter(|&p| self.driven[p] == NONE));
+        if next != own {
+            std::mem::swap(next, own);
+            *range = self.of.get(&own[..]).copied().unwrap_or((0, 0));
+        }
+        let count = range.1 - range.0;
+        for turn in 0..count {
+            let which = (*last + turn) % count;
+            if self.excludes(&self.each[range.0 + which], terms, coefficients, limit) {
+                *last = which;
+                return true;
+            }
+        }
+        false
+    }
+
+    /// Whether this one does, of a candidate with its own columns.
+    #[inline(always)]
+    pub(crate) fn excludes(&self, made: &Tangent, terms: &[usize], coefficients: &[f64], limit: f64) -> bool {
+        let (losses, k) = (&self.losses, made.centre.len());
+        let limit = losses.limit(limit);
+        let (mut rounding, mut length) = (losses.target_rounding, 0.0);
+        let (mut mine, mut filled) = ([0.0; MOST_OWN], 0);
+        for (&p, &c) in terms.iter().zip(coefficients) {
+            rounding += c.abs() * losses.rounding[p];
+            length += c.abs() * losses.lengths[p];
+            if self.driven[p] == NONE {
+                mine[filled] = c;
+                filled += 1;
+            }
+        }
+        // Along the G_m.
+        let mut x = [0.0; MOST_OWN];
+        for i in 0..k {
+            let off = mine[i] - made.centre[i];
+            x[i] += off;
+            x.iter_mut().zip(&made.mix[i * k..i * k + i]).for_each(|(x, share)| *x += share * off);
+        }
+        let (mut size, mut norm, mut steps, mut at) = (1.0, made.norm, 0.0, 0);
+        for m in 0..k {
+            size += x[m].abs() * made.sizes[m];
+            norm += x[m].abs() * made.rests[m];
+            steps += x[m].abs() * made.lengths[m];
+            for n in 0..=m {
+                norm += (x[m] * x[n]).abs() * made.bends[at];
+                at += 1;
+            }
+        }
+        norm += losses.unit * size * (made.around + length + steps);
+        let (mut seen, row) = (0.0, k + 1 + self.width);
+        for m in 0..=k {
+            let products = &made.products[m * row..(m + 1) * row];
+            let mut along = products[0];
+            for i in 0..k {
+                along -= mine[i] * products[1 + i];
+            }
+            for (&p, &c) in terms.iter().zip(coefficients) {
+                if self.driven[p] != NONE {
+                    along -= c * products[1 + k + self.driven[p]];
+                }
+            }
+            seen += if m == 0 { along } else { x[m - 1] * along };
+        }
+        // Neither NaN nor an overflow proves anything.
+        seen.abs() - size * rounding > limit * norm && seen.abs() < f64::MAX
+    }
+}
+
+/// What is made on one record, vectors read backwards.
+struct Part {
+    divisor: Vec<f64>,
+    /// t₀, then the v_m.
+    vectors: Vec<Vec<f64>>,
+    /// G_mᵀt₀.
+    steps: Vec<Vec<f64>>,
+    /// Series of G_m.
+    series: Vec<Vec<f64>>,
+}
+
+impl Part {
+    /// Makes the v_m, and adds up the norms that a candidate's proof asks for.
+    fn correct(&mut self, made: &mut Sized, buffers: &mut Buffers) {
+        let (m, k) = (self.divisor.len(), self.steps.len());
+        let (divisor, inverse) = (Kernel::new(&self.divisor), Kernel::new(&reciprocal(&self.divisor)));
+        let series: Vec<Kernel> = self.series.iter().map(|x| Kernel::new(x)).collect();
+        let mut out = vec![0.0; m];
+        divisor.times(&Kernel::new(&self.vectors[0]), &mut out, buffers);
+        made.norm = made.more(made.norm, &out);
+        let mut corrections: Vec<Kernel> = Vec::new();
+        for (i, step) in self.steps.iter().enumerate() {
+            let mut vector = vec![0.0; m];
+            inverse.times(&Kernel::new(step), &mut vector, buffers);
+            let spectrum = Kernel::new(&vector);
+            divisor.times(&spectrum, &mut out, buffers);
+            out.iter_mut().zip(step).for_each(|(x, y)| *x -= y);
+            made.rests[i] = made.more(made.rests[i], &out);
+            corrections.push(spectrum);
+            self.vectors.push(vector);
+        }
+        let (mut sum, mut at) = (SumOfProducts::new(m), 0);
+        for i in 0..k {
+            for j in 0..=i {
+                sum.add(1.0, &series[i], &corrections[j]);
+                if i != j {
+                    sum.add(1.0, &series[j], &corrections[i]);
+                }
+                sum.take(&mut out, buffers);
+                made.bends[at] = made.more(made.bends[at], &out);
+                at += 1;
+            }
+        }
+    }
+}
+
+/// Norms over all records: the largest modulus, or sums of squares until they are done.
+struct Sized {
+    of: Norm,
+    norm: f64,
+    rests: Vec<f64>,
+    bends: Vec<f64>,
+}
+
+impl Sized {
+    fn new(of: Norm, k: usize) -> Self {
+        Self { of, norm: 0.0, rests: vec![0.0; k], bends: vec![0.0; k * (k + 1) / 2] }
+    }
+
+    fn more(&self, so_far: f64, values: &[f64]) -> f64 {
+        // What is not a number must not be lost.
+        match self.of {
+            Norm::L1 if values.iter().all(|v| v.is_finite()) => so_far.max(largest(values)),
+            Norm::L1 => f64::INFINITY,
+            Norm::L2 => so_far + values.iter().map(|v| v * v).sum::<f64>(),
+        }
+    }
+
+    fn done(mut self) -> Self {
+        if self.of == Norm::L2 {
+            let all = self.rests.iter_mut().chain(&mut self.bends).chain(std::iter::once(&mut self.norm));
+            all.for_each(|v| *v = v.sqrt());
+        }
+        self
+    }
+}
+
+/// Inner products of some vectors with columns, added to what is there, as a kernel: vectors by columns.
+struct Products<'a> {
+    vectors: &'a [Vec<f64>],
+    columns: &'a [&'a [f64]],
+    out: &'a mut [f64],
+}
+
+impl simd::Kernel for Products<'_> {
+    type Output = ();
+
+    #[inline(always)]
+    fn run(self) {
+        for (i, column) in self.columns.iter().enumerate() {
+            for (m, vector) in self.vectors.iter().enumerate() {
+                self.out[m * self.columns.len() + i] += simd::dot(vector, column);
+            }
+        }
+    }
+}
+
+fn backwards(x: &[f64]) -> Vec<f64> {
+    x.iter().rev().copied().collect()
+}
+
+fn largest<'a>(values: impl IntoIterator<Item = &'a f64>) -> f64 {
+    values.into_iter().fold(0.0, |top: f64, v| if v.abs() <= top { top } else { v.abs() })
+}

@@ -1,0 +1,280 @@
+//! A lower bound of a candidate's output error from a few inner products, without running the candidate.
+//!
+//! With D = 1 − Σ c_i F_i over the own-output terms and w = y − Σ c x the equation error, the output error obeys
+//! D e = w. For any test vector t, ⟨t, w⟩ = ⟨t, D e⟩ = ⟨Dᵀt, e⟩, so by Hölder's inequality
+//!
+//!   ‖e‖ ≥ |⟨t, w⟩| / ‖Dᵀt‖ in the dual norm, and ‖Dᵀt‖ ≤ |1 − Σ c_i g_i|·‖t‖ + Σ |c_i|·‖F_iᵀt − g_i t‖
+//!
+//! for any numbers g_i. All inner products and norms are made once; a candidate costs about thirty operations a vector.
+
+use crate::equation::{Equation, Structure};
+use crate::error::{check_length, Result};
+use crate::order_search::dual_bound::infeasibility::Reach;
+use crate::order_search::dual_bound::tailored_vectors::{Adapted, Memory};
+use crate::order_search::dual_bound::test_vectors::{Probes, POOL};
+use crate::order_search::options::Norm;
+use crate::parallel::Stop;
+use crate::regressors::{Bank, Index, Key, Record};
+use crate::simd::WIDTH;
+
+/// What each test vector of the pool proves of an equation's output error at rest: lower bounds of Σ|y − ŷ| or
+/// Σ(y − ŷ)².
+///
+/// # Errors
+/// Orders or signals that make no equation, coefficients that are not one a term.
+///
+/// ```
+/// # use ftlm::equation::{Equation, Structure, Term};
+/// # use ftlm::order_search::dual_bound::lower_bound::lower_bounds;
+/// # use ftlm::order_search::options::Norm;
+/// # use ftlm::regressors::Record;
+/// # let input: Vec<f64> = (0..64).map(|k| if k % 16 < 8 { 1.0 } else { -1.0 }).collect();
+/// # let output = Record::new(0.1, vec![input.clone()], None)?.integral(0, 0.8);
+/// let record = Record::new(0.1, vec![output, input], None)?;
+/// let structure = Structure { output: 0, order: 0.8, terms: vec![Term { signal: 1, order: 0.0 }] };
+/// // y is the integral of order 0.8 of u; twice that misses it by Σ|y|.
+/// let equation = |c: f64| Equation { structure: structure.clone(), coefficients: vec![c] };
+/// let error: f64 = record.signal(0).iter().map(|y| y.abs()).sum();
+/// let proved = |c: f64| Ok::<_, ftlm::error::Error>(
+///     lower_bounds(&record, &equation(c), Norm::L1)?.into_iter().fold(0.0, f64::max)
+/// );
+/// assert!(proved(1.0)? < 1e-9 && proved(2.0)? > 0.1 * error && proved(2.0)? <= error);
+/// # Ok::<(), ftlm::error::Error>(())
+/// ```
+pub fn lower_bounds(record: &Record, equation: &Equation, norm: Norm) -> Result<Vec<f64>> {
+    let (bound, positions) = pooled(record, &equation.structure, norm)?;
+    check_length("coefficients", positions.len(), equation.coefficients.len())?;
+    let mut each = vec![0.0; bound.len()];
+    bound.each(|_| (&positions[..], &equation.coefficients[..], &[][..], &[][..]), &mut each);
+    Ok(each)
+}
+
+/// Whether the pool of test vectors proves that no coefficients of this structure, but for the fixed ones, give an output
+/// error at rest of at most `limit`: Σ|y − ŷ| or Σ(y − ŷ)². The proof is sought from `start`.
+///
+/// # Errors
+/// Orders or signals that make no equation, coefficients that are not one a term.
+///
+/// ```
+/// # use ftlm::equation::{Structure, Term};
+/// # use ftlm::order_search::dual_bound::lower_bound::out_of_reach;
+/// # use ftlm::order_search::options::Norm;
+/// # use ftlm::regressors::Record;
+/// # let input: Vec<f64> = (0..64).map(|k| if k % 16 < 8 { 1.0 } else { -1.0 }).collect();
+/// # let output = Record::new(0.1, vec![input.clone()], None)?.integral(0, 0.8);
+/// let record = Record::new(0.1, vec![output, input], None)?;
+/// let structure = Structure { output: 0, order: 0.8, terms: vec![Term { signal: 1, order: 0.0 }] };
+/// // y is the integral of order 0.8 of u: free coefficients reach it, a known one twice as large does not.
+/// assert!(!out_of_reach(&record, &structure, &[None], &[2.0], Norm::L1, 1e-3)?);
+/// assert!(out_of_reach(&record, &structure, &[Some(2.0)], &[2.0], Norm::L1, 1e-3)?);
+/// # Ok::<(), ftlm::error::Error>(())
+/// ```
+pub fn out_of_reach(
+    record: &Record,
+    structure: &Structure,
+    fixed: &[Option<f64>],
+    start: &[f64],
+    norm: Norm,
+    limit: f64,
+) -> Result<bool> {
+    let (bound, positions) = pooled(record, structure, norm)?;
+    check_length("fixed coefficients", structure.terms.len(), fixed.len())?;
+    check_length("coefficients", structure.terms.len(), start.len())?;
+    Ok(bound.excludes(limit, &positions, fixed, &[], start, &mut Reach::default()))
+}
+
+/// Whether the test vector made for one equation proves that another's output error at rest exceeds `limit`: Σ|y − ŷ| or
+/// Σ(y − ŷ)².
+///
+/// # Errors
+/// Orders or signals that make no equation, coefficients that are not one a term.
+///
+/// ```
+/// # use ftlm::equation::{Equation, Structure, Term};
+/// # use ftlm::order_search::dual_bound::lower_bound::excluded_by;
+/// # use ftlm::order_search::options::Norm;
+/// # use ftlm::regressors::Record;
+/// # let input: Vec<f64> = (0..64).map(|k| if k % 16 < 8 { 1.0 } else { -1.0 }).collect();
+/// # let output = Record::new(0.1, vec![input.clone()], None)?.integral(0, 0.8);
+/// let record = Record::new(0.1, vec![output, input], None)?;
+/// let structure = Structure { output: 0, order: 0.8, terms: vec![Term { signal: 1, order: 0.0 }] };
+/// // y is the integral of order 0.8 of u; twice that misses it by Σ|y|, three times by 2Σ|y|.
+/// let equation = |c: f64| Equation { structure: structure.clone(), coefficients: vec![c] };
+/// let error: f64 = record.signal(0).iter().map(|y| y.abs()).sum();
+/// let proved = |limit: f64| excluded_by(&record, &equation(2.0), &equation(3.0), Norm::L1, limit);
+/// assert!(proved(1.99 * error)? && !proved(2.0 * error)?);
+/// # Ok::<(), ftlm::error::Error>(())
+/// ```
+pub fn excluded_by(record: &Record, made_for: &Equation, equation: &Equation, norm: Norm, limit: f64) -> Result<bool> {
+    Ok(excluded_in_turn(record, made_for, std::slice::from_ref(equation), norm, limit)? == [true])
+}
+
+/// [`excluded_by`] of several equations of the same output, one after the other as a search asks them: what the
+/// vector came to for one is remembered for the next.
+///
+/// # Errors
+/// Orders or signals that make no equation, coefficients that are not one a term.
+pub fn excluded_in_turn(
+    record: &Record,
+    made_for: &Equation,
+    equations: &[Equation],
+    norm: Norm,
+    limit: f64,
+) -> Result<Vec<bool>> {
+    let mut index = Index::default();
+    let mut positions = Vec::new();
+    for Equation { structure, coefficients } in std::iter::once(made_for).chain(equations) {
+        structure.check(record.len(), |_| true)?;
+        check_length("coefficients", structure.terms.len(), coefficients.len())?;
+        let keys = (0..structure.terms.len())
+            .map(|k| index.insert(Key::integral(structure.terms[k].signal, structure.integration(k))));
+        positions.push(keys.collect::<Vec<_>>());
+    }
+    let bank = Bank::new(&index, record, made_for.structure.output)?;
+    let (banks, targets) = ([bank], [record.signal(made_for.structure.output).to_vec()]);
+    let mut adapted = Adapted::new(&banks, &targets, norm);
+    adapted.each.extend(adapted.fit(&banks, &targets, &positions[0], &made_for.coefficients));
+    let mut memory = Memory::of_neighbours();
+    let asked = positions[1..].iter().zip(equations);
+    Ok(asked.map(|(terms, asked)| adapted.exclude(terms, &asked.coefficients, limit, &mut memory)).collect())
+}
+
+/// The whole pool on one record, and the columns of a structure's terms.
+fn pooled(record: &Record, structure: &Structure, norm: Norm) -> Result<(Bound, Vec<usize>)> {
+    structure.check(record.len(), |_| true)?;
+    let mut index = Index::default();
+    let positions: Vec<usize> = (0..structure.terms.len())
+        .map(|k| index.insert(Key::integral(structure.terms[k].signal, structure.integration(k))))
+        .collect();
+    let bank = Bank::new(&index, record, structure.output)?;
+    let target = record.signal(structure.output).to_vec();
+    Ok((Bound::new((&[bank], &[target]), norm, true, POOL, &Stop::default()), positions))
+}
+
+/// The test vectors of a search, on every record.
+pub(crate) struct Bound {
+    norm: Norm,
+    probes: Vec<Probes>,
+}
+
+impl Bound {
+    /// Most test vectors.
+    pub(crate) const POOL: usize = POOL;
+
+    /// Makes `count` test vectors (a multiple of [`WIDTH`], at most [`POOL`]) for these records.
+    ///
+    /// `output_error` tells whether own-output columns act on the divisor; in the equation error D = 1. Runs on the
+    /// current thread pool; what it comes to once it was told to stop is of no use.
+    pub(crate) fn new(
+        (banks, targets): (&[Bank], &[Vec<f64>]),
+        norm: Norm,
+        output_error: bool,
+        count: usize,
+        stop: &Stop,
+    ) -> Self {
+        let probes =
+            banks.iter().zip(targets).map(|(b, y)| Probes::new(b, y, norm, (output_error, count), stop)).collect();
+        Self { norm, probes }
+    }
+
+    /// The test vectors on every record.
+    pub(crate) fn probes(&self) -> &[Probes] {
+        &self.probes
+    }
+
+    /// Number of test vectors.
+    pub(crate) fn len(&self) -> usize {
+        self.probes.first().map_or(0, |p| p.groups * WIDTH)
+    }
+
+    /// Only these test vectors (a multiple of [`WIDTH`] of them), in this order.
+    pub(crate) fn chosen(&self, which: &[usize]) -> Self {
+        Self { norm: self.norm, probes: self.probes.iter().map(|p| p.chosen(which)).collect() }
+    }
+
+    /// Lower bound of the raw score (Σ|e| or Σe²) of a candidate, and a guess at it by which to order visits.
+    ///
+    /// `columns(r)` gives positions and coefficients on record r. Ends as soon as the bound exceeds the limit.
+    #[inline(always)]
+    pub(crate) fn evaluate<'a>(
+        &self,
+        limit: f64,
+        columns: impl Fn(usize) -> (&'a [usize], &'a [f64], &'a [usize], &'a [f64]),
+    ) -> (f64, f64) {
+        let (mut bound, mut guess) = (0.0, 0.0);
+        for (r, probes) in self.probes.iter().enumerate() {
+            let (terms, coefficients, initial, weights) = columns(r);
+            let rounding = probes.allowance(terms, coefficients, initial, weights);
+            let (mut largest, mut farthest) = (0.0, 0.0);
+            for group in 0..probes.groups {
+                let (bounds, guesses) = probes.group(group, terms, coefficients, initial, weights, rounding);
+                for n in 0..WIDTH {
+                    // Neither NaN nor an overflow proves anything.
+                    if bounds[n] > largest && bounds[n] < f64::MAX {
+                        largest = bounds[n];
+                    }
+                    if guesses[n] > farthest {
+                        farthest = guesses[n];
+                    }
+                }
+                if bound + self.raw(largest) > limit {
+                    break;
+                }
+            }
+            bound += self.raw(largest);
+            guess += self.raw(farthest);
+        }
+        (bound, guess)
+    }
+
+    /// Whether no coefficients whatever of these columns give a raw score of at most `limit`.
+    ///
+    /// `fixed` are known coefficients of terms; all others, and those of the initial terms, are free. `start` says where
+    /// to begin: coefficients of the terms, then of the initial terms by record.
+    #[inline(always)]
+    pub(crate) fn excludes(
+        &self,
+        limit: f64,
+        terms: &[usize],
+        fixed: &[Option<f64>],
+        initial: &[usize],
+        start: &[f64],
+        scratch: &mut Reach,
+    ) -> bool {
+        let largest = match self.norm {
+            Norm::L1 => limit,
+            Norm::L2 => limit.sqrt(),
+        };
+        scratch.lay_out(&self.probes, largest, terms, fixed, initial, start);
+        scratch.search()
+    }
+
+    /// The bound of each test vector alone, summed over records.
+    pub(crate) fn each<'a>(
+        &self,
+        columns: impl Fn(usize) -> (&'a [usize], &'a [f64], &'a [usize], &'a [f64]),
+        out: &mut [f64],
+    ) {
+        out.fill(0.0);
+        for (r, probes) in self.probes.iter().enumerate() {
+            let (terms, coefficients, initial, weights) = columns(r);
+            let rounding = probes.allowance(terms, coefficients, initial, weights);
+            for (group, out) in out.chunks_exact_mut(WIDTH).enumerate().take(probes.groups) {
+                let (bounds, _) = probes.group(group, terms, coefficients, initial, weights, rounding);
+                for (sum, bound) in out.iter_mut().zip(bounds) {
+                    if bound > 0.0 && bound < f64::MAX {
+                        *sum += self.raw(bound);
+                    }
+                }
+            }
+        }
+    }
+
+    #[inline(always)]
+    fn raw(&self, norm: f64) -> f64 {
+        match self.norm {
+            Norm::L1 => norm,
+            Norm::L2 => norm * norm,
+        }
+    }
+}

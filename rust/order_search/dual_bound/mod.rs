@@ -1,0 +1,12 @@
+//! What is proved of a candidate's output error from a few inner products with test vectors, without running it.
+
+pub(crate) mod infeasibility;
+pub(crate) mod linearized_vectors;
+pub mod lower_bound;
+pub(crate) mod tailored_vectors;
+pub(crate) mod test_vectors;
+pub(crate) mod unstable_zeros;
+
+pub use linearized_vectors::excluded_along;
+pub use lower_bound::{excluded_by, excluded_in_turn, lower_bounds, out_of_reach};
+pub use unstable_zeros::explodes;

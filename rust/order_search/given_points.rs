@@ -1,0 +1,227 @@
+//! Errors of candidates given as points, each with orders and coefficients of its own: what a genetic algorithm asks for.
+
+use std::collections::HashMap;
+
+use rayon::prelude::*;
+
+use crate::equation::{Structure, Term};
+use crate::error::{check_finite, check_length, Error, Result};
+use crate::fractional::kernels::block_pulse_kernel;
+use crate::order_search::candidate::simulation::March;
+use crate::order_search::control::Control;
+use crate::order_search::options::Norm;
+use crate::order_search::result::Verdict;
+use crate::parallel::{pool, PerThread};
+use crate::regressors::{Key, Record};
+
+/// Memory for regressors kept from one call to the next; a population that has settled asks for the same ones again.
+const KEPT_BYTES: usize = 256 << 20;
+
+/// One candidate: an order and a coefficient for each term.
+#[derive(Debug, Clone, PartialEq)]
+pub struct Point {
+    /// Highest order.
+    pub order: f64,
+    /// Orders of the terms.
+    pub orders: Vec<f64>,
+    /// Their coefficients.
+    pub coefficients: Vec<f64>,
+}
+
+/// One equation on some records, evaluated at any orders and coefficients, at rest.
+pub struct Points {
+    records: Vec<Record>,
+    output: usize,
+    signals: Vec<usize>,
+    inputs: Vec<bool>,
+    norm: Norm,
+    samples: usize,
+    /// Per record: the kernel of an own-output term, the integral of any other signal.
+    kept: HashMap<Key, Vec<Vec<f64>>>,
+}
+
+impl Points {
+    /// The equation of `output` with a term on each of `signals`; `inputs` says which signals of the records are inputs.
+    ///
+    /// # Errors
+    /// No record, or a signal that they do not have.
+    pub fn new(
+        records: Vec<Record>,
+        output: usize,
+        signals: Vec<usize>,
+        inputs: Vec<bool>,
+        norm: Norm,
+    ) -> Result<Self> {
+        let Some(first) = records.first() else {
+            return Err(Error::Structure { what: "no record is given".into(), remedy: "give at least one run".into() });
+        };
+        for &signal in std::iter::once(&output).chain(&signals) {
+            if signal >= first.len() {
+                return Err(Error::Structure {
+                    what: format!("the equation names signal {signal}, but the record holds {}", first.len()),
+                    remedy: "give the record all signals of the equation".into(),
+                });
+            }
+        }
+        for record in &records {
+            check_length("signals of a record", first.len(), record.len())?;
+        }
+        let samples = records.iter().map(Record::m).sum();
+        Ok(Self { records, output, signals, inputs, norm, samples, kept: HashMap::new() })
+    }
+
+    /// Error of every candidate's free run, summed over the records: Σ|e|, or RMSE.
+    ///
+    /// Infinite for orders that make no equation, for one above that of the output, and for a free run that diverges. A
+    /// candidate whose error exceeds `limit` is left as soon as that is sure and is infinite, too. The same bits for any
+    /// number of threads.
+    ///
+    /// # Errors
+    /// A candidate of another length, coefficients that are not finite, threads that do not start,
+    /// [`Error::Interrupted`].
+    ///
+    /// ```
+    /// # use ftlm::order_search::control::Control;
+    /// # use ftlm::order_search::options::Norm;
+    /// # use ftlm::order_search::given_points::{Point, Points};
+    /// # use ftlm::regressors::Record;
+    /// # let input: Vec<f64> = (0..64).map(|k| if k % 16 < 8 { 1.0 } else { -1.0 }).collect();
+    /// # let output = Record::new(0.1, vec![input.clone()], None)?.integral(0, 0.8);
+    /// let record = Record::new(0.1, vec![output, input], None)?;
+    /// // D^α y = c u: α = 0.8 and c = 1 made y; an order of u above α is left out.
+    /// let mut points = Points::new(vec![record], 0, vec![1], vec![false, true], Norm::L1)?;
+    /// let point = |order: f64, of_input: f64| Point { order, orders: vec![of_input], coefficients: vec![1.0] };
+    /// let errors = points.scores(&[point(0.8, 0.0), point(0.8, 0.9)], f64::INFINITY, 1, &Control::default())?;
+    /// assert!(errors[0] < 1e-9 && errors[1].is_infinite());
+    /// # Ok::<(), ftlm::error::Error>(())
+    /// ```
+    pub fn scores(&mut self, points: &[Point], limit: f64, threads: usize, control: &Control) -> Result<Vec<f64>> {
+        let mut structures = Vec::with_capacity(points.len());
+        for point in points {
+            check_length("orders of a candidate", self.signals.len(), point.orders.len())?;
+            check_length("coefficients of a candidate", self.signals.len(), point.coefficients.len())?;
+            check_finite("coefficients of a candidate", &point.coefficients)?;
+            let pairs = self.signals.iter().zip(&point.orders);
+            let terms = pairs.map(|(&signal, &order)| Term { signal, order }).collect();
+            let structure = Structure { output: self.output, order: point.order, terms };
+            let is_input = |s: usize| self.inputs.get(s).copied().unwrap_or(false);
+            let fits = structure.check(self.records[0].len(), is_input).is_ok();
+            // What holds between samples has no derivative at its jumps, and a candidate is to be judged as it will run.
+            let smooth = structure.terms.iter().all(|term| term.order <= structure.order);
+            structures.push((fits && smooth).then_some(structure));
+        }
+        let pool = pool(threads)?;
+        self.fetch(&structures, &pool);
+        // Raw sums: Σ|e|, or Σe².
+        #[allow(clippy::cast_precision_loss)]
+        let samples = self.samples as f64;
+        let raw_limit = if self.norm == Norm::L1 { limit } else { limit * limit * samples };
+        let marches = PerThread::<March>::new(&pool);
+        let this = &*self;
+        let raw: Vec<f64> = pool.install(|| {
+            structures
+                .par_iter()
+                .zip(points)
+                .map(|(structure, point)| {
+                    let Some(structure) = structure else { return f64::INFINITY };
+                    marches.with(|march| {
+                        let error = this.error(structure, &point.coefficients, raw_limit, march, control);
+                        error.unwrap_or(f64::INFINITY)
+                    })
+                })
+                .collect()
+        });
+        control.check_stop()?;
+        control.count(points.len() as u64, 0);
+        Ok(raw.into_iter().map(|raw| self.norm.score(raw, self.samples)).collect())
+    }
+
+    /// Computes the regressors that are not kept yet.
+    fn fetch(&mut self, structures: &[Option<Structure>], pool: &rayon::ThreadPool) {
+        let each = self.samples * std::mem::size_of::<f64>();
+        let mut wanted: Vec<(Key, usize, f64)> = Vec::new();
+        for structure in structures.iter().flatten() {
+            for k in 0..structure.terms.len() {
+                let (signal, eta) = (structure.terms[k].signal, structure.integration(k));
+                wanted.push((Key::integral(signal, eta), signal, eta));
+            }
+        }
+        wanted.sort_unstable_by_key(|a| a.0);
+        wanted.dedup_by(|a, b| a.0 == b.0);
+        if (self.kept.len() + wanted.len()) * each > KEPT_BYTES {
+            self.kept.clear();
+        }
+        wanted.retain(|(key, _, _)| !self.kept.contains_key(key));
+        let (records, output) = (&self.records, self.output);
+        let made: Vec<Vec<Vec<f64>>> = pool.install(|| {
+            wanted
+                .par_iter()
+                .map(|&(_, signal, eta)| {
+                    let one = |record: &Record| {
+                        if signal == output {
+                            block_pulse_kernel(eta, record.m(), record.step())
+                        } else if eta == 0.0 {
+                            record.signal(signal).to_vec()
+                        } else {
+                            record.integral(signal, eta)
+                        }
+                    };
+                    records.iter().map(one).collect()
+                })
+                .collect()
+        });
+        self.kept.extend(wanted.into_iter().map(|(key, _, _)| key).zip(made));
+    }
+
+    /// Raw error of a candidate on all records, or none where it passes the limit or its free run diverges.
+    fn error(
+        &self,
+        structure: &Structure,
+        coefficients: &[f64],
+        limit: f64,
+        march: &mut March,
+        control: &Control,
+    ) -> Option<f64> {
+        let mut sum = 0.0;
+        for (r, record) in self.records.iter().enumerate() {
+            let columns: Vec<(bool, &[f64], f64)> = (0..structure.terms.len())
+                .filter_map(|k| {
+                    let signal = structure.terms[k].signal;
+                    let kept = self.kept.get(&Key::integral(signal, structure.integration(k)))?;
+                    Some((signal == self.output, &kept[r][..], coefficients[k]))
+                })
+                .collect();
+            let side = |own: bool| columns.iter().filter(move |term| term.0 == own).map(|&(_, column, c)| (column, c));
+            let target = record.signal(self.output);
+            match march.run(target, side(true), side(false), self.norm, sum, limit, control) {
+                // A limit that is not a number is passed by all.
+                Verdict::Score(raw) if raw <= limit => sum = raw,
+                _ => return None,
+            }
+        }
+        Some(sum)
+    }
+}
+
+/// Error (45) of one candidate on one record by the naive division: the oracle of [`Points::scores`]. O(m²).
+///
+/// # Panics
+/// Where the record does not hold a signal.
+#[cfg(feature = "oracles")]
+#[must_use]
+pub fn score_naive(record: &Record, output: usize, signals: &[usize], point: &Point) -> f64 {
+    let m = record.m();
+    let (mut divisor, mut numerator) = (vec![0.0; m], vec![0.0; m]);
+    divisor[0] = 1.0;
+    for ((&signal, order), c) in signals.iter().zip(&point.orders).zip(&point.coefficients) {
+        let kernel = block_pulse_kernel(point.order - order, m, record.step());
+        if signal == output {
+            divisor.iter_mut().zip(&kernel).for_each(|(d, v)| *d -= c * v);
+        } else {
+            let integral = crate::series::multiply_naive(&kernel, record.signal(signal), m);
+            numerator.iter_mut().zip(integral).for_each(|(n, v)| *n += c * v);
+        }
+    }
+    crate::series::divide_naive(&numerator, &divisor)
+        .map_or(f64::INFINITY, |response| record.signal(output).iter().zip(response).map(|(y, v)| (y - v).abs()).sum())
+}

@@ -1,0 +1,209 @@
+//! The lattice under an order law: a few free orders give the orders of all equations of a stage.
+
+use crate::equation::{alpha_fits, order_fits, tidy, AffineOrder, Structure, Term, ORDER_GRAIN};
+use crate::error::{check_finite, Error, Result};
+use crate::fractional::kernels::MAX_EXCESS;
+
+/// Most tuples of free orders of a stage; what a search costs follows from the distinct orders of its equations.
+pub const MAX_TUPLES: u128 = 5_000_000_000;
+
+/// One equation of a stage: its α and its terms' orders as affine functions of the stage's free orders.
+#[derive(Debug, Clone, PartialEq)]
+pub struct LawEquation {
+    /// Output of the equation.
+    pub output: usize,
+    /// α.
+    pub order: AffineOrder,
+    /// Signal and order of each term.
+    pub terms: Vec<(usize, AffineOrder)>,
+}
+
+/// The product of free orders under an order law; tuples that make no equation are left out.
+#[derive(Debug, Clone)]
+pub struct LawLattice {
+    axes: Vec<Vec<f64>>,
+    equations: Vec<LawEquation>,
+    inputs: Vec<bool>,
+    product: u64,
+    /// Output and place of terms whose coefficient is known.
+    known: Vec<(usize, usize)>,
+}
+
+impl LawLattice {
+    /// Takes the values of each free order and the equations; `inputs[s]` tells whether signal s is an input.
+    ///
+    /// # Errors
+    /// [`Error::EmptyLattice`] where an axis is empty, [`Error::LatticeTooLarge`] for the product of the axes,
+    /// [`Error::NotFinite`] for an order or a law that is no number, [`Error::Structure`] where there is no equation, or
+    /// one names a signal or a free order that is not there.
+    ///
+    /// ```
+    /// # use ftlm::equation::AffineOrder;
+    /// # use ftlm::order_search::grid::order_law::{LawEquation, LawLattice};
+    /// // D^α y = c D^{α−1} u for a free α.
+    /// let law = |constant: f64| AffineOrder { constant, weights: vec![1.0] };
+    /// let equation = LawEquation { output: 0, order: law(0.0), terms: vec![(1, law(-1.0))] };
+    /// let lattice = LawLattice::new(&[vec![0.5, 1.5]], &[equation], &[false, false])?;
+    /// assert_eq!((lattice.product(), lattice.free(1)), (2, vec![1.5]));
+    /// // An order below 0 is for inputs alone.
+    /// assert!(lattice.structures(0).is_none());
+    /// assert_eq!(lattice.structures(1).map(|all| all[0].terms[0].order), Some(0.5));
+    /// # Ok::<(), ftlm::error::Error>(())
+    /// ```
+    pub fn new(axes: &[Vec<f64>], equations: &[LawEquation], inputs: &[bool]) -> Result<Self> {
+        for (axis, values) in axes.iter().enumerate() {
+            check_finite(&format!("values of free order {axis}"), values)?;
+        }
+        if equations.is_empty() {
+            let what = "a stage without an equation has nothing to search".into();
+            return Err(Error::Structure { what, remedy: "give at least one equation".into() });
+        }
+        equations.iter().try_for_each(|equation| equation.check(axes.len(), inputs.len()))?;
+        let axes: Vec<Vec<f64>> = axes
+            .iter()
+            .map(|axis| {
+                let mut axis: Vec<f64> = axis.iter().map(|&v| tidy(v)).collect();
+                axis.sort_by(f64::total_cmp);
+                axis.dedup();
+                axis
+            })
+            .collect();
+        if let Some(empty) = axes.iter().position(Vec::is_empty) {
+            return Err(Error::EmptyLattice { why: format!("free order {empty} has no value") });
+        }
+        let product = axes.iter().fold(1u128, |p, a| p.saturating_mul(a.len() as u128));
+        match u64::try_from(product) {
+            Ok(count) if product <= MAX_TUPLES => Ok(Self {
+                axes,
+                equations: equations.to_vec(),
+                inputs: inputs.to_vec(),
+                product: count,
+                known: Vec::new(),
+            }),
+            _ => Err(Error::LatticeTooLarge { count: product, limit: MAX_TUPLES }),
+        }
+    }
+
+    /// The same with terms of known coefficients, `fixed[e]` by term of equation e: these may exceed their equation's α.
+    ///
+    /// A term above α with a free coefficient is left out: it is a way to say that an output nearly equals itself.
+    #[must_use]
+    pub fn with_known(mut self, fixed: &[Vec<Option<f64>>]) -> Self {
+        let terms = self.equations.iter().zip(fixed).flat_map(|(equation, fixed)| {
+            let known = fixed.iter().enumerate().filter(|(_, value)| value.is_some());
+            known.map(|(k, _)| (equation.output, k))
+        });
+        self.known = terms.collect();
+        self
+    }
+
+    /// Refuses records of so many signals where an equation names another.
+    pub(crate) fn check_signals(&self, signals: usize) -> Result<()> {
+        self.equations.iter().try_for_each(|equation| equation.check(self.axes.len(), signals))
+    }
+
+    /// Size of the product of the axes; candidates are those of its indices that [`LawLattice::structures`] accepts.
+    #[must_use]
+    pub fn product(&self) -> u64 {
+        self.product
+    }
+
+    /// The equations.
+    #[must_use]
+    pub fn equations(&self) -> &[LawEquation] {
+        &self.equations
+    }
+
+    /// Free orders at an index of the product, the first the slowest; beyond the last the first follows again.
+    #[must_use]
+    pub fn free(&self, index: u64) -> Vec<f64> {
+        let mut rest = index;
+        let mut free: Vec<f64> = self
+            .axes
+            .iter()
+            .rev()
+            .map(|axis| {
+                let len = axis.len() as u64;
+                #[allow(clippy::cast_possible_truncation)]
+                let value = axis[(rest % len) as usize];
+                rest /= len;
+                value
+            })
+            .collect();
+        free.reverse();
+        free
+    }
+
+    /// The structures at an index, or none where an order is out of range or two orders of a signal coincide.
+    #[must_use]
+    pub fn structures(&self, index: u64) -> Option<Vec<Structure>> {
+        let free = self.free(index);
+        self.equations
+            .iter()
+            .map(|equation| {
+                let orders: Vec<f64> = equation.laws().map(|law| law.at(&free)).collect();
+                self.fits(equation, &orders).then(|| {
+                    let terms = equation.terms.iter().zip(&orders[1..]);
+                    let terms = terms.map(|(&(signal, _), &order)| Term { signal, order }).collect();
+                    Structure { output: equation.output, order: orders[0], terms }
+                })
+            })
+            .collect()
+    }
+
+    /// Values of each free order.
+    pub(crate) fn axes(&self) -> &[Vec<f64>] {
+        &self.axes
+    }
+
+    /// Whether α and the terms' orders make an equation whose orders of one signal are distinct.
+    pub(crate) fn fits(&self, equation: &LawEquation, orders: &[f64]) -> bool {
+        let alpha = orders[0];
+        let input = |s: usize| self.inputs.get(s).copied().unwrap_or(false);
+        let fit = |k: usize, signal: usize, order: f64| {
+            let own = signal == equation.output;
+            order_fits(alpha, order, own, input(signal))
+                || !own
+                    && !input(signal)
+                    && order > alpha
+                    && order < alpha + MAX_EXCESS - ORDER_GRAIN
+                    && self.known.contains(&(equation.output, k))
+        };
+        alpha_fits(alpha)
+            && equation.terms.iter().zip(&orders[1..]).enumerate().all(|(k, (term, &order))| fit(k, term.0, order))
+            && equation.terms.iter().enumerate().all(|(a, (signal, _))| {
+                let before = equation.terms[..a].iter().zip(&orders[1..]);
+                before.into_iter().all(|((s, _), v)| s != signal || (v - orders[a + 1]).abs() > ORDER_GRAIN)
+            })
+    }
+}
+
+impl LawEquation {
+    /// Refuses an equation over other signals and free orders than these.
+    fn check(&self, free: usize, signals: usize) -> Result<()> {
+        for signal in std::iter::once(self.output).chain(self.terms.iter().map(|term| term.0)) {
+            if signal >= signals {
+                return Err(Error::Structure {
+                    what: format!("an equation of the stage names signal {signal}, but there are {signals}"),
+                    remedy: "give all signals of the equations".into(),
+                });
+            }
+        }
+        for law in self.laws() {
+            check_finite("order law", std::slice::from_ref(&law.constant))?;
+            check_finite("weights of an order law", &law.weights)?;
+            if law.weights.len() > free {
+                return Err(Error::Structure {
+                    what: format!("an order law weighs {} free orders, but there are {free}", law.weights.len()),
+                    remedy: "give every free order its values".into(),
+                });
+            }
+        }
+        Ok(())
+    }
+
+    /// The law of α, then those of the terms.
+    pub(crate) fn laws(&self) -> impl Iterator<Item = &AffineOrder> {
+        std::iter::once(&self.order).chain(self.terms.iter().map(|t| &t.1))
+    }
+}

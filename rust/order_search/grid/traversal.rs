@@ -1,0 +1,310 @@
+//! A walk through the candidates of a lattice in the order of their indices, from any index on.
+//!
+//! Slabs of a lattice: runs of indices over which two orders alone vary, each through all of its values.
+//!
+//! Orders of visiting that spread any first part of them over the whole range.
+
+use crate::equation::{Structure, Term};
+use crate::order_search::grid::independent::{Bits, Lattice, STRIDE};
+
+impl Lattice {
+    /// Orders of a candidate: its structure; an index beyond the last is the last.
+    ///
+    /// ```
+    /// # use ftlm::order_search::grid::independent::{Lattice, TermAxis};
+    /// let own = TermAxis { signal: 0, values: vec![0.0, 0.5], interchangeable: false };
+    /// let lattice = Lattice::new(0, &[0.8], &[own], |_| false)?;
+    /// let orders: Vec<f64> = (0..lattice.count()).map(|index| lattice.structure(index).terms[0].order).collect();
+    /// assert_eq!(orders, [0.5, 0.0]);
+    /// # Ok::<(), ftlm::error::Error>(())
+    /// ```
+    #[must_use]
+    pub fn structure(&self, index: u64) -> Structure {
+        Cursor::at(self, index).structure()
+    }
+}
+
+/// Where in a lattice a walk stands.
+#[derive(Debug, Clone)]
+pub(crate) struct Cursor<'a> {
+    lattice: &'a Lattice,
+    block: usize,
+    /// Per group: its prefix, and the values that complete it.
+    prefixes: Vec<usize>,
+    completions: Vec<Bits>,
+    /// Position of each term's order in its axis.
+    digits: Vec<Vec<usize>>,
+}
+
+impl<'a> Cursor<'a> {
+    /// Stands at a candidate; an index beyond the last is the last.
+    pub(crate) fn at(lattice: &'a Lattice, index: u64) -> Self {
+        let index = index.min(lattice.count - 1);
+        let block = lattice.blocks.partition_point(|b| b.start <= index).saturating_sub(1);
+        let groups = lattice.groups.len();
+        let mut cursor = Self {
+            lattice,
+            block,
+            prefixes: vec![0; groups],
+            completions: vec![Bits(Vec::new()); groups],
+            digits: lattice.groups.iter().map(|g| vec![0; g.terms.len()]).collect(),
+        };
+        let mut rest = index - lattice.blocks[block].start;
+        for g in (0..groups).rev() {
+            let count = lattice.blocks[block].slices[g].count;
+            cursor.seek(g, rest % count);
+            rest /= count;
+        }
+        cursor
+    }
+
+    /// Index of the candidate of a block whose orders have these positions in their axes, one a term; none where there is
+    /// none.
+    pub(crate) fn find(lattice: &'a Lattice, block: usize, digits: &[usize]) -> Option<u64> {
+        let mut cursor = Self::at(lattice, lattice.blocks.get(block)?.start);
+        let mut index = 0;
+        for (g, group) in lattice.groups.iter().enumerate() {
+            let count = lattice.blocks[block].slices[g].count;
+            let wanted = || group.terms.iter().map(|&term| digits[term]);
+            let (mut lo, mut hi) = (0, count);
+            while lo < hi {
+                let rank = lo + (hi - lo) / 2;
+                cursor.seek(g, rank);
+                if cursor.digits[g].iter().copied().lt(wanted()) {
+                    lo = rank + 1;
+                } else {
+                    hi = rank;
+                }
+            }
+            if lo == count {
+                return None;
+            }
+            cursor.seek(g, lo);
+            if !cursor.digits[g].iter().copied().eq(wanted()) {
+                return None;
+            }
+            index = index * count + lo;
+        }
+        Some(lattice.blocks[block].start + index)
+    }
+
+    /// Puts a group at the tuple with this rank.
+    fn seek(&mut self, g: usize, rank: u64) {
+        let (group, slice) = (&self.lattice.groups[g], &self.lattice.blocks[self.block].slices[g]);
+        let stretch = slice.before.partition_point(|&b| b <= rank).saturating_sub(1);
+        let mut rest = rank - slice.before[stretch];
+        for prefix in stretch * STRIDE..slice.prefixes {
+            group.decode(&slice.first, prefix, &mut self.digits[g]);
+            let here = group.count_completions(&slice.first, &self.digits[g]);
+            if rest < here {
+                self.enter(g, prefix);
+                self.digits[g][group.last()] = self.completions[g].select(rest).unwrap_or(0);
+                return;
+            }
+            rest -= here;
+        }
+    }
+
+    /// Puts a group at a prefix; tells whether anything completes it.
+    fn enter(&mut self, g: usize, prefix: usize) -> bool {
+        let group = &self.lattice.groups[g];
+        let first = &self.lattice.blocks[self.block].slices[g].first;
+        group.decode(first, prefix, &mut self.digits[g]);
+        let words = &mut self.completions[g].0;
+        words.clear();
+        words.resize(group.axes[group.last()].len().div_ceil(64), 0);
+        let mut any = 0;
+        group.completions(first, &self.digits[g], |word, bits| {
+            words[word] = bits;
+            any |= bits;
+        });
+        self.prefixes[g] = prefix;
+        any != 0
+    }
+
+    /// Goes to the next candidate; at the last one it stays. Returns the first group that has changed; after a change
+    /// of block all have.
+    pub(crate) fn advance(&mut self) -> usize {
+        let groups = self.lattice.groups.len();
+        for g in (0..groups).rev() {
+            if self.lattice.blocks[self.block].slices[g].count == 1 {
+                continue;
+            }
+            if self.step(g) {
+                return g;
+            }
+            self.seek(g, 0);
+        }
+        if self.block + 1 < self.lattice.blocks.len() {
+            self.block += 1;
+            (0..groups).for_each(|g| self.seek(g, 0));
+        }
+        0
+    }
+
+    /// The term, and its position in its axis, that alone changes over this and the next `len` − 1 candidates, by one
+    /// position each; none where something else does too.
+    #[inline]
+    pub(crate) fn stretch(&self, len: usize) -> Option<(usize, usize)> {
+        let slices = &self.lattice.blocks[self.block].slices;
+        let g = (0..slices.len()).rev().find(|&g| slices[g].count > 1)?;
+        let group = &self.lattice.groups[g];
+        let digit = self.digits[g][group.last()];
+        let whole = digit + len <= group.axes[group.last()].len();
+        (whole && (digit..digit + len).all(|i| self.completions[g].has(i))).then(|| (group.terms[group.last()], digit))
+    }
+
+    /// The term, and its position in its axis, that alone changes over this and the next candidates, by one position each,
+    /// and how many candidates these are; none where no order varies.
+    #[inline]
+    pub(crate) fn run(&self) -> Option<(usize, usize, usize)> {
+        let slices = &self.lattice.blocks[self.block].slices;
+        let g = (0..slices.len()).rev().find(|&g| slices[g].count > 1)?;
+        let group = &self.lattice.groups[g];
+        let digit = self.digits[g][group.last()];
+        Some((group.terms[group.last()], digit, self.completions[g].run(digit)))
+    }
+
+    /// Goes over this many candidates of a stretch.
+    #[inline]
+    pub(crate) fn skip(&mut self, count: usize) {
+        let slices = &self.lattice.blocks[self.block].slices;
+        if let Some(g) = (0..slices.len()).rev().find(|&g| slices[g].count > 1) {
+            self.digits[g][self.lattice.groups[g].last()] += count;
+        }
+    }
+
+    /// The next tuple of a group, if there is one.
+    fn step(&mut self, g: usize) -> bool {
+        let last = self.lattice.groups[g].last();
+        if let Some(next) = self.completions[g].next(self.digits[g][last] + 1) {
+            self.digits[g][last] = next;
+            return true;
+        }
+        let prefixes = self.lattice.blocks[self.block].slices[g].prefixes;
+        if !(self.prefixes[g] + 1..prefixes).any(|prefix| self.enter(g, prefix)) {
+            return false;
+        }
+        self.digits[g][last] = self.completions[g].next(0).unwrap_or(0);
+        true
+    }
+
+    /// Positions of the orders that complete a group's prefix.
+    pub(crate) fn completions(&self, group: usize) -> Vec<usize> {
+        let set = &self.completions[group];
+        std::iter::successors(set.next(0), |&digit| set.next(digit + 1)).collect()
+    }
+
+    /// Number of the block.
+    pub(crate) fn block(&self) -> usize {
+        self.block
+    }
+
+    /// Calls `take` with the position in the equation and in its axis of the orders of this group and those after it.
+    #[inline(always)]
+    pub(crate) fn each(&self, from: usize, mut take: impl FnMut(usize, usize)) {
+        for (group, digits) in self.lattice.groups[from..].iter().zip(&self.digits[from..]) {
+            group.terms.iter().zip(digits).for_each(|(&term, &digit)| take(term, digit));
+        }
+    }
+
+    /// Orders of the candidate: its structure.
+    pub(crate) fn structure(&self) -> Structure {
+        let mut terms = vec![Term { signal: 0, order: 0.0 }; self.lattice.width()];
+        for (group, digits) in self.lattice.groups.iter().zip(&self.digits) {
+            for ((&k, axis), &digit) in group.terms.iter().zip(&group.axes).zip(digits) {
+                terms[k] = Term { signal: group.signal, order: axis[digit] };
+            }
+        }
+        Structure { output: self.lattice.output(), order: self.lattice.blocks[self.block].alpha, terms }
+    }
+}
+
+/// Candidates `lo … hi − 1`: for each row, an order of one term, a run of orders of another.
+#[derive(Debug, Clone)]
+pub(crate) struct Slab {
+    pub(crate) lo: u64,
+    pub(crate) hi: u64,
+    /// Number of the block, and position of every term's order in its axis at `lo`.
+    pub(crate) block: usize,
+    pub(crate) digits: Vec<usize>,
+    /// The term whose order changes from row to row, and its orders.
+    pub(crate) outer: usize,
+    pub(crate) rows: Vec<usize>,
+    /// The term whose order runs along a row, the first of its orders and their number.
+    pub(crate) inner: usize,
+    pub(crate) first: usize,
+    pub(crate) len: usize,
+}
+
+impl Lattice {
+    /// First value in range of a term's axis in a block.
+    pub(crate) fn first(&self, block: usize, term: usize) -> usize {
+        let place = self.groups.iter().zip(&self.blocks[block].slices);
+        let mut all = place.flat_map(|(group, slice)| group.terms.iter().zip(&slice.first));
+        all.find(|(t, _)| **t == term).map_or(0, |(_, first)| *first)
+    }
+
+    /// Most candidates of a slab of the same block.
+    pub(crate) fn largest(&self, slab: &Slab) -> u64 {
+        let whole = self.groups.iter().find(|group| group.terms.contains(&slab.outer));
+        let axis = whole.map_or(0, |group| group.axes[group.last()].len() - self.first(slab.block, slab.outer));
+        (axis * slab.len) as u64
+    }
+
+    /// The slab that holds a candidate; none where the signal that runs fastest has several terms, or where no other
+    /// signal has orders to vary.
+    pub(crate) fn slab(&self, index: u64) -> Option<Slab> {
+        let cursor = Cursor::at(self, index);
+        let block = &self.blocks[cursor.block()];
+        let mut varying = (0..self.groups.len()).rev().filter(|&g| block.slices[g].count > 1);
+        let (inner, outer) = (varying.next()?, varying.next()?);
+        let (fast, slow) = (&self.groups[inner], &self.groups[outer]);
+        if fast.terms.len() != 1 {
+            return None;
+        }
+        let first = block.slices[inner].first[0];
+        let len = fast.axes[0].len() - first;
+        let rows = cursor.completions(outer);
+        let mut digits = vec![0; self.width()];
+        cursor.each(0, |term, digit| digits[term] = digit);
+        let (u, v) = (slow.terms[slow.last()], fast.terms[0]);
+        let before = rows.iter().position(|&row| row == digits[u])? * len + (digits[v] - first);
+        let lo = index - before as u64;
+        digits[u] = rows[0];
+        digits[v] = first;
+        let hi = lo + (rows.len() * len) as u64;
+        Some(Slab { lo, hi, block: cursor.block(), digits, outer: u, rows, inner: v, first, len })
+    }
+}
+/// Fractional part of the golden section: multiples of it spread evenly.
+const GOLDEN: f64 = 0.618_033_988_75;
+
+/// A place in [0, 1) of every index; neighbours lie far apart.
+#[allow(clippy::cast_precision_loss)]
+pub(crate) fn spread(index: u64) -> f64 {
+    (index as f64 * GOLDEN).fract()
+}
+
+/// Visits 0 … count−1 once each, spread over the whole range from the start.
+pub(crate) fn visit(count: u64) -> impl Fn(u64) -> u64 {
+    // The golden section spreads any prefix evenly; the next stride coprime with the count visits all.
+    #[allow(clippy::cast_possible_truncation, clippy::cast_sign_loss, clippy::cast_precision_loss)]
+    let mut stride = ((count as f64 * GOLDEN) as u64).max(1);
+    while gcd(stride, count) != 1 {
+        stride += 1;
+    }
+    move |i| {
+        #[allow(clippy::cast_possible_truncation)]
+        let index = (u128::from(i) * u128::from(stride) % u128::from(count)) as u64;
+        index
+    }
+}
+
+fn gcd(a: u64, b: u64) -> u64 {
+    if b == 0 {
+        a
+    } else {
+        gcd(b, a % b)
+    }
+}

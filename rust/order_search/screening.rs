@@ -1,0 +1,290 @@
+//! Screening: coefficients of candidates side by side, and those left open that no proved lower bound excludes.
+
+use crate::order_search::candidate::columns::{part_of, Columns};
+use crate::order_search::candidate::normal_equations::{Solve, Squares};
+use crate::order_search::candidate::problem::Problem;
+use crate::order_search::candidate::row_bound::Shared;
+use crate::order_search::candidate_index::Catalogue;
+use crate::order_search::dual_bound::linearized_vectors::Held;
+use crate::order_search::dual_bound::tailored_vectors::Memory;
+use crate::order_search::grid::traversal::{spread, Cursor, Slab};
+use crate::simd::{self, WIDTH};
+
+/// A candidate that its bound has not excluded.
+#[derive(Debug, Clone, Copy)]
+pub(crate) struct Open {
+    pub(crate) index: u64,
+    pub(crate) bound: f64,
+    /// A guess at its score, by which visits are ordered.
+    pub(crate) guess: f64,
+}
+
+/// Sorts by guess, ties by index; what has no order comes last.
+pub(crate) fn by_guess(open: &mut [Open]) {
+    open.sort_unstable_by(|a, b| a.guess.total_cmp(&b.guess).then(a.index.cmp(&b.index)));
+}
+
+/// Screens candidates `lo … hi − 1` against a limit: the open ones, and the singular ones; compiled for the widest
+/// vectors at hand.
+pub(crate) fn screen(catalogue: &Catalogue<'_>, lo: u64, hi: u64, limit: f64) -> (Vec<Open>, Vec<u64>) {
+    simd::widest(Screening { catalogue, lo, hi, limit })
+}
+
+/// [`screen`] as a kernel.
+struct Screening<'a> {
+    catalogue: &'a Catalogue<'a>,
+    lo: u64,
+    hi: u64,
+    limit: f64,
+}
+
+impl simd::Kernel for Screening<'_> {
+    type Output = (Vec<Open>, Vec<u64>);
+
+    #[inline(always)]
+    fn run(self) -> Self::Output {
+        let Self { catalogue, lo, hi, limit } = self;
+        let mut found = (Vec::new(), Vec::new());
+        let mut cursor = Cursor::at(&catalogue.lattice, lo);
+        let mut index = lo;
+        let width = catalogue.lattice.width();
+        // Candidates differ in their Caputo terms and in the power of an offset, so they cannot share a layout.
+        if !catalogue.options.initial.follows_orders() {
+            let mut screen = Screen::<WIDTH>::new(width);
+            catalogue.positions(&cursor, &mut screen.terms);
+            let sharing = Sharing::of(catalogue, limit);
+            while index < hi {
+                let shared = sharing
+                    .as_ref()
+                    .and_then(|sharing| screen.stretch(catalogue, sharing, &mut cursor, (index, hi), &mut found));
+                if let Some(candidates) = shared {
+                    index += candidates;
+                } else if index + WIDTH as u64 <= hi {
+                    screen.some(catalogue, &mut cursor, index, limit, &mut found);
+                    index += WIDTH as u64;
+                } else {
+                    break;
+                }
+            }
+        }
+        let mut screen = Screen::<1>::new(width);
+        catalogue.positions(&cursor, &mut screen.terms);
+        while index < hi {
+            screen.some(catalogue, &mut cursor, index, limit, &mut found);
+            index += 1;
+        }
+        found
+    }
+}
+
+/// What stretches of candidates are judged by first, where squared equation errors rank.
+struct Sharing<'a> {
+    squares: &'a Squares,
+    limit: f64,
+}
+
+impl<'a> Sharing<'a> {
+    /// None where nothing would be excluded, or where coefficients are known.
+    fn of(catalogue: &'a Catalogue<'_>, limit: f64) -> Option<Self> {
+        let Problem { squares, equations, .. } = &catalogue.problem;
+        let squares = squares.as_ref().filter(|_| limit < f64::INFINITY && equations.whole().is_some())?;
+        Some(Self { squares, limit })
+    }
+}
+
+/// Memory of a screening of L candidates side by side.
+pub(crate) struct Screen<const L: usize> {
+    solve: Solve<L>,
+    positions: Vec<Columns<L>>,
+    initial: Vec<usize>,
+    /// Columns of the candidate that comes next.
+    terms: Vec<usize>,
+    /// One candidate's columns, coefficients and initial terms.
+    columns: Vec<usize>,
+    coefficients: Vec<f64>,
+    weights: Vec<f64>,
+    /// What is remembered of the test vectors made for candidates.
+    memory: Memory,
+    /// What is left of a stretch.
+    left: Vec<usize>,
+    /// What is remembered of the test vectors that follow coefficients, and the path that excluded one last.
+    held: Held,
+    path: usize,
+}
+
+impl<const L: usize> Screen<L> {
+    pub(crate) fn new(width: usize) -> Self {
+        Self {
+            solve: Solve::new(),
+            positions: vec![Columns::new([0; L]); width],
+            initial: Vec::new(),
+            terms: vec![0; width],
+            columns: vec![0; width],
+            coefficients: vec![0.0; width],
+            weights: Vec::new(),
+            memory: Memory::of_neighbours(),
+            left: Vec::new(),
+            held: Held::default(),
+            path: 0,
+        }
+    }
+
+    /// Screens the next candidates as far as they differ in one term alone: how many; none where they are few, or where
+    /// nothing is proved of them together.
+    #[inline(always)]
+    fn stretch(
+        &mut self,
+        catalogue: &Catalogue<'_>,
+        &Sharing { squares, limit }: &Sharing<'_>,
+        cursor: &mut Cursor<'_>,
+        (index, hi): (u64, u64),
+        found: &mut (Vec<Open>, Vec<u64>),
+    ) -> Option<u64> {
+        let (term, digit, len) = cursor.run()?;
+        let len = usize::try_from(hi - index).map_or(len, |all| len.min(all));
+        if len < L {
+            return None;
+        }
+        let columns = &catalogue.of_term(cursor, term)[digit..digit + len];
+        let shared = Shared::new(squares, &self.terms, term)?;
+        let mut left = std::mem::take(&mut self.left);
+        left.clear();
+        shared.open::<L>(columns, limit, &mut left);
+        for part in left.chunks(L) {
+            for (positions, &column) in self.positions.iter_mut().zip(&self.terms) {
+                *positions = Columns::one(column);
+            }
+            let mut at = [part[0]; L];
+            at[..part.len()].copy_from_slice(part);
+            let indices = at.map(|n| index + n as u64);
+            self.positions[term] = Columns::new(at.map(|n| columns[n]));
+            self.positions[term].compare();
+            self.judge(catalogue, indices, part.len(), limit, found);
+        }
+        self.left = left;
+        cursor.skip(len - 1);
+        catalogue.next(cursor, &mut self.terms);
+        Some(len as u64)
+    }
+
+    /// Screens the next L candidates.
+    #[inline(always)]
+    fn some(
+        &mut self,
+        catalogue: &Catalogue<'_>,
+        cursor: &mut Cursor<'_>,
+        index: u64,
+        limit: f64,
+        found: &mut (Vec<Open>, Vec<u64>),
+    ) {
+        let Self { positions, initial, terms, .. } = self;
+        catalogue.initial(cursor, initial);
+        if let Some((term, digit)) = cursor.stretch(L) {
+            for (columns, &column) in positions.iter_mut().zip(terms.iter()) {
+                *columns = Columns::one(column);
+            }
+            positions[term].at = part_of(&catalogue.of_term(cursor, term)[digit..]);
+            positions[term].compare();
+            cursor.skip(L - 1);
+            catalogue.next(cursor, terms);
+        } else {
+            for n in 0..L {
+                for (columns, &column) in positions.iter_mut().zip(terms.iter()) {
+                    columns.at[n] = column;
+                }
+                catalogue.next(cursor, terms);
+            }
+            positions.iter_mut().for_each(Columns::compare);
+        }
+        self.judge(catalogue, std::array::from_fn(|n| index + n as u64), L, limit, found);
+    }
+
+    /// Screens the candidates whose columns have been laid out.
+    #[inline(always)]
+    fn judge(
+        &mut self,
+        catalogue: &Catalogue<'_>,
+        indices: [u64; L],
+        count: usize,
+        limit: f64,
+        (open, singular): &mut (Vec<Open>, Vec<u64>),
+    ) {
+        let Self { solve, positions, initial, columns, coefficients, weights, memory, held, path, .. } = self;
+        let failed = catalogue.problem.equations.solve(positions, initial, solve);
+        #[allow(clippy::manual_map)] // a closure would be compiled for the oldest machine
+        let squares = match &catalogue.problem.squares {
+            Some(squares) => Some(squares.error(positions, &solve.coefficients)),
+            None => None,
+        };
+        for (n, &index) in indices.iter().enumerate().take(count) {
+            if failed[n] {
+                singular.push(index);
+                continue;
+            }
+            let (bound, guess) = match (&squares, &catalogue.problem.bound) {
+                (Some((least, guess)), _) => (least[n], guess[n]),
+                (None, Some(bound)) => {
+                    // Coefficients that are yet to be refined give an order of visiting and prove nothing.
+                    let refined = catalogue.problem.refines();
+                    let limit = if refined { f64::INFINITY } else { limit };
+                    columns.iter_mut().zip(positions.iter()).for_each(|(t, p)| *t = p.at[n]);
+                    coefficients.iter_mut().zip(&solve.coefficients).for_each(|(c, x)| *c = x[n]);
+                    weights.clear();
+                    weights.extend(solve.initial.iter().map(|x| x[n]));
+                    let e = initial.len();
+                    let (least, guess) = bound.evaluate(limit, |r| {
+                        (&columns[..], &coefficients[..], &initial[..], &weights[r * e..(r + 1) * e])
+                    });
+                    (if refined { 0.0 } else { least }, guess)
+                }
+                (None, None) => (0.0, spread(index)),
+            };
+            // Written so that a bound that is not a number excludes nothing.
+            if bound > limit {
+                continue;
+            }
+            if let Some(adapted) = &catalogue.problem.adapted {
+                if adapted.exclude(columns, coefficients, limit, memory) {
+                    continue;
+                }
+            }
+            if let (Some(tangents), true) = (&catalogue.problem.tangents, limit < f64::INFINITY) {
+                if tangents.exclude(columns, coefficients, limit, held) {
+                    continue;
+                }
+            }
+            if let (Some(roots), true) = (&catalogue.problem.roots, limit < f64::INFINITY) {
+                if roots.exclude(columns, coefficients, limit, path) {
+                    continue;
+                }
+            }
+            open.push(Open { index, bound, guess });
+        }
+    }
+
+    /// Screens these candidates, at most L, at rest: index, and columns of the two terms that vary in a slab with these
+    /// columns.
+    #[inline(always)]
+    pub(crate) fn these(
+        &mut self,
+        catalogue: &Catalogue<'_>,
+        slab: &Slab,
+        columns: &[usize],
+        candidates: &[(u64, usize, usize)],
+        limit: f64,
+        found: &mut (Vec<Open>, Vec<u64>),
+    ) {
+        for (positions, &column) in self.positions.iter_mut().zip(columns) {
+            *positions = Columns::one(column);
+        }
+        let Some(last) = candidates.last() else { return };
+        let of = |n: usize| candidates.get(n).unwrap_or(last);
+        let outer: [usize; L] = std::array::from_fn(|n| of(n).1);
+        let inner: [usize; L] = std::array::from_fn(|n| of(n).2);
+        for (term, at) in [(slab.outer, outer), (slab.inner, inner)] {
+            self.positions[term].at = at;
+            self.positions[term].compare();
+        }
+        self.judge(catalogue, std::array::from_fn(|n| of(n).0), candidates.len().min(L), limit, found);
+    }
+}

@@ -1,0 +1,406 @@
+//! The search of a stage: what its equations share, and the course that it takes.
+//!
+//! Each equation's distinct orders are evaluated once. Table entries start as lower bounds (left early) and are
+//! sharpened until every tuple that could be kept is exact, so the result is that of enumeration, ties by index.
+
+use std::borrow::Cow;
+use std::sync::atomic::Ordering;
+
+use rayon::prelude::*;
+
+use crate::equation::Structure;
+use crate::error::{check_length, Error, Result};
+use crate::order_search::candidate::columns::Needed;
+use crate::order_search::candidate::problem::{Problem, Scratch};
+use crate::order_search::control::{another, Control};
+use crate::order_search::dual_bound::lower_bound::Bound;
+use crate::order_search::grid::order_law::LawLattice;
+use crate::order_search::options::{Budget, Norm, Options};
+use crate::order_search::result::{Counts, Failure, Row, Verdict};
+use crate::order_search::stage_join::join::{spans, Candidates, Class, Entries, Entry, Join, Span, OPEN};
+use crate::parallel::{pool, PerThread};
+use crate::regressors::Record;
+
+/// An equation's candidates are first followed up to this multiple of its best score.
+const FIRST_LIMIT: f64 = 4.0;
+/// Candidates of one equation evaluated between two looks at its best score, at first: a later look tells less.
+const ROUND: usize = 4096;
+
+/// One kept tuple of free orders.
+#[derive(Debug, Clone, PartialEq)]
+pub struct StageRow {
+    /// Index in the product of the axes.
+    pub index: u64,
+    /// Free orders.
+    pub free: Vec<f64>,
+    /// Sum of the equations' scores, each divided by its scale.
+    pub score: f64,
+    /// The structure of each equation.
+    pub structures: Vec<Structure>,
+    /// The row of each equation (its index is not used).
+    pub rows: Vec<Row>,
+}
+
+/// The result of a search over a stage.
+#[derive(Debug, Clone, PartialEq)]
+pub struct StageOutcome {
+    /// Kept rows, best first, ties by index.
+    pub rows: Vec<StageRow>,
+    /// What became of the tuples.
+    pub counts: Counts,
+    /// The first tuples without a score by index, at most 100.
+    pub failures: Vec<(u64, Failure)>,
+    /// Distinct candidates of each equation.
+    pub distinct: Vec<u64>,
+}
+
+/// What the candidates of one equation share.
+struct Table {
+    problem: Problem,
+    candidates: Candidates,
+    /// Those that some tuple needs.
+    used: Vec<usize>,
+    scale: f64,
+}
+
+impl Table {
+    fn entry(&self, verdict: Verdict) -> Entry {
+        let score = |raw: f64| self.problem.score(raw) / self.scale;
+        match verdict {
+            Verdict::Score(raw) => Entry { value: score(raw), class: Class::Exact },
+            Verdict::Bounded(raw) => Entry { value: score(raw), class: Class::Bounded },
+            Verdict::Stopped(raw) => Entry { value: score(raw), class: Class::Open },
+            Verdict::Failed(failure) => Entry { value: f64::INFINITY, class: Class::Failed(failure) },
+        }
+    }
+}
+
+/// A stage made ready: what the candidates of its equations share.
+pub struct Stage<'a> {
+    lattice: Cow<'a, LawLattice>,
+    options: Options,
+    tables: Vec<Table>,
+    samples: f64,
+}
+
+/// How far the search of a stage is: what is known of every candidate, and which are to be followed next.
+///
+/// What comes next depends on nothing but what the candidates before came to, so these may be followed anywhere, in any
+/// order, and a search goes on from their verdicts.
+pub struct Course {
+    join: Join,
+    known: Entries,
+    /// In the first pass: the equation, how many of its candidates are done or wanted, its best score so far.
+    pass: (usize, usize, f64),
+    raise: f64,
+    wanted: Vec<Span>,
+    total: u64,
+    /// The best exact tuples, once the first pass is over.
+    kept: Vec<(f64, u64)>,
+}
+
+impl<'a> Stage<'a> {
+    /// Lays out the join and builds what every equation's candidates share.
+    ///
+    /// `fixed[e]` gives known coefficients of equation e, `scales[e]` what its score is divided by (say σ(y)·M for norm
+    /// L1), so that radians of hub and of deflection weigh alike.
+    ///
+    /// # Errors
+    /// As [`crate::order_search::batches::search`]; [`Error::EmptyLattice`] where no tuple obeys the law,
+    /// [`Error::OutOfRange`] for a scale that is not positive.
+    pub fn new(
+        records: &[Record],
+        lattice: Cow<'a, LawLattice>,
+        fixed: &[Vec<Option<f64>>],
+        scales: &[f64],
+        options: &Options,
+        pool: &rayon::ThreadPool,
+        control: &Control,
+    ) -> Result<(Self, Course)> {
+        let equations = lattice.equations();
+        check_length("fixed coefficients", equations.len(), fixed.len())?;
+        check_length("scales", equations.len(), scales.len())?;
+        if let Some(e) = scales.iter().position(|scale| !(*scale > 0.0 && scale.is_finite())) {
+            return Err(Error::OutOfRange {
+                name: format!("scale of equation {e}"),
+                value: scales[e],
+                range: "(0, ∞)".into(),
+                remedy: "divide its score by the size of its output".into(),
+            });
+        }
+        options.check()?;
+        for record in records {
+            lattice.check_signals(record.len())?;
+        }
+        let mut candidates: Vec<Candidates> = equations.iter().map(Candidates::new).collect();
+        let (join, used) = Join::new(&lattice, &mut candidates, options.memory, pool, control)?;
+        if join.tuples() == 0 {
+            return Err(Error::EmptyLattice { why: "no tuple of free orders gives orders in range".into() });
+        }
+        #[allow(clippy::cast_precision_loss)]
+        let samples = records.iter().map(Record::m).sum::<usize>() as f64;
+        let mut indices = Vec::with_capacity(equations.len());
+        let mut budget = Budget::default();
+        budget.add_layout(join.bytes());
+        for (e, (candidates, used)) in candidates.into_iter().zip(used).enumerate() {
+            check_length("fixed coefficients", equations[e].terms.len(), fixed[e].len())?;
+            let mut needed = Needed::new(&options.initial);
+            for &id in &used {
+                let structure = candidates.structure(id);
+                needed.alpha(structure.order);
+                structure.terms.iter().for_each(|term| needed.term(structure.order, term.signal, term.order));
+            }
+            let index = needed.index();
+            budget.add(records, equations[e].output, &index, options, Bound::POOL);
+            indices.push((index, candidates, used));
+        }
+        budget.check(options.memory)?;
+        let mut tables = Vec::with_capacity(equations.len());
+        for (e, (index, candidates, used)) in indices.into_iter().enumerate() {
+            let problem = pool.install(|| {
+                let problem = Problem::new(records, equations[e].output, index, &fixed[e], options, &control.stop)?;
+                let problem = problem.with_bound(used.len() as u64, &control.stop);
+                control.check_stop()?;
+                Ok(problem)
+            })?;
+            tables.push(Table { problem, candidates, used, scale: scales[e] });
+        }
+        let stage = Self { lattice, options: options.clone(), tables, samples };
+        let mut course = Course {
+            join,
+            known: stage.tables.iter().map(|t| vec![OPEN; t.candidates.len()]).collect(),
+            pass: (0, 0, f64::INFINITY),
+            raise: FIRST_LIMIT,
+            wanted: Vec::new(),
+            total: stage.tables.iter().map(|t| t.used.len() as u64).sum(),
+            kept: Vec::new(),
+        };
+        course.next(&stage, pool, control)?;
+        Ok((stage, course))
+    }
+
+    /// The raw sum up to which a candidate is followed for a scaled score.
+    fn raw(&self, equation: usize, score: f64) -> f64 {
+        let scaled = score * self.tables[equation].scale;
+        let raw = match self.options.norm {
+            Norm::L1 => scaled,
+            Norm::L2 => scaled * scaled * self.samples,
+        };
+        // A hair above, so that a tie in the scaled sum is followed to its end.
+        raw * (1.0 + 1e-12)
+    }
+
+    /// Follows these candidates: what each came to, in raw sums.
+    ///
+    /// # Errors
+    /// Candidates that this stage has not, or [`Error::Interrupted`].
+    pub fn evaluate(&self, spans: &[Span], pool: &rayon::ThreadPool, control: &Control) -> Result<Vec<Verdict>> {
+        let mut wanted = Vec::new();
+        for &Span { equation, first, last, limit } in spans {
+            let used = self.tables.get(equation).map_or(&[][..], |table| &table.used);
+            // Candidates that no tuple needs have no regressors.
+            let known =
+                first < last && last - first <= used.len() && (first..last).all(|id| used.binary_search(&id).is_ok());
+            if !known || limit.is_nan() {
+                let count = used.len();
+                let what = format!("candidates {first} to {last} of equation {equation} are not among its {count}");
+                return Err(another(what));
+            }
+            let limit = self.raw(equation, limit);
+            wanted.extend((first..last).map(|id| (equation, id, limit)));
+        }
+        let scratches = PerThread::<Scratch>::new(pool);
+        let verdicts: Vec<Verdict> = pool.install(|| {
+            wanted
+                .par_iter()
+                .map(|&(e, id, limit)| {
+                    control.check_stop()?;
+                    let Table { problem, candidates, .. } = &self.tables[e];
+                    let structure = candidates.structure(id);
+                    let (verdict, _) =
+                        scratches.with(|scratch| problem.evaluate_structure(&structure, limit, scratch, control))?;
+                    control.count(1, u64::from(matches!(verdict, Verdict::Bounded(_) | Verdict::Stopped(_))));
+                    Ok(verdict)
+                })
+                .collect::<Result<_>>()
+        })?;
+        control.check_stop()?;
+        Ok(verdicts)
+    }
+
+    /// The result of a search that has nothing left to follow.
+    ///
+    /// # Errors
+    /// A search that has something left, or an internal fault.
+    pub fn outcome(&self, course: &Course, control: &Control) -> Result<StageOutcome> {
+        if !course.wanted.is_empty() {
+            let what = "a search that has candidates left to follow has no result".into();
+            return Err(Error::Structure { what, remedy: "follow them, and take in what they come to".into() });
+        }
+        course.check(self)?;
+        let (mut counts, failures) = course.join.count(&course.states());
+        counts.kept = course.kept.len() as u64;
+        counts.beaten -= counts.kept;
+        let mut scratch = Scratch::default();
+        let mut rows = Vec::with_capacity(course.kept.len());
+        for &(score, index) in &course.kept {
+            let structures = self
+                .lattice
+                .structures(index)
+                .ok_or_else(|| Error::Internal { what: "a kept tuple without structures".into() })?;
+            let mut parts = Vec::with_capacity(structures.len());
+            for (table, structure) in self.tables.iter().zip(&structures) {
+                let (_, mut row) = table.problem.evaluate_structure(structure, f64::INFINITY, &mut scratch, control)?;
+                row.score = table.problem.score(row.score);
+                parts.push(row);
+            }
+            rows.push(StageRow { index, free: self.lattice.free(index), score, structures, rows: parts });
+        }
+        let distinct = self.tables.iter().map(|t| t.used.len() as u64).collect();
+        Ok(StageOutcome { rows, counts, failures, distinct })
+    }
+
+    /// Its lattice.
+    #[must_use]
+    pub fn lattice(&self) -> &LawLattice {
+        &self.lattice
+    }
+}
+
+impl Course {
+    /// Candidates to follow next; none at the end.
+    #[must_use]
+    pub fn wanted(&self) -> &[Span] {
+        &self.wanted
+    }
+
+    /// Candidates to follow in all, as far as is known: one that was left early may have to be followed further.
+    #[must_use]
+    pub fn total(&self) -> u64 {
+        self.total
+    }
+
+    /// Best score of a tuple, once there is one.
+    #[must_use]
+    pub fn best(&self) -> Option<f64> {
+        self.kept.first().map(|kept| kept.0)
+    }
+
+    /// Refuses to go on with another stage.
+    fn check(&self, stage: &Stage<'_>) -> Result<()> {
+        let candidates = stage.tables.iter().map(|table| table.candidates.len());
+        if candidates.eq(self.known.iter().map(Vec::len)) {
+            Ok(())
+        } else {
+            Err(another("a search goes on with another stage than it began with".into()))
+        }
+    }
+
+    fn states(&self) -> [Vec<Entry>; 2] {
+        std::array::from_fn(|h| self.join.halves[h].states(&self.known))
+    }
+
+    /// Takes in what the wanted candidates came to, in their order, and finds those to follow next.
+    ///
+    /// # Errors
+    /// Verdicts that are not theirs, or [`Error::Interrupted`].
+    pub fn take(
+        &mut self,
+        stage: &Stage<'_>,
+        verdicts: &[Verdict],
+        pool: &rayon::ThreadPool,
+        control: &Control,
+    ) -> Result<()> {
+        self.check(stage)?;
+        let wanted: usize = self.wanted.iter().map(|span| span.last - span.first).sum();
+        let sound = |verdict: &Verdict| match *verdict {
+            Verdict::Score(raw) | Verdict::Bounded(raw) | Verdict::Stopped(raw) => raw >= 0.0,
+            Verdict::Failed(_) => true,
+        };
+        if verdicts.len() != wanted || !verdicts.iter().all(sound) {
+            return Err(another(format!("{} verdicts are not those of {wanted} candidates", verdicts.len())));
+        }
+        let first_pass = self.pass.0 < stage.tables.len();
+        let mut verdicts = verdicts.iter();
+        for span in &self.wanted {
+            let table = &stage.tables[span.equation];
+            for (entry, &verdict) in self.known[span.equation][span.first..span.last].iter_mut().zip(&mut verdicts) {
+                *entry = table.entry(verdict);
+                if first_pass && entry.class == Class::Exact {
+                    self.pass.2 = self.pass.2.min(entry.value);
+                }
+            }
+        }
+        self.next(stage, pool, control)
+    }
+
+    fn next(&mut self, stage: &Stage<'_>, pool: &rayon::ThreadPool, control: &Control) -> Result<()> {
+        control.total.store(self.total, Ordering::Relaxed);
+        // First pass: each equation's own best, the others left at a few times it.
+        while let Some(Table { used, .. }) = stage.tables.get(self.pass.0) {
+            let (equation, start, best) = self.pass;
+            if start < used.len() {
+                let end = used.len().min(start + if start == 0 { 256 } else { ROUND.max(start / 2) });
+                let limit = if stage.options.early_stopping { FIRST_LIMIT * best } else { f64::INFINITY };
+                self.wanted = spans(equation, used[start..end].iter().map(|&id| (id, limit)));
+                self.pass.1 = end;
+                return Ok(());
+            }
+            self.pass = (equation + 1, 0, f64::INFINITY);
+        }
+        let keep = stage.options.keep;
+        let states = self.states();
+        self.kept = self.join.best(&states, &self.known, keep, pool, control)?;
+        let worst = if self.kept.len() == keep { self.kept[keep - 1].0 } else { f64::INFINITY };
+        self.wanted = self.join.unresolved(&states, &self.known, worst, self.raise, control)?;
+        self.raise *= FIRST_LIMIT;
+        self.total += self.wanted.iter().map(|span| (span.last - span.first) as u64).sum::<u64>();
+        control.total.store(self.total, Ordering::Relaxed);
+        Ok(())
+    }
+}
+
+/// Searches the free orders of a stage: the sum over equations of score / scale is smallest.
+///
+/// # Errors
+/// As [`Stage::new`].
+///
+/// ```
+/// # use ftlm::order_search::control::Control;
+/// # use ftlm::order_search::options::Options;
+/// # use ftlm::order_search::stage_join::best_first::search;
+/// # use ftlm::equation::AffineOrder;
+/// # use ftlm::order_search::grid::{LawEquation, LawLattice};
+/// let law = |constant: f64| AffineOrder { constant, weights: vec![1.0] };
+/// let equation = LawEquation { output: 0, order: law(0.0), terms: vec![(1, law(-1.0))] };
+/// # use ftlm::regressors::Record;
+/// # let input: Vec<f64> = (0..64).map(|k| if k % 16 < 8 { 1.0 } else { -1.0 }).collect();
+/// # let output = Record::new(0.1, vec![input.clone()], None)?.integral(0, 0.8);
+/// # let derived: Vec<f64> = input.clone();
+/// # let input = Record::new(0.1, vec![derived], None)?.integral(0, 0.7);
+/// # let output = Record::new(0.1, vec![input.clone()], None)?.integral(0, 1.0);
+/// // D^α y = D^{α−1} u for any α: y is the integral of u.
+/// let record = Record::new(0.1, vec![output, input], None)?;
+/// let lattice = LawLattice::new(&[vec![1.0, 1.5]], &[equation], &[false, true])?;
+/// let fixed = [vec![None]];
+/// let found = search(&[record], &lattice, &fixed, &[1.0], &Options::default(), &Control::default())?;
+/// assert_eq!(found.counts.candidates, 2);
+/// assert!((found.rows[0].rows[0].coefficients[0] - 1.0).abs() < 1e-9);
+/// # Ok::<(), ftlm::error::Error>(())
+/// ```
+pub fn search(
+    records: &[Record],
+    lattice: &LawLattice,
+    fixed: &[Vec<Option<f64>>],
+    scales: &[f64],
+    options: &Options,
+    control: &Control,
+) -> Result<StageOutcome> {
+    let pool = pool(options.threads)?;
+    let (stage, mut course) = Stage::new(records, Cow::Borrowed(lattice), fixed, scales, options, &pool, control)?;
+    while !course.wanted().is_empty() {
+        let verdicts = stage.evaluate(course.wanted(), &pool, control)?;
+        course.take(&stage, &verdicts, &pool, control)?;
+    }
+    stage.outcome(&course, control)
+}

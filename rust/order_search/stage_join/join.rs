@@ -1,0 +1,528 @@
+//! The layout of a join: which orders of the equations fit together under the law.
+//!
+//! The law ties the equations' orders to a few free ones, so many tuples of free orders share an equation's orders.
+//! The free orders are split between the first equation and the others: x = (a, b). An equation's orders are then what
+//! its own half of x gives plus what the other half adds, and that addend takes few distinct values: (a, addend from b)
+//! and (b, addend from a) fit together exactly where each names the other's addend. Rows of both halves meet in the
+//! bucket of the two addends; within a bucket every pair is a tuple, and every tuple is one pair of one bucket. The
+//! product of the axes is never gone through.
+//!
+//! What is known of the candidates of each equation: a score, or a bound below it.
+//!
+//! The distinct orders that an order law gives one equation: the candidates of a stage, by number.
+//!
+//! What free orders add to the order laws of some equations: the addends by which the halves of a join meet.
+
+use std::collections::hash_map::Entry as Slot;
+use std::collections::HashMap;
+use std::ops::Range;
+
+use rayon::prelude::*;
+
+use crate::equation::{grains, tidy, Structure, Term};
+use crate::error::{Error, Result};
+use crate::order_search::control::Control;
+use crate::order_search::grid::order_law::{LawEquation, LawLattice};
+use crate::order_search::result::Failure;
+
+/// A row of one half of the join: a choice of its own free orders, and the addend of the other half's.
+#[derive(Debug, Clone, Copy)]
+pub(super) struct Part {
+    /// The two addends by which it meets rows of the other half.
+    bucket: u64,
+    /// What its own free orders contribute to the index of a tuple.
+    pub(super) index: u64,
+    /// Which candidates of its equations it names.
+    pub(super) combination: u32,
+}
+
+/// One half of the join.
+pub(super) struct Half {
+    pub(super) equations: Range<usize>,
+    /// Candidates of each equation, combination after combination.
+    combinations: Vec<u32>,
+    pub(super) parts: Vec<Part>,
+}
+
+impl Half {
+    /// Sum and class of every combination.
+    pub(super) fn states(&self, known: &Entries) -> Vec<Entry> {
+        let width = self.equations.len();
+        if width == 0 {
+            return vec![Entry { value: 0.0, class: Class::Exact }];
+        }
+        self.combinations
+            .chunks_exact(width)
+            .map(|ids| {
+                let entries = self.equations.clone().zip(ids).map(|(e, &id)| known[e][id as usize]);
+                entries.fold(Entry { value: 0.0, class: Class::Exact }, |sum, entry| Entry {
+                    value: sum.value + entry.value,
+                    class: sum.class.with(entry.class),
+                })
+            })
+            .collect()
+    }
+
+    pub(super) fn ids(&self, combination: u32) -> &[u32] {
+        let width = self.equations.len();
+        &self.combinations[combination as usize * width..][..width]
+    }
+}
+
+/// Rows of both halves that fit together, each with each.
+pub(super) struct Bucket {
+    pub(super) rows: [Range<usize>; 2],
+}
+
+/// The layout of a join.
+pub(super) struct Join {
+    pub(super) halves: [Half; 2],
+    pub(super) buckets: Vec<Bucket>,
+}
+
+/// Most rows of both halves: they take a GB.
+const MAX_PARTS: u128 = 40_000_000;
+/// Memory of a row, and as much again while their list grows.
+const ROW: u128 = 2 * size_of::<Part>() as u128;
+/// Free orders whose place in either half is tried; more go to the second.
+const PLACED: usize = 10;
+
+/// The free orders that go to the first half: those that leave the fewest rows.
+fn split(lattice: &LawLattice, rows: &[Sums; 2], memory: u64, control: &Control) -> Result<Vec<usize>> {
+    let axes: Vec<usize> = (0..lattice.axes().len()).collect();
+    let size = |axes: &[usize]| axes.iter().map(|&a| lattice.axes()[a].len() as u128).product::<u128>();
+    let several: Vec<usize> = axes.iter().copied().filter(|&a| lattice.axes()[a].len() > 1).take(PLACED).collect();
+    let mut plans: Vec<(u128, Vec<usize>, Vec<usize>)> = (0..1usize << several.len())
+        .map(|mask| {
+            let own: Vec<usize> =
+                several.iter().enumerate().filter(|(i, _)| mask >> i & 1 == 1).map(|(_, &axis)| axis).collect();
+            let other: Vec<usize> = axes.iter().copied().filter(|axis| !own.contains(axis)).collect();
+            (size(&own) + size(&other), own, other)
+        })
+        .collect();
+    plans.sort();
+    let (mut least, mut best) = (u128::MAX, Vec::new());
+    for (floor, own, other) in plans {
+        control.check_stop()?;
+        if floor >= least {
+            break;
+        }
+        let limit = |size: u128| usize::try_from((least / size).min(MAX_PARTS)).unwrap_or(usize::MAX);
+        let Some(first) = rows[0].image(lattice, &other, limit(size(&own)), control)? else { continue };
+        let Some(second) = rows[1].image(lattice, &own, limit(size(&other)), control)? else { continue };
+        let count = size(&own) * first.len() as u128 + size(&other) * second.len() as u128;
+        if count < least {
+            (least, best) = (count, own);
+        }
+    }
+    if least > MAX_PARTS {
+        return Err(Error::LatticeTooLarge { count: least.min(u128::from(lattice.product())), limit: MAX_PARTS });
+    }
+    let (bytes, limit) = (ROW * least, u128::from(memory));
+    if bytes > limit {
+        return Err(Error::Memory { what: format!("{least} rows of the layout of the order law"), bytes, limit });
+    }
+    Ok(best)
+}
+
+impl Join {
+    /// Lays out the join and the distinct candidates of every equation; marks those that some tuple needs. Refuses rows of
+    /// more than so many bytes.
+    pub(super) fn new(
+        lattice: &LawLattice,
+        candidates: &mut [Candidates],
+        memory: u64,
+        pool: &rayon::ThreadPool,
+        control: &Control,
+    ) -> Result<(Self, Vec<Vec<usize>>)> {
+        let count = candidates.len();
+        let ranges = [0..count.min(1), count.min(1)..count];
+        let rows = ranges.clone().map(|range| Sums::new(lattice, range));
+        let own = split(lattice, &rows, memory, control)?;
+        let other: Vec<usize> = (0..lattice.axes().len()).filter(|axis| !own.contains(axis)).collect();
+        let full = |axes: &[usize], rows: &Sums| {
+            rows.image(lattice, axes, usize::MAX, control)?
+                .ok_or_else(|| Error::Internal { what: "an image without a limit".into() })
+        };
+        let addends = [full(&other, &rows[0])?, full(&own, &rows[1])?];
+        let stride = addends[1].len() as u64;
+        let mut halves = Vec::with_capacity(2);
+        for (h, axes) in [&own, &other].into_iter().enumerate() {
+            let equations = ranges[h].clone();
+            let mut half = Half { equations: equations.clone(), combinations: Vec::new(), parts: Vec::new() };
+            let mut known: HashMap<Box<[u32]>, u32> = HashMap::new();
+            let (mut orders, mut key, mut ids) = (Vec::new(), Vec::new(), Vec::new());
+            rows[h].each(lattice, axes, &rows[1 - h], |index, sums, theirs| {
+                control.check_stop()?;
+                let Some(named) = addends[1 - h].find(theirs) else { return Ok(()) };
+                for (number_of_addend, addend) in addends[h].each().enumerate() {
+                    if number_of_addend % LOOK == LOOK - 1 {
+                        control.check_stop()?;
+                    }
+                    if !rows[h].orders(lattice, sums, addend, &mut orders) {
+                        continue;
+                    }
+                    let combination =
+                        combination(lattice, candidates, &mut half, &mut known, &orders, &mut key, &mut ids)?;
+                    let (mine, named) = (number_of_addend as u64, u64::from(named));
+                    let bucket = if h == 0 { mine * stride + named } else { named * stride + mine };
+                    half.parts.push(Part { bucket, index, combination });
+                }
+                Ok(())
+            })?;
+            control.check_stop()?;
+            pool.install(|| half.parts.par_sort_unstable_by_key(|part| (part.bucket, part.index)));
+            halves.push(half);
+        }
+        let [first, second] =
+            <[Half; 2]>::try_from(halves).map_err(|_| Error::Internal { what: "a join without two halves".into() })?;
+        let mut join = Self { halves: [first, second], buckets: Vec::new() };
+        join.meet(control)?;
+        let mut used: Vec<Vec<bool>> = candidates.iter().map(|c| vec![false; c.len()]).collect();
+        for (i, bucket) in join.buckets.iter().enumerate() {
+            if i % LOOK == 0 {
+                control.check_stop()?;
+            }
+            for (half, rows) in join.halves.iter().zip(&bucket.rows) {
+                for part in &half.parts[rows.clone()] {
+                    for (e, &id) in half.equations.clone().zip(half.ids(part.combination)) {
+                        used[e][id as usize] = true;
+                    }
+                }
+            }
+        }
+        let used = used.iter().map(|u| (0..u.len()).filter(|&id| u[id]).collect()).collect();
+        Ok((join, used))
+    }
+
+    /// Finds the buckets that hold rows of both halves.
+    fn meet(&mut self, control: &Control) -> Result<()> {
+        let [a, b] = [&self.halves[0].parts, &self.halves[1].parts];
+        let end = |parts: &[Part], start: usize| {
+            start + parts[start..].iter().take_while(|part| part.bucket == parts[start].bucket).count()
+        };
+        let (mut i, mut j) = (0, 0);
+        for step in 0usize.. {
+            if i >= a.len() || j >= b.len() {
+                break;
+            }
+            if step % LOOK == 0 {
+                control.check_stop()?;
+            }
+            match a[i].bucket.cmp(&b[j].bucket) {
+                std::cmp::Ordering::Less => i += 1,
+                std::cmp::Ordering::Greater => j += 1,
+                std::cmp::Ordering::Equal => {
+                    let rows = [i..end(a, i), j..end(b, j)];
+                    (i, j) = (rows[0].end, rows[1].end);
+                    self.buckets.push(Bucket { rows });
+                }
+            }
+        }
+        Ok(())
+    }
+
+    /// Memory of its rows.
+    pub(super) fn bytes(&self) -> u128 {
+        self.halves.iter().map(|half| (half.parts.capacity() * size_of::<Part>()) as u128).sum()
+    }
+
+    /// Number of tuples.
+    pub(super) fn tuples(&self) -> u64 {
+        self.buckets.iter().map(|b| b.rows[0].len() as u64 * b.rows[1].len() as u64).sum()
+    }
+}
+
+/// The combination of candidates with these orders, equation after equation, added at the end if new.
+fn combination(
+    lattice: &LawLattice,
+    candidates: &mut [Candidates],
+    half: &mut Half,
+    known: &mut HashMap<Box<[u32]>, u32>,
+    orders: &[f64],
+    key: &mut Vec<i64>,
+    ids: &mut Vec<u32>,
+) -> Result<u32> {
+    ids.clear();
+    let mut rest = orders;
+    for e in half.equations.clone() {
+        let (mine, others) = rest.split_at(lattice.equations()[e].terms.len() + 1);
+        ids.push(candidates[e].id(mine, key)?);
+        rest = others;
+    }
+    match known.entry(ids.as_slice().into()) {
+        Slot::Occupied(slot) => Ok(*slot.get()),
+        Slot::Vacant(slot) => {
+            // Every equation adds its candidates in the order of combinations where it is alone.
+            let next = number(if ids.is_empty() { 0 } else { half.combinations.len() / ids.len() })?;
+            half.combinations.extend_from_slice(ids);
+            Ok(*slot.insert(next))
+        }
+    }
+}
+
+/// What is known of one equation's candidate: its scaled score, or a bound below it.
+#[derive(Debug, Clone, Copy)]
+pub(super) struct Entry {
+    pub(super) value: f64,
+    pub(super) class: Class,
+}
+
+/// What became of a candidate, or of several together: the first failure, else the largest.
+#[derive(Debug, Clone, Copy, PartialEq, Eq, PartialOrd, Ord)]
+pub(super) enum Class {
+    Exact,
+    /// A bound without a run is all that is known.
+    Bounded,
+    /// Left at a partial sum, or not looked at.
+    Open,
+    Failed(Failure),
+}
+
+impl Class {
+    pub(super) fn failed(self) -> bool {
+        matches!(self, Self::Failed(_))
+    }
+
+    pub(super) fn with(self, later: Self) -> Self {
+        if self.failed() {
+            self
+        } else {
+            self.max(later)
+        }
+    }
+}
+
+/// Of a candidate that was not looked at.
+pub(super) const OPEN: Entry = Entry { value: 0.0, class: Class::Open };
+
+/// What is known of every candidate of every equation.
+pub(super) type Entries = Vec<Vec<Entry>>;
+
+/// Candidates `first … last − 1` of one equation, to be followed up to one limit of its scaled score.
+#[derive(Debug, Clone, Copy, PartialEq)]
+pub struct Span {
+    /// Equation.
+    pub equation: usize,
+    /// See above.
+    pub first: usize,
+    /// See above.
+    pub last: usize,
+    /// See above.
+    pub limit: f64,
+}
+
+/// Candidates of an equation with the limit of each, in stretches that share one.
+pub(super) fn spans(equation: usize, wanted: impl Iterator<Item = (usize, f64)>) -> Vec<Span> {
+    let mut spans: Vec<Span> = Vec::new();
+    for (id, limit) in wanted {
+        match spans.last_mut() {
+            Some(span) if span.last == id && span.limit.to_bits() == limit.to_bits() => span.last = id + 1,
+            _ => spans.push(Span { equation, first: id, last: id + 1, limit }),
+        }
+    }
+    spans
+}
+
+/// Distinct orders of one equation.
+pub(super) struct Candidates {
+    output: usize,
+    signals: Vec<usize>,
+    /// α and the terms' orders, one candidate after the other.
+    orders: Vec<f64>,
+    ids: HashMap<Box<[i64]>, u32>,
+}
+
+impl Candidates {
+    pub(super) fn new(equation: &LawEquation) -> Self {
+        let signals = equation.terms.iter().map(|t| t.0).collect();
+        Self { output: equation.output, signals, orders: Vec::new(), ids: HashMap::new() }
+    }
+
+    pub(super) fn len(&self) -> usize {
+        self.ids.len()
+    }
+
+    /// Number of the candidate with these orders, added at the end if new.
+    pub(super) fn id(&mut self, orders: &[f64], key: &mut Vec<i64>) -> Result<u32> {
+        key.clear();
+        key.extend(orders.iter().map(|&v| grains(v)));
+        if let Some(&id) = self.ids.get(key.as_slice()) {
+            return Ok(id);
+        }
+        let id = number(self.ids.len())?;
+        self.ids.insert(key.as_slice().into(), id);
+        self.orders.extend_from_slice(orders);
+        Ok(id)
+    }
+
+    pub(super) fn structure(&self, id: usize) -> Structure {
+        let width = self.signals.len() + 1;
+        let orders = &self.orders[id * width..(id + 1) * width];
+        let terms = self.signals.iter().zip(&orders[1..]).map(|(&signal, &order)| Term { signal, order }).collect();
+        Structure { output: self.output, order: orders[0], terms }
+    }
+}
+
+/// A count as a number of 32 bits, which is what tables hold.
+pub(super) fn number(count: usize) -> Result<u32> {
+    u32::try_from(count).map_err(|_| Error::Internal { what: "more than 2^32 distinct orders".into() })
+}
+
+/// Rows of a layout between two looks at whether it is to stop.
+pub(super) const LOOK: usize = 4096;
+
+/// Vectors of sums, each once.
+#[derive(Debug)]
+pub(super) struct Distinct {
+    width: usize,
+    count: usize,
+    values: Vec<f64>,
+    ids: HashMap<Box<[i64]>, u32>,
+}
+
+impl Drop for Distinct {
+    /// Millions of keys take longer to give back than Ctrl-C may take, so nobody waits for it.
+    fn drop(&mut self) {
+        if self.count > 8 * LOOK {
+            let ids = std::mem::take(&mut self.ids);
+            // Where no thread can be had they are given back here.
+            drop(std::thread::Builder::new().spawn(move || drop(ids)));
+        }
+    }
+}
+
+impl Distinct {
+    fn of(width: usize) -> Self {
+        Self { width, count: 0, values: Vec::new(), ids: HashMap::new() }
+    }
+
+    /// Sums are of multiples of the grain by short weights: a thousandth of it tells them apart and forgives rounding.
+    #[allow(clippy::cast_possible_truncation)]
+    fn key(sums: &[f64]) -> Box<[i64]> {
+        sums.iter().map(|v| (v * 1e12).round() as i64).collect()
+    }
+
+    fn insert(&mut self, sums: &[f64]) {
+        #[allow(clippy::cast_possible_truncation)]
+        let next = self.count as u32;
+        if let Slot::Vacant(slot) = self.ids.entry(Self::key(sums)) {
+            slot.insert(next);
+            self.values.extend_from_slice(sums);
+            self.count += 1;
+        }
+    }
+
+    pub(super) fn len(&self) -> usize {
+        self.count
+    }
+
+    pub(super) fn find(&self, sums: &[f64]) -> Option<u32> {
+        self.ids.get(&Self::key(sums)).copied()
+    }
+
+    pub(super) fn each(&self) -> impl Iterator<Item = &[f64]> {
+        (0..self.count).map(|i| &self.values[i * self.width..(i + 1) * self.width])
+    }
+}
+
+/// The order laws of some equations of a stage, whose free orders come in two parts.
+pub(super) struct Sums {
+    equations: Range<usize>,
+    constants: Vec<f64>,
+    /// Weights of each free order.
+    weights: Vec<Vec<f64>>,
+}
+
+impl Sums {
+    pub(super) fn new(lattice: &LawLattice, equations: Range<usize>) -> Self {
+        let laws = || lattice.equations()[equations.clone()].iter().flat_map(LawEquation::laws);
+        let constants = laws().map(|law| law.constant).collect();
+        let weights = (0..lattice.axes().len())
+            .map(|axis| laws().map(|law| law.weights.get(axis).copied().unwrap_or(0.0)).collect())
+            .collect();
+        Self { constants, weights, equations }
+    }
+
+    /// What these free orders add to the laws: distinct sums, or none where there are more than the limit.
+    ///
+    /// # Errors
+    /// [`crate::error::Error::Interrupted`].
+    pub(super) fn image(
+        &self,
+        lattice: &LawLattice,
+        axes: &[usize],
+        limit: usize,
+        control: &Control,
+    ) -> Result<Option<Distinct>> {
+        let width = self.constants.len();
+        let mut found = Distinct::of(width);
+        found.insert(&vec![0.0; width]);
+        for &axis in axes {
+            let mut next = Distinct::of(width);
+            for sums in found.each() {
+                for (i, value) in lattice.axes()[axis].iter().enumerate() {
+                    if i % LOOK == 0 {
+                        control.check_stop()?;
+                    }
+                    let sums: Vec<f64> = sums.iter().zip(&self.weights[axis]).map(|(s, w)| s + w * value).collect();
+                    next.insert(&sums);
+                }
+                if next.len() > limit {
+                    return Ok(None);
+                }
+            }
+            found = next;
+        }
+        Ok(Some(found))
+    }
+
+    /// Calls `take` for every choice of these free orders with its part of a tuple's index, its sums in these laws
+    /// (constants included) and its sums in the others (without).
+    ///
+    /// # Errors
+    /// The first of `take`.
+    pub(super) fn each(
+        &self,
+        lattice: &LawLattice,
+        axes: &[usize],
+        others: &Self,
+        mut take: impl FnMut(u64, &[f64], &[f64]) -> Result<()>,
+    ) -> Result<()> {
+        let strides: Vec<u64> =
+            axes.iter().map(|&axis| lattice.axes()[axis + 1..].iter().map(|a| a.len() as u64).product()).collect();
+        let mut digits = vec![0usize; axes.len()];
+        let (mut sums, mut theirs) = (Vec::new(), Vec::new());
+        loop {
+            let value = |i: usize| lattice.axes()[axes[i]][digits[i]];
+            let add = |base: &[f64], weights: &[Vec<f64>], out: &mut Vec<f64>| {
+                out.clear();
+                out.extend_from_slice(base);
+                for (i, &axis) in axes.iter().enumerate() {
+                    out.iter_mut().zip(&weights[axis]).for_each(|(s, w)| *s += w * value(i));
+                }
+            };
+            add(&self.constants, &self.weights, &mut sums);
+            add(&vec![0.0; others.constants.len()], &others.weights, &mut theirs);
+            let index = digits.iter().zip(&strides).map(|(&digit, stride)| digit as u64 * stride).sum();
+            take(index, &sums, &theirs)?;
+            let Some(i) = (0..axes.len()).rev().find(|&i| digits[i] + 1 < lattice.axes()[axes[i]].len()) else {
+                return Ok(());
+            };
+            digits[i] += 1;
+            digits[i + 1..].fill(0);
+        }
+    }
+
+    /// The orders of these equations from own sums and an addend; tells whether they make equations.
+    pub(super) fn orders(&self, lattice: &LawLattice, sums: &[f64], addend: &[f64], orders: &mut Vec<f64>) -> bool {
+        orders.clear();
+        orders.extend(sums.iter().zip(addend).map(|(s, a)| tidy(s + a)));
+        let mut rest = &orders[..];
+        lattice.equations()[self.equations.clone()].iter().all(|equation| {
+            let (mine, others) = rest.split_at(equation.terms.len() + 1);
+            rest = others;
+            lattice.fits(equation, mine)
+        })
+    }
+}

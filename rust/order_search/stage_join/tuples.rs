@@ -1,0 +1,218 @@
+//! Tuples of a join: the best of the best buckets, those that are yet to be resolved, and what became of all, counted
+//! bucket by bucket.
+
+use rayon::prelude::*;
+
+use crate::error::Result;
+use crate::order_search::control::Control;
+use crate::order_search::result::{Counts, Failure, LISTED};
+use crate::order_search::stage_join::join::{spans, Bucket, Class, Entries, Entry, Join, Part, Span};
+
+/// Sums of scores are compared with this much room: their terms may have been added in another order.
+const ROUNDING: f64 = 1e-12;
+
+impl Join {
+    fn least(&self, bucket: &Bucket, states: &[Vec<Entry>; 2], passes: impl Fn(Class) -> bool) -> Option<[f64; 2]> {
+        let mut least = [f64::INFINITY; 2];
+        for h in 0..2 {
+            for part in &self.halves[h].parts[bucket.rows[h].clone()] {
+                let state = states[h][part.combination as usize];
+                if passes(state.class) && state.value < least[h] {
+                    least[h] = state.value;
+                }
+            }
+        }
+        least.iter().all(|v| v.is_finite()).then_some(least)
+    }
+
+    /// Score of a tuple: its equations' in their order, as enumeration adds them.
+    fn score(&self, known: &Entries, pair: [u32; 2]) -> f64 {
+        let halves = self.halves.iter().zip(pair);
+        halves
+            .flat_map(|(half, combination)| half.equations.clone().zip(half.ids(combination)))
+            .map(|(e, &id)| known[e][id as usize].value)
+            .sum()
+    }
+
+    /// The best exact tuples, best first, ties by index.
+    pub(super) fn best(
+        &self,
+        states: &[Vec<Entry>; 2],
+        known: &Entries,
+        keep: usize,
+        pool: &rayon::ThreadPool,
+        control: &Control,
+    ) -> Result<Vec<(f64, u64)>> {
+        let exact = |class: Class| class == Class::Exact;
+        let mut order: Vec<(f64, usize, [f64; 2])> = pool.install(|| {
+            let found = self.buckets.par_iter().enumerate().filter_map(|(i, bucket)| {
+                self.least(bucket, states, exact).map(|least| (least[0] + least[1], i, least))
+            });
+            let mut order: Vec<_> = found.collect();
+            order.par_sort_unstable_by(|a, b| a.0.total_cmp(&b.0).then(a.1.cmp(&b.1)));
+            order
+        });
+        order.dedup_by_key(|o| o.1);
+        let mut kept: Vec<(f64, u64)> = Vec::new();
+        let trim = |kept: &mut Vec<(f64, u64)>| {
+            kept.sort_unstable_by(|a, b| a.0.total_cmp(&b.0).then(a.1.cmp(&b.1)));
+            kept.truncate(keep);
+            if kept.len() == keep {
+                kept[keep - 1].0 * (1.0 + ROUNDING)
+            } else {
+                f64::INFINITY
+            }
+        };
+        let mut worst = f64::INFINITY;
+        let room = keep.max(512).saturating_mul(2);
+        for (bound, i, least) in order {
+            control.check_stop()?;
+            if bound > worst {
+                break;
+            }
+            let rows: [Vec<(f64, Part)>; 2] = std::array::from_fn(|h| {
+                let parts = self.halves[h].parts[self.buckets[i].rows[h].clone()].iter();
+                let mut rows: Vec<(f64, Part)> = parts
+                    .map(|&part| (states[h][part.combination as usize], part))
+                    .filter(|(state, _)| exact(state.class) && state.value + least[1 - h] <= worst)
+                    .map(|(state, part)| (state.value, part))
+                    .collect();
+                rows.sort_unstable_by(|a, b| a.0.total_cmp(&b.0).then(a.1.index.cmp(&b.1.index)));
+                rows
+            });
+            for (a, first) in &rows[0] {
+                if a + least[1] > worst {
+                    break;
+                }
+                for (b, second) in &rows[1] {
+                    if a + b > worst {
+                        break;
+                    }
+                    let pair = [first.combination, second.combination];
+                    kept.push((self.score(known, pair), first.index + second.index));
+                    if kept.len() >= room {
+                        worst = trim(&mut kept);
+                    }
+                }
+            }
+            if worst == f64::INFINITY && kept.len() >= keep {
+                worst = trim(&mut kept);
+            }
+        }
+        trim(&mut kept);
+        Ok(kept)
+    }
+
+    /// Inexact entries that could still be part of a kept tuple, with the score up to which to follow each.
+    pub(super) fn unresolved(
+        &self,
+        states: &[Vec<Entry>; 2],
+        known: &Entries,
+        worst: f64,
+        raise: f64,
+        control: &Control,
+    ) -> Result<Vec<Span>> {
+        let mut limits: Vec<Vec<f64>> = known.iter().map(|k| vec![f64::NEG_INFINITY; k.len()]).collect();
+        for bucket in &self.buckets {
+            control.check_stop()?;
+            // Not finite where all of one half have failed.
+            let Some(least) = self.least(bucket, states, |class| !class.failed()) else { continue };
+            if least[0] + least[1] > worst * (1.0 + ROUNDING) {
+                continue;
+            }
+            for (h, half) in self.halves.iter().enumerate() {
+                for part in &half.parts[bucket.rows[h].clone()] {
+                    let state = states[h][part.combination as usize];
+                    let open = matches!(state.class, Class::Bounded | Class::Open);
+                    if !open || state.value + least[1 - h] > worst * (1.0 + ROUNDING) {
+                        continue;
+                    }
+                    for (e, &id) in half.equations.clone().zip(half.ids(part.combination)) {
+                        let entry = known[e][id as usize];
+                        if entry.class == Class::Exact {
+                            continue;
+                        }
+                        // Without a full table any tuple may enter: follow this one a few times further than before.
+                        let limit = if worst.is_finite() {
+                            worst - least[1 - h] - (state.value - entry.value)
+                        } else {
+                            raise * entry.value
+                        };
+                        // Where rounding leaves no room between bound and worst, only its end tells more.
+                        let limit = if limit > entry.value { limit } else { f64::INFINITY };
+                        let old = &mut limits[e][id as usize];
+                        *old = old.max(limit);
+                    }
+                }
+            }
+        }
+        let wanted = limits
+            .into_iter()
+            .enumerate()
+            .flat_map(|(e, all)| spans(e, all.into_iter().enumerate().filter(|(_, limit)| *limit > f64::NEG_INFINITY)));
+        Ok(wanted.collect())
+    }
+
+    /// What became of all tuples, and the first failures by index.
+    pub(super) fn count(&self, states: &[Vec<Entry>; 2]) -> (Counts, Vec<(u64, Failure)>) {
+        let mut counts = Counts::default();
+        let mut failures: Vec<(u64, Failure)> = Vec::new();
+        for bucket in &self.buckets {
+            let parts: [&[Part]; 2] = std::array::from_fn(|h| &self.halves[h].parts[bucket.rows[h].clone()]);
+            let tally: [Vec<(Class, u64)>; 2] = std::array::from_fn(|h| {
+                let mut tally: Vec<(Class, u64)> = Vec::new();
+                for part in parts[h] {
+                    let class = states[h][part.combination as usize].class;
+                    match tally.iter_mut().find(|t| t.0 == class) {
+                        Some(t) => t.1 += 1,
+                        None => tally.push((class, 1)),
+                    }
+                }
+                tally
+            });
+            let mut failed = false;
+            for &(a, x) in &tally[0] {
+                for &(b, y) in &tally[1] {
+                    let count = x * y;
+                    counts.candidates += count;
+                    *match a.with(b) {
+                        Class::Exact => &mut counts.beaten,
+                        Class::Bounded => &mut counts.bounded,
+                        Class::Open => &mut counts.stopped,
+                        Class::Failed(Failure::Singular) => &mut counts.singular,
+                        Class::Failed(Failure::Diverged) => &mut counts.diverged,
+                    } += count;
+                    failed |= a.with(b).failed();
+                }
+            }
+            if failed {
+                self.list(parts, states, &mut failures);
+            }
+        }
+        failures.sort_unstable();
+        failures.truncate(LISTED);
+        (counts, failures)
+    }
+
+    /// Adds the failures of a bucket that may be among the first; parts come in the order of their index.
+    fn list(&self, parts: [&[Part]; 2], states: &[Vec<Entry>; 2], failures: &mut Vec<(u64, Failure)>) {
+        for first in parts[0] {
+            for second in parts[1] {
+                let index = first.index + second.index;
+                if failures.len() >= LISTED && index > failures[LISTED - 1].0 {
+                    break;
+                }
+                let [a, b] = [(0, first), (1, second)].map(|(h, p)| states[h][p.combination as usize].class);
+                if let Class::Failed(failure) = a.with(b) {
+                    failures.push((index, failure));
+                    if failures.len() >= 8 * LISTED {
+                        failures.sort_unstable();
+                        failures.truncate(LISTED);
+                    }
+                }
+            }
+        }
+        failures.sort_unstable();
+        failures.truncate(LISTED);
+    }
+}

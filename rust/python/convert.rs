@@ -1,0 +1,229 @@
+//! Arrays and tuples from Python become records, structures and equations; results become arrays.
+//!
+//! Lists from Python whose told length is not believed: a range, or an object of one's own, may claim more than memory.
+
+use std::ops::Deref;
+
+use numpy::{PyArray1, PyArray2, PyArrayMethods, PyReadonlyArray1, PyReadonlyArray2, PyUntypedArrayMethods};
+use pyo3::conversion::FromPyObjectOwned;
+use pyo3::exceptions::PyTypeError;
+use pyo3::prelude::*;
+use pyo3::types::{PyDict, PyList, PyString, PyTuple};
+
+use crate::equation::{Equation, Initial, Structure, Term};
+use crate::error::{check_finite, check_points, Error};
+use crate::regressors::Record;
+
+/// Values of a two-dimensional array, at most: eight gigabytes.
+const MOST_VALUES: usize = 1 << 30;
+
+/// (step, signals as rows, series of the sensor filter or None).
+#[derive(FromPyObject)]
+pub enum RecordArg<'py> {
+    /// With which signals' sensors may still have held something, the level at which each signal began, and answers of
+    /// the filter to an impulse and to derivatives of one as rows.
+    Begun(
+        f64,
+        PyReadonlyArray2<'py, f64>,
+        Option<PyReadonlyArray1<'py, f64>>,
+        (List<bool>, List<f64>, Option<PyReadonlyArray2<'py, f64>>),
+    ),
+    Plain(f64, PyReadonlyArray2<'py, f64>, Option<PyReadonlyArray1<'py, f64>>),
+}
+/// (output, alpha, [(signal, order), …]).
+pub type StructureArg = (usize, f64, List<(usize, f64)>);
+/// A structure and its coefficients.
+pub type EquationArg = (StructureArg, List<f64>);
+/// (whether Caputo's powers, else these exponents).
+#[derive(FromPyObject)]
+pub enum InitialArg {
+    /// With offset and the number of impulses that a filter holds.
+    Filtered(bool, List<f64>, u8, u8),
+    /// With offset: 0 none, 1 a constant, 2 a constant and a ramp.
+    Offset(bool, List<f64>, u8),
+    Plain(bool, List<f64>),
+}
+
+/// A one-dimensional array as a vector, refused if it holds a value that is not finite.
+pub fn vector(name: &str, array: &PyReadonlyArray1<'_, f64>) -> PyResult<Vec<f64>> {
+    let values = copied(name, array)?;
+    check_finite(name, &values)?;
+    Ok(values)
+}
+
+/// A one-dimensional array as a vector, whatever it holds.
+pub fn copied(name: &str, array: &PyReadonlyArray1<'_, f64>) -> PyResult<Vec<f64>> {
+    check_points(&format!("length of {name}"), array.len())?;
+    Ok(array.as_array().iter().copied().collect())
+}
+
+/// Rows of a two-dimensional array. One whose strides are 0 may seem larger than memory.
+pub fn rows(array: &PyReadonlyArray2<'_, f64>) -> PyResult<Vec<Vec<f64>>> {
+    let [rows, columns] = [array.shape()[0], array.shape()[1]];
+    check_points("rows of an array", rows)?;
+    check_points("columns of an array", columns)?;
+    if rows.saturating_mul(columns) > MOST_VALUES {
+        let what = format!("an array of {rows} rows and {columns} columns");
+        return Err(Error::Structure { what, remedy: format!("give at most {MOST_VALUES} values at once") }.into());
+    }
+    Ok(array.as_array().outer_iter().map(|row| row.iter().copied().collect()).collect())
+}
+
+pub fn record(argument: &RecordArg<'_>) -> PyResult<Record> {
+    let (step, signals, filter, begun) = match argument {
+        RecordArg::Begun(step, signals, filter, begun) => (step, signals, filter, Some(begun)),
+        RecordArg::Plain(step, signals, filter) => (step, signals, filter, None),
+    };
+    let filter = filter.as_ref().map(|f| vector("filter", f)).transpose()?;
+    let record = Record::new(*step, rows(signals)?, filter)?;
+    Ok(match begun {
+        Some((held, levels, answers)) => {
+            let answers = answers.as_ref().map(rows).transpose()?.unwrap_or_default();
+            record.begun(held.to_vec(), levels, answers)?
+        }
+        None => record,
+    })
+}
+
+pub fn records(arguments: &[RecordArg<'_>]) -> PyResult<Vec<Record>> {
+    arguments.iter().map(record).collect()
+}
+
+/// A structure that the records can carry; inputs are all signals that `is_input` says.
+pub fn structure(argument: StructureArg, signals: usize, inputs: &[bool]) -> PyResult<Structure> {
+    let structure = Structure {
+        output: argument.0,
+        order: argument.1,
+        terms: argument.2.into_iter().map(|(signal, order)| Term { signal, order }).collect(),
+    };
+    structure.check(signals, |s| inputs.get(s).copied().unwrap_or(false))?;
+    Ok(structure)
+}
+
+pub fn equations(arguments: List<EquationArg>, signals: usize, inputs: &[bool]) -> PyResult<Vec<Equation>> {
+    arguments
+        .into_iter()
+        .map(|(s, coefficients)| {
+            // A model that was estimated under an order law may have an order a little below 0; it is simulated as it is.
+            let structure = structure(s, signals, &vec![true; inputs.len()])?;
+            Ok(Equation::new(structure, coefficients.into())?)
+        })
+        .collect()
+}
+
+pub fn initial(argument: InitialArg) -> PyResult<Initial> {
+    let (caputo, powers, offset, states) = match argument {
+        InitialArg::Filtered(caputo, powers, offset, states) => (caputo, powers, offset, states),
+        InitialArg::Offset(caputo, powers, offset) => (caputo, powers, offset, 0),
+        InitialArg::Plain(caputo, powers) => (caputo, powers, 0, 0),
+    };
+    let powers = Initial::Powers(powers.into());
+    powers.check()?;
+    let under = match powers {
+        _ if caputo => Initial::Caputo,
+        Initial::Powers(powers) if powers.is_empty() => Initial::Rest,
+        powers => powers,
+    };
+    Ok(under.with_offset(offset)?.with_states(states))
+}
+
+/// A row-major matrix as an array.
+pub fn matrix<'py>(py: Python<'py>, values: Vec<f64>, rows: usize) -> PyResult<Bound<'py, PyArray2<f64>>> {
+    let columns = values.len().checked_div(rows).unwrap_or(0);
+    PyArray1::from_vec(py, values).reshape([rows, columns])
+}
+
+/// Vectors of equal length as the rows of an array.
+pub fn stacked<'py>(py: Python<'py>, vectors: &[Vec<f64>]) -> PyResult<Bound<'py, PyArray2<f64>>> {
+    matrix(py, vectors.concat(), vectors.len())
+}
+
+/// Length of the last axis.
+pub fn columns(array: &PyReadonlyArray2<'_, f64>) -> usize {
+    array.shape()[1]
+}
+
+/// Items of a sequence that is neither list nor tuple, at most: those two hold what they tell of already.
+const MOST_ITEMS: usize = 1 << 24;
+
+/// A vector from any sequence of Python.
+#[derive(IntoPyObject)]
+#[pyo3(transparent)]
+pub struct List<T>(Vec<T>);
+
+impl<'py, T: FromPyObjectOwned<'py>> FromPyObject<'_, 'py> for List<T> {
+    type Error = PyErr;
+
+    fn extract(object: Borrowed<'_, 'py, PyAny>) -> PyResult<Self> {
+        let item = |item: Bound<'py, PyAny>| item.extract::<T>().map_err(Into::into);
+        if let Ok(list) = object.cast::<PyList>() {
+            return list.iter().map(item).collect::<PyResult<_>>().map(Self);
+        }
+        if let Ok(tuple) = object.cast::<PyTuple>() {
+            return tuple.iter().map(item).collect::<PyResult<_>>().map(Self);
+        }
+        let words = object.is_instance_of::<PyString>() || object.is_instance_of::<PyDict>();
+        if words || !object.hasattr("__getitem__")? {
+            return Err(PyTypeError::new_err(format!("{} is no sequence", object.get_type().name()?)));
+        }
+        let told = object.len()?;
+        if told > MOST_ITEMS {
+            let what = format!("a sequence of {told} items");
+            return Err(Error::Structure { what, remedy: format!("give a list, or at most {MOST_ITEMS}") }.into());
+        }
+        let mut items = Vec::new();
+        for next in object.try_iter()? {
+            if items.len() == told {
+                let what = format!("a sequence that tells of {told} items and hands over more");
+                return Err(Error::Structure { what, remedy: "give a list".into() }.into());
+            }
+            items.push(item(next?)?);
+        }
+        Ok(Self(items))
+    }
+}
+
+impl<T> Deref for List<T> {
+    type Target = Vec<T>;
+
+    fn deref(&self) -> &Vec<T> {
+        &self.0
+    }
+}
+
+impl<T> From<List<T>> for Vec<T> {
+    fn from(list: List<T>) -> Self {
+        list.0
+    }
+}
+
+impl<T> From<Vec<T>> for List<T> {
+    fn from(items: Vec<T>) -> Self {
+        Self(items)
+    }
+}
+
+impl<T> FromIterator<T> for List<T> {
+    fn from_iter<I: IntoIterator<Item = T>>(items: I) -> Self {
+        Self(items.into_iter().collect())
+    }
+}
+
+impl<T> IntoIterator for List<T> {
+    type Item = T;
+    type IntoIter = std::vec::IntoIter<T>;
+
+    fn into_iter(self) -> Self::IntoIter {
+        self.0.into_iter()
+    }
+}
+
+/// Lists of lists as vectors of vectors.
+pub fn nested<T>(lists: List<List<T>>) -> Vec<Vec<T>> {
+    lists.into_iter().map(Vec::from).collect()
+}
+
+/// Vectors of vectors as lists of lists.
+pub fn lists<T>(vectors: Vec<Vec<T>>) -> List<List<T>> {
+    vectors.into_iter().map(List::from).collect()
+}

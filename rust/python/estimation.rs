@@ -1,0 +1,390 @@
+//! Least squares and multi-innovation least squares at given orders; joint output error.
+
+use numpy::{PyArray1, PyArray2, PyReadonlyArray1, PyReadonlyArray2};
+use pyo3::prelude::*;
+use pyo3::types::PyDict;
+
+use super::convert::{
+    initial, nested, record, records, rows, stacked, structure, vector, InitialArg, List, RecordArg, StructureArg,
+};
+use super::errors::{attached, detached};
+use crate::equation::{AffineOrder, Initial};
+use crate::error::{check_finite, check_length, Error};
+use crate::estimation::instrumental_variables as instruments;
+use crate::estimation::least_squares::{self as batch, Estimate};
+use crate::estimation::multi_innovation::{self as stepwise, Innovation, Rows};
+use crate::estimation::output_error as joint;
+use crate::estimation::resonance_scan;
+use crate::estimation::streaming::Streaming as StreamingFit;
+use crate::python::order_search::watch::{leavable, Stop};
+use crate::regressors::Record;
+use crate::signal::block_pulse::{Jumps, Readings};
+
+/// (coefficients, initial terms per record, exponents, dropped (record, position) pairs).
+pub type EstimateTuple = (Vec<f64>, Vec<Vec<f64>>, Vec<f64>, Vec<(usize, usize)>);
+
+/// Pulses of all records together.
+pub fn pulses(records: &[Record]) -> usize {
+    records.iter().map(Record::m).sum()
+}
+
+/// Pulses of all experiments together, each as often as it is evaluated at most.
+pub fn evaluated(experiments: &[joint::Experiment], evaluations: usize) -> usize {
+    experiments.iter().map(|e| e.record.m()).sum::<usize>().saturating_mul(evaluations)
+}
+
+fn tuple(estimate: Estimate) -> EstimateTuple {
+    (estimate.coefficients, estimate.initial, estimate.exponents, estimate.dropped)
+}
+
+#[pyfunction]
+#[allow(clippy::needless_pass_by_value)]
+pub fn least_squares(
+    py: Python<'_>,
+    runs: List<RecordArg<'_>>,
+    equation: StructureArg,
+    inputs: List<bool>,
+    fixed: List<Option<f64>>,
+    terms: InitialArg,
+) -> PyResult<EstimateTuple> {
+    let records = records(&runs)?;
+    let structure = structure(equation, inputs.len(), &inputs)?;
+    let initial = initial(terms)?;
+    let points = pulses(&records);
+    Ok(tuple(leavable(py, points, None, move |_| batch::fit(&records, &structure, &fixed, &initial))?))
+}
+
+/// Output error and coefficients of each point; none where it is no number.
+type PointTuple = Option<(f64, Vec<f64>)>;
+
+#[pyfunction]
+#[allow(clippy::too_many_arguments, clippy::needless_pass_by_value)]
+pub fn projected_errors(
+    py: Python<'_>,
+    runs: List<RecordArg<'_>>,
+    equation: StructureArg,
+    inputs: List<bool>,
+    fixed: List<Option<f64>>,
+    terms: InitialArg,
+    own: List<f64>,
+    points: List<List<f64>>,
+) -> PyResult<Vec<PointTuple>> {
+    let records = records(&runs)?;
+    let structure = structure(equation, inputs.len(), &inputs)?;
+    let initial = initial(terms)?;
+    let points: Vec<Vec<f64>> = points.iter().map(|point| point.to_vec()).collect();
+    let work = pulses(&records).saturating_mul(points.len());
+    let found = leavable(py, work, None, move |_| {
+        resonance_scan::projected(&records, &structure, &fixed, &initial, &own, &points)
+    })?;
+    Ok(found.into_iter().map(|at| at.map(|p| (p.error, p.coefficients))).collect())
+}
+
+#[pyfunction]
+#[allow(clippy::too_many_arguments, clippy::needless_pass_by_value, clippy::type_complexity)]
+pub fn multi_innovation<'py>(
+    py: Python<'py>,
+    runs: List<RecordArg<'py>>,
+    equation: StructureArg,
+    inputs: List<bool>,
+    fixed: List<Option<f64>>,
+    terms: InitialArg,
+    length: usize,
+    prior_covariance: f64,
+    haar: bool,
+    recursion: bool,
+) -> PyResult<(EstimateTuple, Option<Bound<'py, PyArray2<f64>>>)> {
+    let records = records(&runs)?;
+    let structure = structure(equation, inputs.len(), &inputs)?;
+    let initial = initial(terms)?;
+    let points = pulses(&records);
+    let innovation = Innovation { length, prior_covariance, rows: if haar { Rows::Haar } else { Rows::Time } };
+    if recursion {
+        let (estimate, trace) = leavable(py, points, None, move |_| {
+            stepwise::recursion(&records, &structure, &fixed, &initial, &innovation)
+        })?;
+        return Ok((tuple(estimate), Some(stacked(py, &trace)?)));
+    }
+    let estimate = leavable(py, points, None, move |_| {
+        stepwise::closed_form(&records, &structure, &fixed, &initial, &innovation)
+    })?;
+    Ok((tuple(estimate), None))
+}
+
+/// Refined instrumental variables: (estimates, covariances, iterations, converged, damped).
+type InstrumentTuple = (Vec<EstimateTuple>, Vec<Vec<f64>>, usize, bool, bool);
+
+#[pyfunction]
+#[allow(clippy::too_many_arguments, clippy::needless_pass_by_value)]
+pub fn instrumental_variables(
+    py: Python<'_>,
+    runs: List<RecordArg<'_>>,
+    equations: List<StructureArg>,
+    inputs: List<bool>,
+    fixed: List<List<Option<f64>>>,
+    terms: InitialArg,
+    iterations: usize,
+    tolerance: f64,
+) -> PyResult<InstrumentTuple> {
+    let measured = records(&runs)?;
+    let structures =
+        equations.into_iter().map(|e| structure(e, inputs.len(), &inputs)).collect::<PyResult<Vec<_>>>()?;
+    let (initial, fixed) = (initial(terms)?, nested(fixed));
+    let settings = instruments::Settings { iterations, tolerance };
+    let points = pulses(&measured).saturating_mul(iterations.max(1));
+    let fit = leavable(py, points, None, move |stop| {
+        let at_rest = initial == Initial::Rest;
+        let measured = measured
+            .into_iter()
+            .map(|r| instruments::with_projections(r, &inputs, at_rest, stop))
+            .collect::<Result<Vec<_>, _>>()?;
+        instruments::fit(&measured, &structures, &fixed, &initial, settings)
+    })?;
+    let (mut estimates, mut covariances) = (Vec::new(), Vec::new());
+    for e in fit.estimates {
+        estimates.push((e.coefficients, e.initial, e.exponents, Vec::new()));
+        covariances.push(e.covariance);
+    }
+    Ok((estimates, covariances, fit.iterations, fit.converged, fit.damped))
+}
+
+/// (constant, weight of each free order).
+pub type AffineArg = (f64, List<f64>);
+/// (known factor, (coefficient, power) pairs).
+pub type MonomialArg = (f64, List<(usize, i32)>);
+/// (output, alpha, [(signal, order, coefficient), …]).
+pub type FreeEquationArg = (usize, AffineArg, List<(usize, AffineArg, MonomialArg)>);
+/// (places of the samples in pulses, places and sizes of the jumps of each signal that holds in between).
+pub type OwnTimesArg<'py> =
+    (PyReadonlyArray1<'py, f64>, List<Option<(PyReadonlyArray1<'py, f64>, PyReadonlyArray1<'py, f64>)>>);
+/// (record, pulses a sample interval, samples of each output, filter of simulated outputs, weight of each output,
+/// (values at the samples, whether it holds) of each signal, shares of the compared samples of each output, times of
+/// their own).
+pub type ExperimentArg<'py> = (
+    RecordArg<'py>,
+    usize,
+    PyReadonlyArray2<'py, f64>,
+    Option<(PyReadonlyArray1<'py, f64>, List<bool>)>,
+    List<f64>,
+    List<(Option<PyReadonlyArray1<'py, f64>>, bool)>,
+    Option<PyReadonlyArray2<'py, f64>>,
+    Option<OwnTimesArg<'py>>,
+);
+
+fn affine((constant, weights): AffineArg) -> AffineOrder {
+    AffineOrder { constant, weights: weights.into() }
+}
+
+/// The jumps of a held signal near the readings.
+pub fn jumps_near(
+    readings: &Readings,
+    places: &PyReadonlyArray1<'_, f64>,
+    sizes: &PyReadonlyArray1<'_, f64>,
+) -> PyResult<Jumps> {
+    let (places, sizes) = (vector("times of jumps", places)?, vector("jumps", sizes)?);
+    check_length("jumps", places.len(), sizes.len())?;
+    if let Some(k) = places.windows(2).position(|pair| pair[0] > pair[1]) {
+        let what = format!("the times of jumps fall from index {k}");
+        return Err(Error::Structure { what, remedy: "give them in ascending order".into() }.into());
+    }
+    Ok(readings.jumps(&places, &sizes))
+}
+
+pub fn experiment(argument: &ExperimentArg<'_>) -> PyResult<joint::Experiment> {
+    let (record, samples, weights) = (record(&argument.0)?, rows(&argument.2)?, argument.4.to_vec());
+    let experiment = match &argument.7 {
+        None => joint::Experiment::new(record, argument.1, samples, weights)?,
+        Some((places, jumps)) => {
+            let readings = Readings::new(vector("times of readings", places)?, record.m())?;
+            let jumps = (jumps.iter())
+                .map(|near| {
+                    let Some((places, sizes)) = near else { return Ok(None) };
+                    Ok(Some(jumps_near(&readings, places, sizes)?))
+                })
+                .collect::<PyResult<Vec<_>>>()?;
+            joint::Experiment::with_own_times(record, samples, weights, joint::OwnTimes { readings, jumps })?
+        }
+    };
+    let experiment = match &argument.6 {
+        None => experiment,
+        Some(shares) => experiment.with_shares(rows(shares)?)?,
+    };
+    let instants = (argument.5.iter())
+        .map(|(values, held)| {
+            let values = values.as_ref().map(|v| vector("signal at the samples", v)).transpose()?;
+            Ok(joint::Instant { values, held: *held })
+        })
+        .collect::<PyResult<Vec<_>>>()?;
+    let experiment = experiment.with_instants(instants)?;
+    Ok(match &argument.3 {
+        None => experiment,
+        Some((series, applies)) => experiment.with_filter(vector("filter", series)?, applies.to_vec())?,
+    })
+}
+
+/// One equation whose orders and coefficients are free.
+pub fn free_equation((output, order, terms): FreeEquationArg) -> joint::FreeEquation {
+    joint::FreeEquation {
+        output,
+        order: affine(order),
+        terms: terms
+            .into_iter()
+            .map(|(signal, order, (factor, powers))| {
+                (signal, affine(order), joint::Monomial { factor, powers: powers.into() })
+            })
+            .collect(),
+    }
+}
+
+/// Coordinates by name.
+pub fn coordinates(names: &[String]) -> PyResult<Vec<joint::Coordinate>> {
+    let known = |name: &String| match name.as_str() {
+        "plain" => Ok(joint::Coordinate::Plain),
+        "logarithm" => Ok(joint::Coordinate::Logarithm),
+        "excess" => Ok(joint::Coordinate::ExcessLogarithm),
+        "held" => Ok(joint::Coordinate::Held),
+        other => Err(Error::Structure {
+            what: format!("coordinate '{other}' is not known"),
+            remedy: "use plain, logarithm, excess or held".into(),
+        }),
+    };
+    Ok(names.iter().map(known).collect::<Result<Vec<_>, _>>()?)
+}
+
+/// How a search ended, as Python has it.
+pub fn status(status: joint::Status) -> &'static str {
+    match status {
+        joint::Status::Converged => "converged",
+        joint::Status::Exhausted => "exhausted",
+        joint::Status::Stalled => "stalled",
+        joint::Status::Wall => "wall",
+    }
+}
+
+/// What is free of inputs: signal, law, bounds, value at the start.
+pub(super) type FreeInputArg = (usize, String, (f64, f64), f64);
+
+pub(super) fn free_inputs(inputs: &[FreeInputArg]) -> PyResult<Vec<joint::FreeInput>> {
+    let law = |name: &str| match name {
+        "delay" => Ok(joint::InputLaw::Delay),
+        "saturation" => Ok(joint::InputLaw::Saturation),
+        "dead_zone" => Ok(joint::InputLaw::DeadZone),
+        other => Err(Error::Structure {
+            what: format!("law '{other}' of an input is not known"),
+            remedy: "use delay, saturation or dead_zone".into(),
+        }),
+    };
+    let free = |(signal, name, bounds, _): &FreeInputArg| {
+        Ok::<_, Error>(joint::FreeInput { signal: *signal, law: law(name)?, bounds: *bounds })
+    };
+    Ok(inputs.iter().map(free).collect::<Result<Vec<_>, _>>()?)
+}
+
+#[pyfunction]
+#[pyo3(signature = (
+    runs, laws, order_bounds, coordinates, coupled, terms, start_orders, start_coefficients, inputs, evaluations, tolerance,
+    steady=false, stop=None,
+))]
+#[allow(clippy::too_many_arguments, clippy::needless_pass_by_value)]
+pub fn output_error<'py>(
+    py: Python<'py>,
+    runs: List<ExperimentArg<'py>>,
+    laws: List<FreeEquationArg>,
+    order_bounds: List<(f64, f64)>,
+    coordinates: List<String>,
+    coupled: bool,
+    terms: InitialArg,
+    start_orders: List<f64>,
+    start_coefficients: List<f64>,
+    inputs: List<FreeInputArg>,
+    evaluations: usize,
+    tolerance: f64,
+    steady: bool,
+    stop: Option<&Stop>,
+) -> PyResult<Bound<'py, PyDict>> {
+    let experiments = runs.iter().map(experiment).collect::<PyResult<Vec<_>>>()?;
+    let equations = laws.into_iter().map(free_equation).collect();
+    let order_bounds = order_bounds.into();
+    let coordinates = self::coordinates(&coordinates)?;
+    let start = joint::Point {
+        orders: start_orders.into(),
+        coefficients: start_coefficients.into(),
+        inputs: inputs.iter().map(|input| input.3).collect(),
+    };
+    let free = free_inputs(&inputs)?;
+    let model =
+        joint::FreeModel { equations, order_bounds, coordinates, inputs: free, coupled, initial: initial(terms)? };
+    let settings = joint::Settings { evaluations, tolerance };
+    let points = evaluated(&experiments, evaluations);
+    let fit =
+        leavable(py, points, stop, move |stop| joint::fit_until(&model, &experiments, &start, settings, steady, stop))?;
+    let dict = PyDict::new(py);
+    dict.set_item("orders", fit.point.orders)?;
+    dict.set_item("coefficients", fit.point.coefficients)?;
+    dict.set_item("inputs", fit.point.inputs)?;
+    dict.set_item("cost", fit.cost)?;
+    dict.set_item("residuals", PyArray1::from_vec(py, fit.residuals))?;
+    dict.set_item("jacobian", if fit.jacobian.is_empty() { None } else { Some(stacked(py, &fit.jacobian)?) })?;
+    dict.set_item("initial", fit.initial)?;
+    dict.set_item("exponents", fit.exponents)?;
+    dict.set_item("evaluations", fit.evaluations)?;
+    dict.set_item("status", status(fit.status))?;
+    Ok(dict)
+}
+
+/// Whether s^alpha less the own terms (coefficient, order) has a zero to the right of the imaginary axis, or on it.
+#[pyfunction]
+#[allow(clippy::needless_pass_by_value)]
+pub fn grows(py: Python<'_>, alpha: f64, own_terms: List<(f64, f64)>) -> PyResult<bool> {
+    detached(py, || {
+        check_finite("alpha", &[alpha])?;
+        own_terms.iter().try_for_each(|&(c, order)| check_finite("own terms", &[c, order]))?;
+        Ok(joint::stability::grows(alpha, &own_terms))
+    })
+}
+
+/// Recursion (44) on a stream of samples; see the module `estimate::streaming` of the core.
+#[pyclass(module = "ftlm._core")]
+pub struct Streaming {
+    inner: StreamingFit,
+}
+
+#[pymethods]
+impl Streaming {
+    #[new]
+    #[allow(clippy::needless_pass_by_value, clippy::too_many_arguments)]
+    fn new(
+        py: Python<'_>,
+        step: f64,
+        longest: usize,
+        inputs: List<bool>,
+        equations: List<(StructureArg, List<Option<f64>>)>,
+        length: usize,
+        prior_covariance: f64,
+    ) -> PyResult<Self> {
+        let equations = equations
+            .into_iter()
+            .map(|(equation, fixed)| Ok((structure(equation, inputs.len(), &inputs)?, fixed.into())))
+            .collect::<PyResult<Vec<_>>>()?;
+        let inner = detached(py, || StreamingFit::new(step, longest, &inputs, &equations, length, prior_covariance))?;
+        Ok(Self { inner })
+    }
+
+    /// Takes samples, shape (n, signals).
+    #[allow(clippy::needless_pass_by_value)]
+    fn push(&mut self, py: Python<'_>, samples: PyReadonlyArray2<'_, f64>) -> PyResult<()> {
+        let samples = rows(&samples)?;
+        let inner = &mut self.inner;
+        detached(py, || samples.iter().try_for_each(|sample| inner.push(sample)))
+    }
+
+    #[getter]
+    fn coefficients(&self) -> PyResult<Vec<Vec<f64>>> {
+        attached(|| Ok(self.inner.coefficients()))
+    }
+
+    #[getter]
+    fn pulses(&self) -> PyResult<usize> {
+        attached(|| Ok(self.inner.pulses()))
+    }
+}

@@ -1,0 +1,200 @@
+//! What is free in a joint fit, and its numbers in the runs' own unit of time.
+
+use std::collections::BTreeMap;
+use std::sync::Arc;
+
+use numpy::{PyArray1, PyReadonlyArray1, PyReadonlyArray2};
+use pyo3::prelude::*;
+use pyo3::types::PyDict;
+
+use super::structure::{named, StructureArg};
+use crate::error::{check_length, Error};
+use crate::estimation::joint_fit::parameter_set::Free;
+use crate::estimation::joint_fit::structure::Law;
+use crate::estimation::joint_fit::{Clock, Place};
+use crate::estimation::output_error::Settings;
+use crate::python::convert::{copied, nested, rows, stacked, vector, List};
+use crate::python::errors::{attached, detached};
+use crate::python::estimation::{evaluated, experiment, status, ExperimentArg};
+use crate::python::order_search::watch::{leavable, Stop};
+
+type Array<'py> = Bound<'py, PyArray1<f64>>;
+/// Sample interval and duration of each run \[s\].
+type Spans = List<(f64, f64)>;
+
+/// What is free in a joint fit.
+#[pyclass(module = "ftlm._core", frozen)]
+pub struct JointProblem {
+    pub(super) inner: Arc<Free>,
+}
+
+#[pymethods]
+impl JointProblem {
+    #[new]
+    fn new(told: StructureArg) -> PyResult<Self> {
+        let structure = named(told)?;
+        attached(|| Ok(Self { inner: Arc::new(Free::of(structure)?) }))
+    }
+
+    /// Names of the free orders.
+    #[getter]
+    fn orders(&self) -> PyResult<Vec<String>> {
+        attached(|| Ok(self.inner.orders.clone()))
+    }
+
+    /// Names of the free coefficients, those of a law among them.
+    #[getter]
+    fn coefficients(&self) -> PyResult<Vec<String>> {
+        attached(|| Ok(self.inner.coefficients.clone()))
+    }
+
+    /// Coefficients that a law gives: name, sign, factors.
+    #[getter]
+    fn products(&self) -> PyResult<Vec<(String, f64, Vec<String>)>> {
+        let told = |law: &Law| (law.name.clone(), law.sign, law.factors.clone());
+        attached(|| Ok(self.inner.products.iter().map(told).collect()))
+    }
+
+    /// Second order with one derivative of the output, everything else as it is, as far as the bounds allow.
+    #[getter]
+    fn whole_orders(&self) -> PyResult<Vec<f64>> {
+        attached(|| Ok(self.inner.whole_orders()))
+    }
+
+    /// Free coefficients from freely estimated ones, by name; ratios as the median of what the equations can say.
+    #[allow(clippy::needless_pass_by_value)]
+    fn free_from(&self, estimated: BTreeMap<String, f64>) -> PyResult<Vec<f64>> {
+        attached(|| Ok(self.inner.free_from(&estimated)))
+    }
+
+    /// Bounds of everything that is free.
+    #[getter]
+    fn bounds(&self) -> PyResult<Vec<(f64, f64)>> {
+        attached(|| Ok(self.inner.problem.bounds()))
+    }
+
+    /// The last point on the way from a feasible one to another that keeps bounds and constraints of orders.
+    fn feasible<'py>(
+        &self,
+        py: Python<'py>,
+        at: PyReadonlyArray1<'py, f64>,
+        towards: PyReadonlyArray1<'py, f64>,
+    ) -> PyResult<Array<'py>> {
+        let (at, towards) = (vector("values to go from", &at)?, vector("values to go to", &towards)?);
+        let found = detached(py, || self.inner.problem.feasible(&at, &towards))?;
+        Ok(PyArray1::from_vec(py, found))
+    }
+
+    /// Levenberg–Marquardt on sampled runs from (values of everything free, states of runs with friction), in logarithms
+    /// where the start allows them unless plain ones are asked for, numbers held by their places.
+    #[pyo3(signature = (runs, start, plain, held, evaluations, tolerance, steady, stop=None))]
+    #[allow(clippy::needless_pass_by_value, clippy::too_many_arguments)]
+    fn descend<'py>(
+        &self,
+        py: Python<'py>,
+        runs: List<ExperimentArg<'py>>,
+        start: (List<f64>, List<List<f64>>),
+        plain: bool,
+        held: List<usize>,
+        evaluations: usize,
+        tolerance: f64,
+        steady: bool,
+        stop: Option<&Stop>,
+    ) -> PyResult<Bound<'py, PyDict>> {
+        let experiments = runs.iter().map(experiment).collect::<PyResult<Vec<_>>>()?;
+        let place = Place { point: self.inner.problem.point(&start.0)?, states: nested(start.1) };
+        let size = self.inner.problem.size();
+        if let Some(beyond) = held.iter().find(|&&number| number >= size) {
+            let what = format!("number {beyond} of {size} to be held");
+            return Err(Error::Structure { what, remedy: "count them from 0".into() }.into());
+        }
+        let (free, settings) = (Arc::clone(&self.inner), Settings { evaluations, tolerance });
+        let points = evaluated(&experiments, evaluations);
+        let found = leavable(py, points, stop, move |stop| {
+            free.turned(&place, plain, &held).descend(&experiments, &place, settings, steady, stop)
+        })?;
+        let dict = PyDict::new(py);
+        dict.set_item("values", found.values())?;
+        dict.set_item("states", &found.place.states)?;
+        dict.set_item("initial", found.initial)?;
+        dict.set_item("cost", found.cost)?;
+        dict.set_item("residuals", PyArray1::from_vec(py, found.residuals))?;
+        let none = found.jacobian.first().is_none_or(Vec::is_empty);
+        dict.set_item("jacobian", if none { None } else { Some(stacked(py, &found.jacobian)?) })?;
+        dict.set_item("evaluations", found.evaluations)?;
+        dict.set_item("status", status(found.status))?;
+        Ok(dict)
+    }
+
+    /// The unit of time of runs, each told by its sample interval and its duration.
+    #[allow(clippy::needless_pass_by_value)]
+    fn clock(&self, spans: Spans) -> PyResult<JointClock> {
+        attached(|| {
+            spans.iter().try_for_each(|&(step, duration)| {
+                crate::error::check_step(step)?;
+                crate::error::check_step(duration)
+            })?;
+            Ok(JointClock { inner: Clock::of(&self.inner.problem, &spans), size: self.inner.problem.size() })
+        })
+    }
+}
+
+/// Numbers of a fit in a unit of time of the runs' own.
+#[pyclass(module = "ftlm._core", frozen)]
+pub struct JointClock {
+    inner: Clock,
+    size: usize,
+}
+
+impl JointClock {
+    fn values(&self, name: &str, array: &PyReadonlyArray1<'_, f64>) -> PyResult<Vec<f64>> {
+        let values = copied(name, array)?;
+        check_length(name, self.size, values.len())?;
+        Ok(values)
+    }
+}
+
+#[pymethods]
+impl JointClock {
+    /// ln of the unit of time.
+    #[getter]
+    fn unit(&self) -> PyResult<f64> {
+        attached(|| Ok(self.inner.unit()))
+    }
+
+    /// Parameters in the unit.
+    fn told<'py>(&self, py: Python<'py>, values: PyReadonlyArray1<'py, f64>) -> PyResult<Array<'py>> {
+        let values = self.values("values", &values)?;
+        Ok(PyArray1::from_vec(py, attached(|| Ok(self.inner.told(&values)))?))
+    }
+
+    /// Parameters from those in the unit.
+    fn untold<'py>(&self, py: Python<'py>, values: PyReadonlyArray1<'py, f64>) -> PyResult<Array<'py>> {
+        let values = self.values("values", &values)?;
+        Ok(PyArray1::from_vec(py, attached(|| Ok(self.inner.untold(&values)))?))
+    }
+
+    /// A small step of the parameters at some values, from the one in the unit.
+    fn step<'py>(
+        &self,
+        py: Python<'py>,
+        values: PyReadonlyArray1<'py, f64>,
+        moved: PyReadonlyArray1<'py, f64>,
+    ) -> PyResult<Array<'py>> {
+        let (values, moved) = (self.values("values", &values)?, self.values("step", &moved)?);
+        Ok(PyArray1::from_vec(py, attached(|| Ok(self.inner.step(&values, &moved)))?))
+    }
+
+    /// Standard errors in the unit; infinite where the runs do not see all that takes part.
+    fn errors<'py>(
+        &self,
+        py: Python<'py>,
+        values: PyReadonlyArray1<'py, f64>,
+        covariance: PyReadonlyArray2<'py, f64>,
+    ) -> PyResult<Array<'py>> {
+        let (values, spread) = (self.values("values", &values)?, rows(&covariance)?);
+        check_length("rows of a covariance", self.size, spread.len())?;
+        spread.iter().try_for_each(|row| check_length("a row of a covariance", self.size, row.len()))?;
+        Ok(PyArray1::from_vec(py, attached(|| Ok(self.inner.errors(&values, &spread.concat())))?))
+    }
+}

@@ -1,0 +1,118 @@
+//! Structures by name, as Python tells them.
+
+use pyo3::prelude::*;
+
+use crate::error::Error;
+use crate::estimation::joint_fit::structure::{Coefficient, Equation, Hints, Input, Law, Order, Rubs, Structure, Term};
+use crate::python::convert::{initial, InitialArg, List};
+use crate::python::estimation::free_inputs;
+
+/// (constant, weight of each free order by name).
+type OrderArg = (f64, List<(String, f64)>);
+/// (factor, coefficient).
+type NumberArg = (f64, CoefficientArg);
+/// (signal, order, coefficient, factor).
+type TermArg = (usize, OrderArg, CoefficientArg, f64);
+/// (output, order, terms, fc, fs and vs of friction).
+type EquationArg = (usize, OrderArg, List<TermArg>, Option<[NumberArg; 3]>);
+
+/// A name or a number.
+#[derive(FromPyObject)]
+pub enum CoefficientArg {
+    Free(String),
+    Known(f64),
+}
+
+impl From<CoefficientArg> for Coefficient {
+    fn from(argument: CoefficientArg) -> Self {
+        match argument {
+            CoefficientArg::Free(name) => Self::Free(name),
+            CoefficientArg::Known(value) => Self::Known(value),
+        }
+    }
+}
+
+/// A structure: a dictionary of these.
+#[derive(FromPyObject)]
+#[pyo3(from_item_all)]
+pub struct StructureArg {
+    signals: List<String>,
+    equations: List<EquationArg>,
+    bounds: List<(String, (f64, f64))>,
+    coupled: bool,
+    delayed: bool,
+    initial: InitialArg,
+    history: bool,
+    inputs: List<(String, usize, String, (f64, f64))>,
+    laws: List<(String, f64, List<String>)>,
+    hints: HintsArg,
+}
+
+/// What is known of where orders lie.
+#[derive(FromPyObject)]
+#[pyo3(from_item_all)]
+pub struct HintsArg {
+    highest: Option<(f64, f64)>,
+    natural: List<(String, List<f64>)>,
+    exceeds: List<(String, f64)>,
+    positive: List<String>,
+    known: List<(String, f64)>,
+}
+
+fn order((constant, weights): OrderArg) -> Order {
+    Order { constant, weights: weights.into() }
+}
+
+fn rubs([coulomb, stribeck, speed]: [NumberArg; 3]) -> Rubs {
+    let number = |(factor, coefficient): NumberArg| (factor, coefficient.into());
+    Rubs { coulomb: number(coulomb), stribeck: number(stribeck), speed: number(speed) }
+}
+
+/// A structure whose signals and coefficients are there.
+pub fn named(argument: StructureArg) -> PyResult<Structure> {
+    let term = |(signal, at, coefficient, factor): TermArg| Term {
+        signal,
+        order: order(at),
+        coefficient: coefficient.into(),
+        factor,
+    };
+    let equation = |(output, at, terms, friction): EquationArg| Equation {
+        output,
+        order: order(at),
+        terms: terms.into_iter().map(term).collect(),
+        friction: friction.map(rubs),
+    };
+    let mut inputs = Vec::new();
+    for (name, signal, law, bounds) in argument.inputs {
+        let free = free_inputs(&[(signal, law, bounds, 0.0)])?;
+        inputs.extend(free.into_iter().map(|free| Input { name: name.clone(), free }));
+    }
+    let hints = argument.hints;
+    let law = |(name, sign, factors): (String, f64, List<String>)| Law { name, sign, factors: factors.into() };
+    let found = Structure {
+        signals: argument.signals.into(),
+        equations: argument.equations.into_iter().map(equation).collect(),
+        bounds: argument.bounds.into_iter().collect(),
+        coupled: argument.coupled,
+        delayed: argument.delayed,
+        initial: initial(argument.initial)?,
+        history: argument.history,
+        inputs,
+        laws: argument.laws.into_iter().map(law).collect(),
+        hints: Hints {
+            highest: hints.highest,
+            natural: hints.natural.into_iter().map(|(name, values)| (name, values.into())).collect(),
+            exceeds: hints.exceeds.into_iter().collect(),
+            positive: hints.positive.into_iter().collect(),
+            known: hints.known.into_iter().collect(),
+        },
+    };
+    let signals = found.signals.len();
+    let missing =
+        found.equations.iter().flat_map(|e| std::iter::once(e.output).chain(e.terms.iter().map(|t| t.signal)));
+    if let Some(signal) = missing.chain(found.inputs.iter().map(|i| i.free.signal)).find(|&s| s >= signals) {
+        let what = format!("signal {signal} of {signals}");
+        return Err(Error::Structure { what, remedy: "number them from 0".into() }.into());
+    }
+    Ok(found)
+}

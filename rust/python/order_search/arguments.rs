@@ -1,0 +1,288 @@
+//! Tuples from Python become settings, lattices, parts and verdicts, and what a search comes to becomes tuples.
+
+use pyo3::prelude::*;
+use pyo3::types::PyDict;
+
+use crate::equation::{AffineOrder, Initial};
+use crate::error::Error;
+use crate::estimation::instrumental_variables::{with_projections, Settings};
+use crate::estimation::multi_innovation::{Innovation, Rows};
+use crate::order_search::control::{another, Checkpoint, Control, Place};
+use crate::order_search::grid::independent::{Lattice, TermAxis};
+use crate::order_search::grid::order_law::{LawEquation, LawLattice};
+use crate::order_search::options::{Criterion, Estimator, Norm, Options};
+use crate::order_search::result::{Counts, Failure, Part, Row, Verdict};
+use crate::order_search::stage_join::Span;
+use crate::python::convert::{initial, lists, nested, records, InitialArg, List, RecordArg};
+use crate::regressors::Record;
+
+/// Change below which a candidate's instrumental variables stand still: far below what moves a rank.
+const REFINED: f64 = 1e-4;
+
+/// (criterion, norm, p or 0 for least squares, K₀, Haar rows, keep, threads, early stopping, steps of instrumental
+/// variables or 0, bytes of memory).
+type SettingsTuple = (String, String, usize, f64, bool, usize, usize, bool, usize, u64);
+
+/// Settings of a search but for its initial terms.
+pub struct SettingsArg {
+    criterion: Criterion,
+    norm: Norm,
+    estimator: Estimator,
+    keep: usize,
+    threads: usize,
+    early_stopping: bool,
+    memory: u64,
+}
+
+impl<'py> FromPyObject<'_, 'py> for SettingsArg {
+    type Error = PyErr;
+
+    fn extract(object: Borrowed<'_, 'py, PyAny>) -> PyResult<Self> {
+        let given: SettingsTuple = object.extract()?;
+        let (criterion, norm, length, prior_covariance, haar, keep, threads, early_stopping, iterations, memory) =
+            given;
+        let unknown = |what: String, remedy: &str| Error::Structure { what, remedy: remedy.into() };
+        Ok(Self {
+            criterion: match criterion.as_str() {
+                "output-error" => Criterion::OutputError,
+                "equation-error" => Criterion::EquationError,
+                other => {
+                    let what = format!("criterion '{other}' is not known");
+                    return Err(unknown(what, "use output-error or equation-error").into());
+                }
+            },
+            norm: match norm.as_str() {
+                "l1" => Norm::L1,
+                "l2" => Norm::L2,
+                other => return Err(unknown(format!("norm '{other}' is not known"), "use l1 or l2").into()),
+            },
+            estimator: if iterations > 0 {
+                Estimator::InstrumentalVariables(Settings { iterations, tolerance: REFINED })
+            } else if length == 0 {
+                Estimator::LeastSquares
+            } else {
+                let rows = if haar { Rows::Haar } else { Rows::Time };
+                Estimator::MultiInnovation(Innovation { length, prior_covariance, rows })
+            },
+            keep,
+            threads,
+            early_stopping,
+            memory,
+        })
+    }
+}
+
+impl SettingsArg {
+    /// With the initial terms of the records.
+    pub fn options(self, terms: InitialArg) -> PyResult<Options> {
+        let Self { criterion, norm, estimator, keep, threads, early_stopping, memory } = self;
+        Ok(Options { criterion, norm, estimator, initial: initial(terms)?, keep, threads, early_stopping, memory })
+    }
+}
+
+/// What a search is given besides its lattice; `F` holds the known coefficients of one equation or of several.
+pub struct Given<F> {
+    records: Vec<Record>,
+    pub inputs: Vec<bool>,
+    pub fixed: F,
+    pub options: Options,
+}
+
+impl<F> Given<F> {
+    pub fn new(
+        runs: &[RecordArg<'_>],
+        inputs: List<bool>,
+        fixed: F,
+        terms: InitialArg,
+        settings: SettingsArg,
+    ) -> PyResult<Self> {
+        Ok(Self { records: records(runs)?, inputs: inputs.into(), fixed, options: settings.options(terms)? })
+    }
+
+    /// Records, with the clean signals that the estimator asks for.
+    pub fn records(&mut self, control: &Control) -> Result<Vec<Record>, Error> {
+        let records = std::mem::take(&mut self.records);
+        if !matches!(self.options.estimator, Estimator::InstrumentalVariables(_)) {
+            return Ok(records);
+        }
+        let at_rest = self.options.initial == Initial::Rest;
+        records.into_iter().map(|r| with_projections(r, &self.inputs, at_rest, &control.stop)).collect()
+    }
+}
+
+/// (output, values of alpha, [(signal, values, interchangeable), …]).
+type OrdersTuple = (usize, List<f64>, List<(usize, List<f64>, bool)>);
+
+/// The axes of a lattice.
+pub struct OrdersArg {
+    output: usize,
+    alphas: Vec<f64>,
+    axes: Vec<TermAxis>,
+}
+
+impl<'py> FromPyObject<'_, 'py> for OrdersArg {
+    type Error = PyErr;
+
+    fn extract(object: Borrowed<'_, 'py, PyAny>) -> PyResult<Self> {
+        let (output, alphas, axes): OrdersTuple = object.extract()?;
+        let axis = |(signal, values, interchangeable)| TermAxis { signal, values: Vec::from(values), interchangeable };
+        Ok(Self { output, alphas: alphas.into(), axes: axes.into_iter().map(axis).collect() })
+    }
+}
+
+impl OrdersArg {
+    pub fn lattice(&self, inputs: &[bool]) -> Result<Lattice, Error> {
+        Lattice::new(self.output, &self.alphas, &self.axes, |s| inputs.get(s).copied().unwrap_or(false))
+    }
+}
+
+/// (constant, weight of each free order).
+type AffineTuple = (f64, List<f64>);
+/// (output, alpha, [(signal, order), …]).
+type LawTuple = (usize, AffineTuple, List<(usize, AffineTuple)>);
+
+/// The order laws of one equation.
+pub struct LawArg(LawEquation);
+
+impl<'py> FromPyObject<'_, 'py> for LawArg {
+    type Error = PyErr;
+
+    fn extract(object: Borrowed<'_, 'py, PyAny>) -> PyResult<Self> {
+        let (output, order, terms): LawTuple = object.extract()?;
+        let affine = |(constant, weights)| AffineOrder { constant, weights: Vec::from(weights) };
+        let terms = terms.into_iter().map(|(signal, order)| (signal, affine(order))).collect();
+        Ok(Self(LawEquation { output, order: affine(order), terms }))
+    }
+}
+
+/// The lattice of a stage from the values of its free orders.
+pub fn law_lattice(
+    axes: &[Vec<f64>],
+    laws: List<LawArg>,
+    inputs: &[bool],
+    fixed: &[Vec<Option<f64>>],
+) -> Result<LawLattice, Error> {
+    let equations: Vec<LawEquation> = laws.into_iter().map(|law| law.0).collect();
+    Ok(LawLattice::new(axes, &equations, inputs)?.with_known(fixed))
+}
+
+/// Counts under the names that people read.
+pub fn counted<'py>(py: Python<'py>, counts: &Counts) -> PyResult<Bound<'py, PyDict>> {
+    let dict = PyDict::new(py);
+    dict.set_item("candidates", counts.candidates)?;
+    dict.set_item("kept", counts.kept)?;
+    dict.set_item("beaten", counts.beaten)?;
+    dict.set_item("bound", counts.bounded)?;
+    dict.set_item("stopped early", counts.stopped)?;
+    dict.set_item("singular", counts.singular)?;
+    dict.set_item("diverged", counts.diverged)?;
+    Ok(dict)
+}
+
+/// A failure in a word.
+pub fn named(failure: Failure) -> &'static str {
+    match failure {
+        Failure::Singular => "singular",
+        Failure::Diverged => "diverged",
+    }
+}
+
+/// (index, raw score, coefficients, initial terms by record).
+type RowArg = (u64, f64, List<f64>, List<List<f64>>);
+/// Candidates, kept, beaten, bounded, stopped, singular, diverged; how many of the bounded were in boxes, where any was.
+#[derive(FromPyObject, IntoPyObject)]
+pub enum CountsArg {
+    Plain((u64, u64, u64, u64, u64, u64, u64)),
+    Boxed((u64, u64, u64, u64, u64, u64, u64, u64)),
+}
+/// Rows, counts, (index, whether diverged rather than singular) of failures.
+pub type PartArg = (List<RowArg>, CountsArg, List<(u64, bool)>);
+/// (round, followed, end, size, limit, order), whether the stretch was begun anew, and what it came to.
+pub type CheckpointArg = ((u64, u64, u64, u64, f64, u64), bool, PartArg);
+
+/// What rounds came to, as Python keeps it.
+pub fn part_of(part: Part) -> PartArg {
+    let c = part.counts;
+    (
+        part.rows.into_iter().map(|r| (r.index, r.score, r.coefficients.into(), lists(r.initial))).collect(),
+        match c.boxed {
+            0 => CountsArg::Plain((c.candidates, c.kept, c.beaten, c.bounded, c.stopped, c.singular, c.diverged)),
+            n => CountsArg::Boxed((c.candidates, c.kept, c.beaten, c.bounded, c.stopped, c.singular, c.diverged, n)),
+        },
+        part.failures.into_iter().map(|(index, f)| (index, f == Failure::Diverged)).collect(),
+    )
+}
+
+/// What rounds came to, as they told.
+pub fn part((rows, counts, failures): PartArg) -> Part {
+    let (candidates, kept, beaten, bounded, stopped, singular, diverged, boxed) = match counts {
+        CountsArg::Plain((a, b, c, d, e, f, g)) => (a, b, c, d, e, f, g, 0),
+        CountsArg::Boxed(all) => all,
+    };
+    Part {
+        rows: rows
+            .into_iter()
+            .map(|(index, score, coefficients, initial)| Row {
+                index,
+                score,
+                coefficients: coefficients.into(),
+                initial: nested(initial),
+            })
+            .collect(),
+        counts: Counts { candidates, kept, beaten, bounded, boxed, stopped, singular, diverged },
+        failures: failures
+            .into_iter()
+            .map(|(index, diverged)| (index, if diverged { Failure::Diverged } else { Failure::Singular }))
+            .collect(),
+    }
+}
+
+/// A checkpoint from what Python kept.
+pub fn checkpoint(((round, followed, end, size, limit, order), anew, found): CheckpointArg) -> Checkpoint {
+    Checkpoint { place: Place { round, followed, end, size, limit, order }, anew, part: part(found) }
+}
+
+/// A checkpoint as Python keeps it.
+pub fn checkpoint_of(checkpoint: Checkpoint) -> CheckpointArg {
+    let p = checkpoint.place;
+    ((p.round, p.followed, p.end, p.size, p.limit, p.order), checkpoint.anew, part_of(checkpoint.part))
+}
+
+/// (equation, first candidate, the one behind the last, limit).
+pub type SpanArg = (usize, usize, usize, f64);
+
+/// A stretch of candidates.
+pub fn span((equation, first, last, limit): SpanArg) -> Span {
+    Span { equation, first, last, limit }
+}
+
+/// What candidates came to: raw sums as little-endian doubles, and a byte each that says of what.
+pub fn verdicts_of(verdicts: &[Verdict]) -> (Vec<u8>, Vec<u8>) {
+    let pairs = verdicts.iter().map(|verdict| match *verdict {
+        Verdict::Score(raw) => (raw, 0),
+        Verdict::Bounded(raw) => (raw, 1),
+        Verdict::Stopped(raw) => (raw, 2),
+        Verdict::Failed(Failure::Singular) => (0.0, 3),
+        Verdict::Failed(Failure::Diverged) => (0.0, 4),
+    });
+    let (values, kinds): (Vec<[u8; 8]>, Vec<u8>) = pairs.map(|(raw, kind)| (raw.to_le_bytes(), kind)).unzip();
+    (values.concat(), kinds)
+}
+
+/// The verdicts that [`verdicts_of`] wrote.
+pub fn verdicts(values: &[u8], kinds: &[u8]) -> Result<Vec<Verdict>, Error> {
+    let known = kinds.iter().zip(values.chunks_exact(8)).map(|(kind, value)| {
+        let raw = f64::from_le_bytes(std::array::from_fn(|i| value[i]));
+        match kind {
+            0 => Some(Verdict::Score(raw)),
+            1 => Some(Verdict::Bounded(raw)),
+            2 => Some(Verdict::Stopped(raw)),
+            3 => Some(Verdict::Failed(Failure::Singular)),
+            4 => Some(Verdict::Failed(Failure::Diverged)),
+            _ => None,
+        }
+    });
+    known.collect::<Option<Vec<_>>>().filter(|_| values.len() == 8 * kinds.len()).ok_or_else(|| {
+        another(format!("{} bytes of values and {} of kinds are no verdicts", values.len(), kinds.len()))
+    })
+}

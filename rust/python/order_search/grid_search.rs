@@ -1,0 +1,303 @@
+//! Searches over a lattice: at once, or in rounds that are done here or elsewhere.
+//!
+//! Certificates of equation errors over whole intervals of orders.
+//!
+//! Errors of candidates given as points, for a genetic algorithm.
+//!
+//! What tests turn and provoke: the instructions that kernels run with, and panics.
+
+use std::borrow::Cow;
+
+use numpy::{PyArray1, PyReadonlyArray2};
+use pyo3::prelude::*;
+use pyo3::types::PyDict;
+
+use super::arguments::{
+    checkpoint, counted, named, part, part_of, CheckpointArg, Given, OrdersArg, PartArg, SettingsArg,
+};
+use super::watch::{saved, watched};
+use crate::error::{check_length, Error};
+use crate::order_search::batches;
+use crate::order_search::certificate::{self, Asked, Range, Region};
+use crate::order_search::control::another;
+use crate::order_search::given_points::{Point, Points as PointsOf};
+use crate::order_search::grid::independent::Lattice;
+use crate::order_search::options::Norm;
+use crate::order_search::result::{Counts, Outcome, Part, Row};
+use crate::parallel::pool;
+use crate::python::convert::{records, rows, InitialArg, List, RecordArg};
+use crate::python::errors::detached;
+
+#[pyfunction]
+#[allow(clippy::needless_pass_by_value)]
+pub fn lattice_size(py: Python<'_>, orders: OrdersArg, inputs: List<bool>) -> PyResult<u64> {
+    detached(py, || Ok(orders.lattice(&inputs)?.count()))
+}
+
+#[pyfunction]
+#[allow(clippy::needless_pass_by_value, clippy::too_many_arguments)]
+pub fn search<'py>(
+    py: Python<'py>,
+    runs: List<RecordArg<'py>>,
+    orders: OrdersArg,
+    inputs: List<bool>,
+    fixed: List<Option<f64>>,
+    terms: InitialArg,
+    settings: SettingsArg,
+    progress: Option<Py<PyAny>>,
+) -> PyResult<Bound<'py, PyDict>> {
+    let mut given = Given::new(&runs, inputs, fixed, terms, settings)?;
+    let found = watched(py, progress.as_ref(), |control| {
+        let lattice = orders.lattice(&given.inputs)?;
+        let records = given.records(control)?;
+        Ok(Found::new(&lattice, batches::search(&records, &lattice, &given.fixed, &given.options, control)?))
+    })?;
+    found.dict(py)
+}
+
+/// (index, score, α, orders, coefficients, initial terms by record).
+type FoundRow = (u64, f64, f64, Vec<f64>, Vec<f64>, Vec<Vec<f64>>);
+
+/// A table, counts and failures with the orders of each index.
+struct Found {
+    rows: Vec<FoundRow>,
+    counts: Counts,
+    failures: Vec<(u64, f64, Vec<f64>, &'static str)>,
+}
+
+impl Found {
+    fn new(lattice: &Lattice, outcome: Outcome) -> Self {
+        let orders = |index: u64| {
+            let structure = lattice.structure(index);
+            (structure.order, structure.terms.iter().map(|t| t.order).collect::<Vec<f64>>())
+        };
+        let row = |row: Row| {
+            let (alpha, orders) = orders(row.index);
+            (row.index, row.score, alpha, orders, row.coefficients, row.initial)
+        };
+        let failure = |&(index, failure): &_| {
+            let (alpha, orders) = orders(index);
+            (index, alpha, orders, named(failure))
+        };
+        Self {
+            rows: outcome.rows.into_iter().map(row).collect(),
+            counts: outcome.counts,
+            failures: outcome.failures.iter().map(failure).collect(),
+        }
+    }
+
+    fn dict(self, py: Python<'_>) -> PyResult<Bound<'_, PyDict>> {
+        let dict = PyDict::new(py);
+        dict.set_item("rows", self.rows)?;
+        dict.set_item("counts", counted(py, &self.counts)?)?;
+        dict.set_item("boxed", self.counts.boxed)?;
+        dict.set_item("failures", self.failures)?;
+        Ok(dict)
+    }
+}
+
+/// Candidates of a search, where each wave of its rounds ends by this algorithm or the present one, and whose number that
+/// is.
+#[pyfunction]
+#[allow(clippy::needless_pass_by_value)]
+pub fn search_plan(
+    py: Python<'_>,
+    orders: OrdersArg,
+    inputs: List<bool>,
+    terms: InitialArg,
+    settings: SettingsArg,
+    algorithm: Option<u64>,
+) -> PyResult<(u64, Vec<u64>, u64)> {
+    let options = settings.options(terms)?;
+    detached(py, || {
+        let count = orders.lattice(&inputs)?.count();
+        let present = batches::algorithm(count, &options);
+        let all = batches::rounds_by(algorithm.unwrap_or(present).min(present), count, &options);
+        Ok((count, batches::waves(all), present))
+    })
+}
+
+/// The result of a search from the parts that its rounds came to, over records of so many samples.
+#[pyfunction]
+#[allow(clippy::needless_pass_by_value)]
+pub fn search_join<'py>(
+    py: Python<'py>,
+    orders: OrdersArg,
+    inputs: List<bool>,
+    terms: InitialArg,
+    settings: SettingsArg,
+    samples: usize,
+    parts: List<PartArg>,
+) -> PyResult<Bound<'py, PyDict>> {
+    let options = settings.options(terms)?;
+    let found = detached(py, || {
+        let lattice = orders.lattice(&inputs)?;
+        let mut all = Part::default();
+        for argument in parts {
+            let part = part(argument);
+            let index = part.rows.iter().map(|r| r.index).chain(part.failures.iter().map(|f| f.0)).max();
+            if let Some(index) = index.filter(|&i| i >= lattice.count()) {
+                return Err(another(format!("a row has index {index} among {} candidates", lattice.count())));
+            }
+            all.join(part, options.keep);
+        }
+        if all.counts.candidates != lattice.count() || all.counts.done() != lattice.count() {
+            return Err(another(format!("parts account for {} of {} candidates", all.counts.done(), lattice.count())));
+        }
+        if all.counts.boxed > all.counts.bounded {
+            let Counts { boxed, bounded, .. } = all.counts;
+            return Err(another(format!("parts have {boxed} candidates in boxes among {bounded} excluded ones")));
+        }
+        Ok(Found::new(&lattice, all.outcome(options.norm, samples)))
+    })?;
+    found.dict(py)
+}
+
+/// A search made ready for its rounds: on this machine, or on one of many.
+#[pyclass(frozen, module = "ftlm._core")]
+pub struct OrderSearch {
+    ready: batches::Search<'static>,
+}
+
+#[pymethods]
+impl OrderSearch {
+    #[new]
+    #[allow(clippy::needless_pass_by_value)]
+    fn new(
+        py: Python<'_>,
+        runs: List<RecordArg<'_>>,
+        orders: OrdersArg,
+        inputs: List<bool>,
+        fixed: List<Option<f64>>,
+        terms: InitialArg,
+        settings: SettingsArg,
+    ) -> PyResult<Self> {
+        let mut given = Given::new(&runs, inputs, fixed, terms, settings)?;
+        let ready = watched(py, None, |control| {
+            let lattice = orders.lattice(&given.inputs)?;
+            let records = given.records(control)?;
+            let pool = pool(given.options.threads)?;
+            batches::Search::new(&records, Cow::Owned(lattice), &given.fixed, &given.options, &pool, control)
+        })?;
+        Ok(Self { ready })
+    }
+
+    /// Rounds `first … last − 1` of one wave: the part they come to.
+    #[allow(clippy::needless_pass_by_value, clippy::too_many_arguments)]
+    fn rounds(
+        &self,
+        py: Python<'_>,
+        first: u64,
+        last: u64,
+        seed: List<(u64, f64)>,
+        start: Option<CheckpointArg>,
+        threads: usize,
+        progress: Option<Py<PyAny>>,
+        save: Option<Py<PyAny>>,
+    ) -> PyResult<PartArg> {
+        let found = saved(py, progress.as_ref(), save.as_ref(), |control| {
+            let pool = pool(threads)?;
+            self.ready.rounds(first, last, &seed, start.map(checkpoint), &pool, control)
+        })?;
+        Ok(part_of(found))
+    }
+}
+
+/// (output, interval of alpha, [(signal, lowest, highest), …], apart).
+type RegionTuple = (usize, (f64, f64), List<(usize, f64, f64)>, f64);
+
+/// (within, largest, cells, threads, bytes of memory).
+type AskedTuple = (f64, f64, u64, usize, u64);
+
+#[pyfunction]
+#[allow(clippy::needless_pass_by_value)]
+pub fn certify<'py>(
+    py: Python<'py>,
+    runs: List<RecordArg<'py>>,
+    region: RegionTuple,
+    asked: AskedTuple,
+    progress: Option<Py<PyAny>>,
+) -> PyResult<Bound<'py, PyDict>> {
+    let records = records(&runs)?;
+    let (output, alpha, terms, apart) = region;
+    let terms = terms.iter().map(|&(signal, lowest, highest)| Range { signal, lowest, highest }).collect();
+    let region = Region { output, alpha, terms, apart };
+    let (within, largest, cells, threads, memory) = asked;
+    let asked = Asked { within, largest, cells, threads, memory };
+    let found = watched(py, progress.as_ref(), |control| certificate::certify(&records, &region, &asked, control))?;
+    let dict = PyDict::new(py);
+    dict.set_item("at_least", found.at_least)?;
+    dict.set_item("best", found.best)?;
+    dict.set_item("alpha", found.order)?;
+    dict.set_item("orders", found.orders)?;
+    dict.set_item("cells", found.cells)?;
+    dict.set_item("open", found.open)?;
+    Ok(dict)
+}
+
+/// Errors of candidates at orders and coefficients of their own.
+#[pyclass(module = "ftlm._core")]
+pub struct Points {
+    inner: PointsOf,
+    width: usize,
+}
+
+#[pymethods]
+impl Points {
+    #[new]
+    #[allow(clippy::needless_pass_by_value)]
+    fn new(
+        py: Python<'_>,
+        runs: List<RecordArg<'_>>,
+        output: usize,
+        signals: List<usize>,
+        inputs: List<bool>,
+        squares: bool,
+    ) -> PyResult<Self> {
+        let width = signals.len();
+        let norm = if squares { Norm::L2 } else { Norm::L1 };
+        let (records, signals, inputs) = (records(&runs)?, signals.into(), inputs.into());
+        Ok(Self { inner: detached(py, || PointsOf::new(records, output, signals, inputs, norm))?, width })
+    }
+
+    /// Errors of candidates given as rows (alpha, orders, coefficients); infinite beyond the limit.
+    #[allow(clippy::needless_pass_by_value)]
+    fn scores<'py>(
+        &mut self,
+        py: Python<'py>,
+        candidates: PyReadonlyArray2<'py, f64>,
+        limit: f64,
+        threads: usize,
+    ) -> PyResult<Bound<'py, PyArray1<f64>>> {
+        let (rows, Self { inner, width }) = (rows(&candidates)?, self);
+        let found = watched(py, None, |control| {
+            let point = |row: Vec<f64>| {
+                check_length("a candidate", 1 + 2 * *width, row.len())?;
+                let (orders, coefficients) = row[1..].split_at(*width);
+                Ok(Point { order: row[0], orders: orders.to_vec(), coefficients: coefficients.to_vec() })
+            };
+            let points = rows.into_iter().map(point).collect::<Result<Vec<_>, Error>>()?;
+            inner.scores(&points, limit, threads, control)
+        })?;
+        Ok(PyArray1::from_vec(py, found))
+    }
+}
+
+/// Panics where it is told to, so that a test can see what becomes of a panic: in a call, in the thread that a search
+/// runs on, or in one of its workers.
+#[pyfunction]
+#[allow(clippy::panic)]
+pub fn panic_on_purpose(py: Python<'_>, place: &str) -> PyResult<()> {
+    let fault = || std::panic::panic_any("on purpose");
+    match place {
+        "call" => detached(py, fault),
+        "search" => watched(py, None, |_| fault()),
+        _ => watched(py, None, |_| pool(2)?.install(|| rayon::join(fault, || ()).0)),
+    }
+}
+
+/// Whether kernels run as they are compiled for the oldest machine.
+#[pyfunction]
+pub fn portable(on: bool) {
+    crate::simd::portable(on);
+}

@@ -1,0 +1,174 @@
+//! Searches over the free orders of a stage: at once, or followed here and elsewhere.
+
+use std::borrow::Cow;
+use std::sync::{Mutex, PoisonError};
+
+use pyo3::prelude::*;
+use pyo3::types::{PyBytes, PyDict};
+
+use super::arguments::{counted, law_lattice, named, span, verdicts, verdicts_of, Given, LawArg, SettingsArg, SpanArg};
+use super::watch::watched;
+use crate::error::Error;
+use crate::order_search::grid::order_law::LawLattice;
+use crate::order_search::result::Counts;
+use crate::order_search::stage_join::{self, Course, Stage, StageOutcome, StageRow};
+use crate::parallel::pool;
+use crate::python::convert::{nested, InitialArg, List, RecordArg};
+use crate::python::errors::detached;
+
+#[pyfunction]
+#[allow(clippy::needless_pass_by_value, clippy::too_many_arguments)]
+pub fn search_stage<'py>(
+    py: Python<'py>,
+    runs: List<RecordArg<'py>>,
+    axes: List<List<f64>>,
+    laws: List<LawArg>,
+    inputs: List<bool>,
+    fixed: List<List<Option<f64>>>,
+    scales: List<f64>,
+    terms: InitialArg,
+    settings: SettingsArg,
+    progress: Option<Py<PyAny>>,
+) -> PyResult<Bound<'py, PyDict>> {
+    let (axes, fixed) = (nested(axes), nested(fixed));
+    let mut given = Given::new(&runs, inputs, fixed, terms, settings)?;
+    let found = watched(py, progress.as_ref(), |control| {
+        let lattice = law_lattice(&axes, laws, &given.inputs, &given.fixed)?;
+        let records = given.records(control)?;
+        let outcome = stage_join::search(&records, &lattice, &given.fixed, &scales, &given.options, control)?;
+        Ok(Found::new(&lattice, outcome))
+    })?;
+    found.dict(py)
+}
+
+/// (score, α, orders, coefficients, initial terms by record) of one equation.
+type FoundEquation = (f64, f64, Vec<f64>, Vec<f64>, Vec<Vec<f64>>);
+
+/// A table, counts and failures with the free orders of each index.
+struct Found {
+    rows: Vec<(u64, f64, Vec<f64>, Vec<FoundEquation>)>,
+    counts: Counts,
+    failures: Vec<(u64, Vec<f64>, &'static str)>,
+    distinct: Vec<u64>,
+}
+
+impl Found {
+    fn new(lattice: &LawLattice, outcome: StageOutcome) -> Self {
+        let row = |row: StageRow| {
+            let equations = row.structures.iter().zip(row.rows).map(|(structure, part)| {
+                let orders = structure.terms.iter().map(|t| t.order).collect();
+                (part.score, structure.order, orders, part.coefficients, part.initial)
+            });
+            (row.index, row.score, row.free, equations.collect())
+        };
+        let failure = |&(index, failure): &_| (index, lattice.free(index), named(failure));
+        Self {
+            rows: outcome.rows.into_iter().map(row).collect(),
+            counts: outcome.counts,
+            failures: outcome.failures.iter().map(failure).collect(),
+            distinct: outcome.distinct,
+        }
+    }
+
+    fn dict(self, py: Python<'_>) -> PyResult<Bound<'_, PyDict>> {
+        let dict = PyDict::new(py);
+        dict.set_item("rows", self.rows)?;
+        dict.set_item("counts", counted(py, &self.counts)?)?;
+        dict.set_item("failures", self.failures)?;
+        dict.set_item("distinct", self.distinct)?;
+        Ok(dict)
+    }
+}
+
+/// The search of a stage made ready: its candidates are followed here or elsewhere, and taken in where its course is
+/// kept.
+#[pyclass(frozen, module = "ftlm._core")]
+pub struct StageSearch {
+    stage: Stage<'static>,
+    course: Mutex<Option<Course>>,
+}
+
+impl StageSearch {
+    /// Works on the course.
+    fn course<T>(&self, work: impl FnOnce(&mut Course) -> Result<T, Error>) -> Result<T, Error> {
+        let mut course = self.course.lock().unwrap_or_else(PoisonError::into_inner);
+        let found = course.as_mut().ok_or_else(|| Error::Structure {
+            what: "this search only follows candidates".into(),
+            remedy: "make one that keeps its course".into(),
+        })?;
+        work(found)
+    }
+}
+
+#[pymethods]
+impl StageSearch {
+    #[new]
+    #[allow(clippy::needless_pass_by_value, clippy::too_many_arguments)]
+    fn new(
+        py: Python<'_>,
+        runs: List<RecordArg<'_>>,
+        axes: List<List<f64>>,
+        laws: List<LawArg>,
+        inputs: List<bool>,
+        fixed: List<List<Option<f64>>>,
+        scales: List<f64>,
+        terms: InitialArg,
+        settings: SettingsArg,
+        keeps_course: bool,
+    ) -> PyResult<Self> {
+        let (axes, fixed) = (nested(axes), nested(fixed));
+        let mut given = Given::new(&runs, inputs, fixed, terms, settings)?;
+        let (stage, course) = watched(py, None, |control| {
+            let lattice = law_lattice(&axes, laws, &given.inputs, &given.fixed)?;
+            let records = given.records(control)?;
+            let pool = pool(given.options.threads)?;
+            Stage::new(&records, Cow::Owned(lattice), &given.fixed, &scales, &given.options, &pool, control)
+        })?;
+        Ok(Self { stage, course: Mutex::new(keeps_course.then_some(course)) })
+    }
+
+    /// Candidates to follow next; none at the end.
+    fn wanted(&self, py: Python<'_>) -> PyResult<Vec<SpanArg>> {
+        detached(py, || {
+            self.course(|c| Ok(c.wanted().iter().map(|s| (s.equation, s.first, s.last, s.limit)).collect()))
+        })
+    }
+
+    /// Candidates to follow in all, as far as is known, and the best score so far.
+    fn state(&self, py: Python<'_>) -> PyResult<(u64, Option<f64>)> {
+        detached(py, || self.course(|c| Ok((c.total(), c.best()))))
+    }
+
+    /// What these candidates come to.
+    #[allow(clippy::needless_pass_by_value)]
+    fn follow<'py>(
+        &self,
+        py: Python<'py>,
+        spans: List<SpanArg>,
+        threads: usize,
+        progress: Option<Py<PyAny>>,
+    ) -> PyResult<(Bound<'py, PyBytes>, Bound<'py, PyBytes>)> {
+        let wanted: Vec<_> = spans.into_iter().map(span).collect();
+        let (values, kinds) = watched(py, progress.as_ref(), |control| {
+            Ok(verdicts_of(&self.stage.evaluate(&wanted, &pool(threads)?, control)?))
+        })?;
+        Ok((PyBytes::new(py, &values), PyBytes::new(py, &kinds)))
+    }
+
+    /// Takes in what the wanted candidates came to, in their order.
+    fn take(&self, py: Python<'_>, values: &[u8], kinds: &[u8], threads: usize) -> PyResult<()> {
+        watched(py, None, |control| {
+            let found = verdicts(values, kinds)?;
+            self.course(|course| course.take(&self.stage, &found, &pool(threads)?, control))
+        })
+    }
+
+    /// The result, once nothing is wanted.
+    fn outcome<'py>(&self, py: Python<'py>) -> PyResult<Bound<'py, PyDict>> {
+        let found = watched(py, None, |control| {
+            let outcome = self.course(|course| self.stage.outcome(course, control))?;
+            Ok(Found::new(self.stage.lattice(), outcome))
+        })?;
+        found.dict(py)
+    }
+}

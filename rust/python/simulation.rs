@@ -1,0 +1,180 @@
+//! Free runs, the two errors, explicit Euler, the four figures and the correlations of residuals.
+
+use numpy::{PyArray1, PyArray2, PyReadonlyArray1, PyReadonlyArray2};
+use pyo3::prelude::*;
+
+use super::convert::{
+    copied, equations, initial, nested, record, rows, stacked, structure, vector, EquationArg, InitialArg, List,
+    RecordArg, StructureArg,
+};
+use super::errors::detached;
+use super::estimation::jumps_near;
+use crate::python::order_search::watch::leavable;
+use crate::signal::block_pulse::Readings;
+use crate::simulate::{self, OutputFilter};
+
+#[pyfunction]
+#[allow(clippy::needless_pass_by_value)]
+pub fn respond<'py>(
+    py: Python<'py>,
+    run: RecordArg<'py>,
+    model: List<EquationArg>,
+    inputs: List<bool>,
+    terms: List<List<(f64, f64)>>,
+) -> PyResult<Bound<'py, PyArray2<f64>>> {
+    let record = record(&run)?;
+    let equations = equations(model, record.len(), &inputs)?;
+    let outputs = leavable(py, record.m(), None, move |_| simulate::respond(&equations, &record, &nested(terms)))?;
+    stacked(py, &outputs)
+}
+
+#[pyfunction]
+#[allow(clippy::needless_pass_by_value)]
+#[allow(clippy::type_complexity)]
+pub fn respond_and_units<'py>(
+    py: Python<'py>,
+    run: RecordArg<'py>,
+    model: List<EquationArg>,
+    inputs: List<bool>,
+    units: List<(usize, f64)>,
+) -> PyResult<(Bound<'py, PyArray2<f64>>, Bound<'py, PyArray2<f64>>)> {
+    let record = record(&run)?;
+    let equations = equations(model, record.len(), &inputs)?;
+    let (driven, units) =
+        leavable(py, record.m(), None, move |_| simulate::respond_and_units(&equations, &record, &units))?;
+    Ok((stacked(py, &driven)?, stacked(py, &units.concat())?))
+}
+
+#[pyfunction]
+#[allow(clippy::needless_pass_by_value, clippy::type_complexity)]
+pub fn respond_with_initial<'py>(
+    py: Python<'py>,
+    run: RecordArg<'py>,
+    model: List<EquationArg>,
+    inputs: List<bool>,
+    terms: InitialArg,
+    filter: Option<(PyReadonlyArray1<'py, f64>, List<bool>)>,
+) -> PyResult<(Bound<'py, PyArray2<f64>>, Vec<Vec<f64>>, Vec<Vec<f64>>)> {
+    let record = record(&run)?;
+    let equations = equations(model, record.len(), &inputs)?;
+    let initial = initial(terms)?;
+    let filter = filter.map(|(series, applies)| Ok::<_, PyErr>((vector("filter", &series)?, applies))).transpose()?;
+    let response = leavable(py, record.m(), None, move |_| {
+        let filter = filter.as_ref().map(|(series, applies)| OutputFilter { series, applies });
+        simulate::respond_with_initial(&equations, &record, &initial, filter)
+    })?;
+    Ok((stacked(py, &response.outputs)?, response.exponents, response.initial))
+}
+
+#[pyfunction]
+#[allow(clippy::needless_pass_by_value)]
+pub fn equation_error<'py>(
+    py: Python<'py>,
+    run: RecordArg<'py>,
+    equation: EquationArg,
+    inputs: List<bool>,
+    terms: InitialArg,
+) -> PyResult<Bound<'py, PyArray1<f64>>> {
+    let record = record(&run)?;
+    let equations = equations(vec![equation].into(), record.len(), &inputs)?;
+    let initial = initial(terms)?;
+    let found = leavable(py, record.m(), None, move |_| simulate::equation_error(&equations[0], &record, &initial))?;
+    Ok(PyArray1::from_vec(py, found))
+}
+
+#[pyfunction]
+#[allow(clippy::needless_pass_by_value)]
+pub fn explicit_euler<'py>(
+    py: Python<'py>,
+    signals: PyReadonlyArray2<'py, f64>,
+    step: f64,
+    model: List<EquationArg>,
+    inputs: List<bool>,
+) -> PyResult<Bound<'py, PyArray2<f64>>> {
+    let signals = rows(&signals)?;
+    let equations = equations(model, signals.len(), &inputs)?;
+    let outputs = detached(py, || simulate::explicit_euler(&equations, &signals, step))?;
+    stacked(py, &outputs)
+}
+
+#[pyfunction]
+#[allow(clippy::needless_pass_by_value)]
+pub fn trace_errors<'py>(
+    py: Python<'py>,
+    run: RecordArg<'py>,
+    equation: StructureArg,
+    inputs: List<bool>,
+    trace: PyReadonlyArray2<'py, f64>,
+) -> PyResult<Bound<'py, PyArray1<f64>>> {
+    let record = record(&run)?;
+    let structure = structure(equation, record.len(), &inputs)?;
+    let rows = rows(&trace)?;
+    let found = leavable(py, record.m(), None, move |_| simulate::trace_errors(&structure, &record, &rows))?;
+    Ok(PyArray1::from_vec(py, found))
+}
+
+#[pyfunction]
+#[allow(clippy::needless_pass_by_value)]
+pub fn nyquist_margin(py: Python<'_>, own_terms: List<(f64, f64)>, step: f64) -> PyResult<f64> {
+    detached(py, || Ok(simulate::nyquist_margin(&own_terms, step)))
+}
+
+#[pyfunction]
+#[allow(clippy::needless_pass_by_value)]
+pub fn metrics(
+    py: Python<'_>,
+    measured: PyReadonlyArray1<'_, f64>,
+    residuals: PyReadonlyArray1<'_, f64>,
+) -> PyResult<(f64, f64, f64, f64)> {
+    let measured = vector("measured", &measured)?;
+    let residuals = copied("residuals", &residuals)?;
+    let found = detached(py, || crate::signal::metrics::metrics(&measured, &residuals))?;
+    Ok((found.error, found.rmse, found.nr, found.fit_percent))
+}
+
+#[pyfunction]
+#[allow(clippy::needless_pass_by_value)]
+pub fn correlation<'py>(
+    py: Python<'py>,
+    x: List<PyReadonlyArray1<'py, f64>>,
+    y: List<PyReadonlyArray1<'py, f64>>,
+    lags: usize,
+) -> PyResult<(Bound<'py, PyArray1<f64>>, f64, usize)> {
+    let x = x.iter().map(|a| vector("x", a)).collect::<PyResult<Vec<_>>>()?;
+    let y = y.iter().map(|a| vector("y", a)).collect::<PyResult<Vec<_>>>()?;
+    let found = detached(py, || crate::signal::metrics::correlation(&x, &y, lags))?;
+    Ok((PyArray1::from_vec(py, found.values), found.variance, found.window))
+}
+
+#[pyfunction]
+#[allow(clippy::needless_pass_by_value)]
+pub fn read_at<'py>(
+    py: Python<'py>,
+    means: PyReadonlyArray2<'py, f64>,
+    places: PyReadonlyArray1<'py, f64>,
+) -> PyResult<Bound<'py, PyArray2<f64>>> {
+    let (means, places) = (rows(&means)?, vector("times of readings", &places)?);
+    let m = means.first().map_or(0, Vec::len);
+    let read = detached(py, || {
+        let readings = Readings::new(places, m)?;
+        Ok(means.iter().map(|row| readings.read(row)).collect::<Vec<_>>())
+    })?;
+    stacked(py, &read)
+}
+
+#[pyfunction]
+#[allow(clippy::needless_pass_by_value)]
+pub fn corners<'py>(
+    py: Python<'py>,
+    m: usize,
+    places: PyReadonlyArray1<'py, f64>,
+    jumps: (PyReadonlyArray1<'py, f64>, PyReadonlyArray1<'py, f64>),
+    order: f64,
+    step: f64,
+) -> PyResult<Bound<'py, PyArray1<f64>>> {
+    let places = vector("times of readings", &places)?;
+    let readings = Readings::new(places, m)?;
+    let jumps = jumps_near(&readings, &jumps.0, &jumps.1)?;
+    let lacking = detached(py, || Ok(readings.corners(&jumps, order, step)))?;
+    Ok(PyArray1::from_vec(py, lacking))
+}

@@ -1,0 +1,380 @@
+//! The two-link arm stepped in time: four linear equations of fractional order in its angles, and dry friction of its hubs.
+//!
+//! Which equations is not said here: whoever makes the arm hands them over with orders and coefficients, the same that
+//! identification and free runs read. Each is integrated once. What is differentiated by more than 1, D^ν θ with ν > 1,
+//! then stands on the left as a momentum, D^{ν−1} θ, so that what hangs on the motion of something else hangs on its rate;
+//! everything else is a force. Fractional derivatives of the angles are integrals of their rates, D^ν θ = I^{1−ν} θ′ and
+//! D^ν θ = I^{2−ν} θ″, exact for rates that are linear over a substep; the past lives in a fixed number of exponentials
+//! ([`crate::fractional::exponential_sum`]). One substep is a trapezoidal step, implicit in all four rates at once.
+//!
+//! A hub's Coulomb friction is a set-valued torque: it counts as a current that is subtracted from the motor's and may take
+//! any value up to its limit at standstill, by the law of a pulse of [`crate::friction::law`] for each of two hubs that
+//! feel each other.
+
+use crate::equation::{check_regular, tidy, Equation, ORDER_GRAIN};
+use crate::error::{check_length, check_step, Error, Result};
+use crate::fractional::exponential_sum::{decay, Rates};
+use crate::friction::law::{pulse, Phase};
+use crate::linalg::small;
+
+/// Accuracy of the memory's kernels: far below what the trapezoidal steps leave.
+const MEMORY_TOLERANCE: f64 = 1e-10;
+/// Sweeps of the friction solve; two hubs need one where the stages are apart and a few where they are not.
+const FRICTION_SWEEPS: usize = 60;
+/// Share of the most that friction takes from a rate which may be rounding.
+const ROUNDING: f64 = 1e-12;
+
+/// Most substeps of a sample: more take seconds each, and a slip of the hand would never end.
+const MOST_SUBSTEPS: f64 = 1e6;
+
+/// Signals of the arm's equations: θ₁₁, θ₁₂, θ₂₁, θ₂₂, I₁, I₂.
+pub const SIGNALS: usize = 6;
+
+/// What the arm obeys.
+#[derive(Debug, Clone, PartialEq)]
+pub struct Parameters {
+    /// D^α θ = Σ c D^ν s of the four angles in their order, over [`SIGNALS`]; currents as they are.
+    pub equations: Vec<Equation>,
+    /// Coulomb friction of each hub as a current \[A\].
+    pub coulomb: [f64; 2],
+}
+
+/// A derivative of one angle and what it contributes to the four equations.
+#[derive(Debug, Clone, Default)]
+struct Operator {
+    signal: usize,
+    order: f64,
+    into: [f64; 4],
+    /// Momenta that it is part of: what stands on the left of the equations, integrated once.
+    momentum: [f64; 4],
+    /// On the states of the past; empty for orders 0 and 1.
+    weights: Vec<f64>,
+    /// On the rate at the start and at the end of the substep.
+    before: f64,
+    now: f64,
+    /// Its value at the start of the substep.
+    value: f64,
+}
+
+/// The arm's state and its substep.
+#[derive(Debug, Clone)]
+pub struct Arm {
+    substep: f64,
+    substeps: usize,
+    operators: Vec<Operator>,
+    /// Accelerations per ampere of both motors.
+    input: [[f64; 2]; 4],
+    coulomb: [f64; 2],
+    /// (P − h/2·C)⁻¹ with P the momenta and C the forces per rate at the end of the substep.
+    solve: [[f64; 4]; 4],
+    implicit: [[f64; 4]; 4],
+    keep: Vec<f64>,
+    first: Vec<f64>,
+    last: Vec<f64>,
+    past: [Vec<f64>; 4],
+    rate: [f64; 4],
+    angle: [f64; 4],
+    linear: [f64; 4],
+    friction: [f64; 2],
+}
+
+impl Arm {
+    /// An arm at rest, stepped `step` s at a time in substeps of at most `longest_substep`, for `horizon` s.
+    ///
+    /// # Errors
+    /// [`Error::OutOfRange`] for an order outside [0, 3), a highest order outside (1, 2], a negative friction, a step that
+    /// is not positive, a horizon that is no number, more than a million substeps; [`Error::NotFinite`] for a
+    /// coefficient; [`Error::Structure`] for equations that do not tell the angles apart, a differentiated current, and
+    /// friction of a hub whose motor does not drive it.
+    pub fn new(parameters: &Parameters, step: f64, longest_substep: f64, horizon: f64) -> Result<Self> {
+        check_step(step)?;
+        check_step(longest_substep)?;
+        let outside = |name: &str, value: f64, range: &str| Error::OutOfRange {
+            name: name.into(),
+            value,
+            range: range.into(),
+            remedy: "correct the times of the virtual arm".into(),
+        };
+        if horizon.is_nan() {
+            return Err(outside("horizon", horizon, "[0, ∞) s"));
+        }
+        let parts = (step / longest_substep - 1e-9).ceil().max(1.0);
+        if parts > MOST_SUBSTEPS {
+            return Err(outside("substeps a sample", parts, &format!("[1, {MOST_SUBSTEPS}]")));
+        }
+        #[allow(clippy::cast_possible_truncation, clippy::cast_sign_loss)]
+        let substeps = parts as usize;
+        #[allow(clippy::cast_precision_loss)]
+        let h = step / substeps as f64;
+        let (mut operators, input) = accelerations(parameters)?;
+        let rates = Rates::new(h, horizon.max(2.0 * step), MEMORY_TOLERANCE)?;
+        for operator in &mut operators {
+            operator.prepare(h, &rates);
+        }
+        let (mut implicit, mut momenta) = ([[0.0; 4]; 4], [[0.0; 4]; 4]);
+        for operator in &operators {
+            for (row, c) in implicit.iter_mut().zip(operator.into) {
+                row[operator.signal] += c * operator.now;
+            }
+            for (row, c) in momenta.iter_mut().zip(operator.momentum) {
+                row[operator.signal] += c * operator.now;
+            }
+        }
+        let matrix: Vec<f64> = (0..16).map(|i| momenta[i / 4][i % 4] - h / 2.0 * implicit[i / 4][i % 4]).collect();
+        let inverse = small::inverse(&matrix, 4).map_err(|_| singular())?;
+        let mut solve = [[0.0; 4]; 4];
+        for (i, value) in inverse.iter().enumerate() {
+            solve[i / 4][i % 4] = *value;
+        }
+        let steps: Vec<(f64, f64, f64)> = rates.rates().iter().map(|s| decay(s * h)).collect();
+        let count = steps.len();
+        // What is differentiated by whole orders alone has no past.
+        let remembered: [bool; 4] =
+            std::array::from_fn(|s| operators.iter().any(|o| o.signal == s && !o.weights.is_empty()));
+        let arm = Self {
+            substep: h,
+            substeps,
+            operators,
+            input,
+            coulomb: parameters.coulomb,
+            solve,
+            implicit,
+            keep: steps.iter().map(|s| s.0).collect(),
+            first: steps.iter().map(|s| h * s.1).collect(),
+            last: steps.iter().map(|s| h * s.2).collect(),
+            past: remembered.map(|any| vec![0.0; if any { count } else { 0 }]),
+            rate: [0.0; 4],
+            angle: [0.0; 4],
+            linear: [0.0; 4],
+            friction: [0.0; 2],
+        };
+        let columns = arm.columns();
+        for (k, column) in columns.iter().enumerate() {
+            if arm.coulomb[k] > 0.0 && !(column[2 * k] > 0.0 && column[2 * k].is_finite()) {
+                return Err(Error::Structure {
+                    what: format!(
+                        "motor {} does not turn its hub, so friction given as its current does not hold it",
+                        k + 1
+                    ),
+                    remedy: "give the hub a torque per ampere above 0, or no friction".into(),
+                });
+            }
+        }
+        Ok(arm)
+    }
+
+    /// θ₁₁, θ₁₂, θ₂₁, θ₂₂ \[rad\].
+    #[must_use]
+    pub fn angles(&self) -> [f64; 4] {
+        self.angle
+    }
+
+    /// Their rates \[rad/s\].
+    #[must_use]
+    pub fn rates(&self) -> [f64; 4] {
+        self.rate
+    }
+
+    /// How many numbers hold the past.
+    #[must_use]
+    pub fn memory(&self) -> usize {
+        self.past.iter().map(Vec::len).sum()
+    }
+
+    /// One sample under held motor currents \[A\]. Constant time.
+    pub fn advance(&mut self, current: [f64; 2]) {
+        for _ in 0..self.substeps {
+            self.substep(current);
+        }
+    }
+
+    fn substep(&mut self, current: [f64; 2]) {
+        let h = self.substep;
+        let (mut history, mut gained) = ([0.0; 4], [0.0; 4]);
+        for operator in &mut self.operators {
+            let s = operator.signal;
+            let mut value = operator.before * self.rate[s];
+            if operator.order == 0.0 {
+                value += self.angle[s];
+            }
+            value += operator.weights.iter().zip(&self.past[s]).map(|(w, z)| w * z).sum::<f64>();
+            for (sum, c) in history.iter_mut().zip(operator.into) {
+                *sum += c * value;
+            }
+            for (sum, c) in gained.iter_mut().zip(operator.momentum) {
+                *sum += c * (operator.value - value);
+            }
+            // But for what the rate at the end adds.
+            operator.value = value;
+        }
+        let mut right = [0.0; 4];
+        for (i, value) in right.iter_mut().enumerate() {
+            let driven: f64 = self.input[i].iter().zip(current).map(|(b, u)| b * u).sum();
+            *value = gained[i] + h / 2.0 * (self.linear[i] + history[i]) + h * driven;
+        }
+        let mut rate = times(&self.solve, &right);
+        if self.coulomb != [0.0; 2] {
+            self.rub(&mut rate);
+        }
+        for operator in &mut self.operators {
+            operator.value += operator.now * rate[operator.signal];
+        }
+        let implicit = times(&self.implicit, &rate);
+        for i in 0..4 {
+            self.linear[i] = history[i] + implicit[i];
+            self.angle[i] += h / 2.0 * (self.rate[i] + rate[i]);
+            let (before, after) = (self.rate[i], rate[i]);
+            for (((z, keep), first), last) in self.past[i].iter_mut().zip(&self.keep).zip(&self.first).zip(&self.last) {
+                *z = *z * keep + first * before + last * after;
+            }
+        }
+        self.rate = rate;
+    }
+
+    /// Rates at the end of a substep per ampere of each motor in it.
+    fn columns(&self) -> [[f64; 4]; 2] {
+        let h = self.substep;
+        std::array::from_fn(|k| times(&self.solve, &std::array::from_fn(|i| h * self.input[i][k])))
+    }
+
+    /// Coulomb friction: what each hub's own law asks for beside the other's, until both agree.
+    fn rub(&mut self, rate: &mut [f64; 4]) {
+        let columns = self.columns();
+        let free = *rate;
+        let mut friction = self.friction;
+        let mut rests = [false; 2];
+        for _ in 0..FRICTION_SWEEPS {
+            let mut change = 0.0_f64;
+            for k in (0..2).filter(|&k| self.coulomb[k] > 0.0) {
+                let (hub, other) = (2 * k, 1 - k);
+                let without = free[hub] - columns[other][hub] * friction[other];
+                let most = columns[k][hub] * self.coulomb[k];
+                let (sign, _, phase) = pulse(self.rate[hub], without, most, ROUNDING * most);
+                let next = self.coulomb[k] * sign;
+                change = change.max((next - friction[k]).abs());
+                friction[k] = next;
+                rests[k] = phase == Phase::Stick;
+            }
+            if change < 1e-15 {
+                break;
+            }
+        }
+        self.friction = friction;
+        for i in 0..4 {
+            rate[i] = free[i] - columns[0][i] * friction[0] - columns[1][i] * friction[1];
+        }
+        for k in 0..2 {
+            // A hub held by friction stands still exactly, and its encoder with it.
+            if rests[k] {
+                rate[2 * k] = 0.0;
+            }
+        }
+    }
+}
+
+fn times(matrix: &[[f64; 4]; 4], vector: &[f64; 4]) -> [f64; 4] {
+    std::array::from_fn(|i| matrix[i].iter().zip(vector).map(|(a, b)| a * b).sum())
+}
+
+impl Operator {
+    fn prepare(&mut self, h: f64, rates: &Rates) {
+        if self.order == 0.0 {
+            (self.before, self.now) = (h / 2.0, h / 2.0);
+        } else if self.order == 1.0 {
+            (self.before, self.now) = (0.0, 1.0);
+        } else if self.order < 1.0 {
+            // I^q of a rate that is linear over the last substep, exactly; older parts through the exponentials.
+            let q = 1.0 - self.order;
+            let scale = libm::pow(h, q) / libm::tgamma(q + 2.0);
+            (self.before, self.now) = (q * scale, scale);
+            self.weights = decayed(rates, q, h);
+        } else {
+            let q = 2.0 - self.order;
+            let scale = libm::pow(h, q - 1.0) / libm::tgamma(q + 1.0);
+            // ∫ e^{−s(t−τ)} θ″ dτ = θ′(t) − s z(t).
+            let weights = decayed(rates, q, h);
+            self.before = weights.iter().sum::<f64>() - scale;
+            self.now = scale;
+            self.weights = weights.iter().zip(rates.rates()).map(|(w, s)| -w * s).collect();
+        }
+    }
+}
+
+/// Weights of the kernel at lags beyond a substep.
+fn decayed(rates: &Rates, q: f64, h: f64) -> Vec<f64> {
+    rates.weights(q).iter().zip(rates.rates()).map(|(w, s)| w * libm::exp(-s * h)).collect()
+}
+
+fn singular() -> Error {
+    Error::Structure {
+        what: "the arm's equations do not tell its angles apart: their leading matrix is singular".into(),
+        remedy: "change an order, or an inertia that the stages share".into(),
+    }
+}
+
+/// The forces and momenta of the four equations as derivatives of the angles, and their motor currents.
+fn accelerations(parameters: &Parameters) -> Result<(Vec<Operator>, [[f64; 2]; 4])> {
+    check_length("equations of the arm", 4, parameters.equations.len())?;
+    let outside = |name: &str, value: f64, range: &str| Error::OutOfRange {
+        name: name.into(),
+        value,
+        range: range.into(),
+        remedy: "correct the arm's parameters".into(),
+    };
+    if let Some(&value) = parameters.coulomb.iter().find(|c| !(**c >= 0.0 && c.is_finite())) {
+        return Err(outside("Coulomb friction", value, "[0, ∞) A"));
+    }
+    let mut operators: Vec<Operator> = Vec::new();
+    let mut input = [[0.0; 2]; 4];
+    for (row, equation) in parameters.equations.iter().enumerate() {
+        let structure = &equation.structure;
+        crate::error::check_finite("coefficients of the arm", &equation.coefficients)?;
+        check_length("coefficients", structure.terms.len(), equation.coefficients.len())?;
+        if structure.output != row {
+            let what = format!("equation {row} of the arm is not that of its angle {row}");
+            return Err(Error::Structure { what, remedy: "give θ11, θ12, θ21, θ22 in this order".into() });
+        }
+        let alpha = structure.order;
+        if !(alpha > 1.0 && alpha <= 2.0) {
+            return Err(outside("highest order of the arm", alpha, "(1, 2]"));
+        }
+        // What is on the left counts as taken from the right.
+        let terms = structure.terms.iter().zip(&equation.coefficients).map(|(t, &c)| (t.signal, t.order, c));
+        for (signal, order, c) in std::iter::once((row, alpha, -1.0)).chain(terms) {
+            if signal >= SIGNALS {
+                let what = format!("an equation of the arm names signal {signal}, but it has {SIGNALS}");
+                return Err(Error::Structure { what, remedy: "number four angles and two currents from 0".into() });
+            }
+            if signal >= 4 {
+                if order.abs() > ORDER_GRAIN {
+                    let what = format!("an equation of the arm has its current differentiated by {order}");
+                    return Err(Error::Structure { what, remedy: "currents are held: take them as they are".into() });
+                }
+                input[row][signal - 4] += c;
+                continue;
+            }
+            // Beyond 3 even the momentum would be differentiated more often than trapezoids follow.
+            if !(0.0..3.0).contains(&order) {
+                return Err(outside("order of the arm", order, "[0, 3)"));
+            }
+            if c == 0.0 {
+                continue;
+            }
+            let momentum = order > 1.0;
+            let order = tidy(if momentum { order - 1.0 } else { order });
+            #[allow(clippy::float_cmp)]
+            let known = operators.iter().position(|o| o.signal == signal && o.order == order);
+            let at = known.unwrap_or_else(|| {
+                operators.push(Operator { signal, order, ..Operator::default() });
+                operators.len() - 1
+            });
+            if momentum {
+                operators[at].momentum[row] -= c;
+            } else {
+                operators[at].into[row] += c;
+            }
+        }
+    }
+    check_regular(&parameters.equations).map_err(|_| singular())?;
+    Ok((operators, input))
+}

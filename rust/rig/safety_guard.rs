@@ -1,0 +1,469 @@
+//! What stands between a command and a motor, on either rig: limits on every write, and faults that latch with their
+//! cause in words.
+
+use thiserror::Error;
+
+use crate::error::{Error, Result};
+use crate::rig::virtual_arm::Reading;
+
+/// Numbers of the arm that limits and faults are judged by; pairs are stage 1 and stage 2.
+#[derive(Debug, Clone, PartialEq)]
+pub struct Settings {
+    /// Time between samples \[s\].
+    pub step: f64,
+    /// Deflection per volt of strain gauge \[rad/V\]; the deflection is minus the volts less their bias times this.
+    pub strain_scale: [f64; 2],
+    /// Current per volt of the sense \[A/V\]; the current is minus the volts times this.
+    pub sense_scale: f64,
+    /// Current per volt of the command \[A/V\]; the volts are minus the current over this.
+    pub command_scale: f64,
+    /// Hub angle per count \[rad\].
+    pub encoder_scale: [f64; 2],
+    /// Largest command \[A\].
+    pub current_limit: [f64; 2],
+    /// Largest change of a command \[A/s\].
+    pub slew: [f64; 2],
+    /// Current that a motor bears for ever \[A\]; the mean square over `thermal_time` stays below its square.
+    pub continuous: [f64; 2],
+    /// Time over which squares of the current are averaged \[s\].
+    pub thermal_time: f64,
+    /// Largest deflection \[rad\].
+    pub deflection_limit: [f64; 2],
+    /// Volts from which a gauge counts as saturated.
+    pub saturation: f64,
+    /// Current from which a hub must move \[A\].
+    pub moving_current: f64,
+    /// Time that it may stand still under it \[s\].
+    pub standstill: f64,
+    /// Fastest hub \[rad/s\]: a count that jumps further than it goes in a sample has lost its place.
+    pub fastest: f64,
+    /// Longest delay of a write \[s\].
+    pub late_limit: f64,
+    /// Missed deadlines in a row that are borne.
+    pub missed_limit: u32,
+    /// Sensor filter of both deflections: natural frequency \[rad/s\] and damping.
+    pub filter: Option<(f64, f64)>,
+}
+
+impl Settings {
+    fn check(&self) -> Result<()> {
+        let pairs = [
+            ("strain_scale", self.strain_scale),
+            ("encoder_scale", self.encoder_scale),
+            ("current_limit", self.current_limit),
+            ("slew", self.slew),
+            ("continuous", self.continuous),
+            ("deflection_limit", self.deflection_limit),
+        ];
+        let single = [
+            ("step", self.step),
+            ("sense_scale", self.sense_scale),
+            ("command_scale", self.command_scale),
+            ("thermal_time", self.thermal_time),
+            ("saturation", self.saturation),
+            ("moving_current", self.moving_current),
+            ("standstill", self.standstill),
+            ("fastest", self.fastest),
+            ("late_limit", self.late_limit),
+        ];
+        if let Some((frequency, damping)) = self.filter {
+            if !(frequency > 0.0 && frequency.is_finite() && damping > 0.0 && damping.is_finite()) {
+                let value = if frequency > 0.0 && frequency.is_finite() { damping } else { frequency };
+                return Err(Error::OutOfRange {
+                    name: "sensor filter".into(),
+                    value,
+                    range: "(0, ∞)".into(),
+                    remedy: "give its frequency in rad/s and its damping".into(),
+                });
+            }
+        }
+        let all = pairs.iter().flat_map(|(name, v)| v.map(|v| (*name, v))).chain(single);
+        for (name, value) in all {
+            if !(value > 0.0 && value.is_finite()) {
+                return Err(Error::OutOfRange {
+                    name: name.into(),
+                    value,
+                    range: "(0, ∞)".into(),
+                    remedy: "correct the rig's limits".into(),
+                });
+            }
+        }
+        Ok(())
+    }
+}
+
+/// Why the motors were stopped.
+#[derive(Debug, Clone, PartialEq, Error)]
+pub enum Fault {
+    /// NaN or infinity.
+    #[error("the command of motor {stage} is {value}, not a finite current; correct the input")]
+    Command {
+        /// Which motor.
+        stage: usize,
+        /// The value.
+        value: f64,
+    },
+    /// No count although the motor is driven.
+    #[error("encoder {stage} has not counted for {seconds:.2} s under {current:.2} A or more; it is dead, or the hub is blocked: check its cable and the gear")]
+    DeadEncoder {
+        /// Which hub.
+        stage: usize,
+        /// How long \[s\].
+        seconds: f64,
+        /// Current from which it must move \[A\].
+        current: f64,
+    },
+    /// More counts than the hub can go.
+    #[error(
+        "encoder {stage} jumped by {counts} counts in one sample; its counter wrapped or its cable is loose: check it"
+    )]
+    EncoderJump {
+        /// Which hub.
+        stage: usize,
+        /// How far.
+        counts: i64,
+    },
+    /// A gauge at its rail.
+    #[error("strain gauge {stage} is saturated at {volts:.2} V; check its amplifier and cable")]
+    Saturated {
+        /// Which link.
+        stage: usize,
+        /// Reading \[V\].
+        volts: f64,
+    },
+    /// A gauge that does not follow its motor.
+    #[error("strain gauge {stage} has stood at {volts:.4} V for {seconds:.2} s although the current changed by {current:.2} A or more; it is dead, and would not see the link bend: check its amplifier and cable")]
+    DeadGauge {
+        /// Which link.
+        stage: usize,
+        /// Reading \[V\].
+        volts: f64,
+        /// How long \[s\].
+        seconds: f64,
+        /// Change of the current which it must follow \[A\].
+        current: f64,
+    },
+    /// A current sense that reads no number.
+    #[error("the current sense of motor {stage} reads {volts} V; check the board's analog inputs")]
+    Sense {
+        /// Which motor.
+        stage: usize,
+        /// Reading \[V\].
+        volts: f64,
+    },
+    /// A link bent too far.
+    #[error("link {stage} is bent by {degrees:.2} degrees, more than the limit of {limit:.2}; use a smaller amplitude or avoid its resonance")]
+    Deflection {
+        /// Which link.
+        stage: usize,
+        /// Deflection \[degrees\].
+        degrees: f64,
+        /// Limit \[degrees\].
+        limit: f64,
+    },
+    /// A limit switch.
+    #[error(
+        "limit switch {line} is tripped; move the arm off the switch by hand with the amplifier off, then start again"
+    )]
+    Switch {
+        /// Digital line.
+        line: usize,
+    },
+    /// One very late write.
+    #[error("a command was {milliseconds:.1} ms late, more than the limit of {limit:.0} ms; lower the rate or the machine's load")]
+    Late {
+        /// Delay \[ms\].
+        milliseconds: f64,
+        /// Limit \[ms\].
+        limit: f64,
+    },
+    /// Many late writes.
+    #[error("{count} deadlines in a row were missed; lower the rate or the machine's load")]
+    Missed {
+        /// How many.
+        count: u32,
+    },
+    /// What the rig itself reports.
+    #[error("{0}")]
+    Rig(String),
+}
+
+/// Limits, conversions and faults of one run.
+#[derive(Debug, Clone)]
+pub struct Guard {
+    settings: Settings,
+    fault: Option<Fault>,
+    rest: usize,
+    sums: [f64; 2],
+    bias: [f64; 2],
+    zero: [i32; 2],
+    previous: Option<[i32; 2]>,
+    still: [f64; 2],
+    gauges: [Gauge; 2],
+    written: [f64; 2],
+    heat: [f64; 2],
+    missed: u32,
+    missed_in_all: u64,
+    filters: Option<[Filter; 2]>,
+}
+
+impl Guard {
+    /// A guard before its run.
+    ///
+    /// # Errors
+    /// [`Error::OutOfRange`] for a setting that is not a positive, finite number.
+    ///
+    /// ```
+    /// # fn main() -> ftlm::error::Result<()> {
+    /// use ftlm::rig::safety_guard::{Guard, Settings};
+    /// let mut guard = Guard::new(Settings {
+    ///     step: 0.002,
+    ///     strain_scale: [0.0136, 0.0187],
+    ///     sense_scale: 2.0,
+    ///     command_scale: 0.5,
+    ///     encoder_scale: [1.5e-5, 3.1e-5],
+    ///     current_limit: [0.9, 1.2],
+    ///     slew: [50.0, 80.0],
+    ///     continuous: [0.6, 0.8],
+    ///     thermal_time: 1.0,
+    ///     deflection_limit: [0.09, 0.13],
+    ///     saturation: 9.99,
+    ///     moving_current: 0.25,
+    ///     standstill: 0.5,
+    ///     fastest: 20.0,
+    ///     late_limit: 0.05,
+    ///     missed_limit: 20,
+    ///     filter: None,
+    /// })?;
+    /// // A step of 5 A is slewed to 0.1 A, 50 A/s for 2 ms.
+    /// assert!((guard.command([5.0, 0.0])[0] + 0.2).abs() < 1e-12);
+    /// # Ok(())
+    /// # }
+    /// ```
+    pub fn new(settings: Settings) -> Result<Self> {
+        settings.check()?;
+        let filters = settings.filter.map(|(w, damping)| [Filter::new(w, damping, settings.step); 2]);
+        Ok(Self {
+            settings,
+            fault: None,
+            rest: 0,
+            sums: [0.0; 2],
+            bias: [0.0; 2],
+            zero: [0; 2],
+            previous: None,
+            still: [0.0; 2],
+            gauges: [Gauge::default(); 2],
+            written: [0.0; 2],
+            heat: [0.0; 2],
+            missed: 0,
+            missed_in_all: 0,
+            filters,
+        })
+    }
+
+    /// The first fault; it stays.
+    #[must_use]
+    pub fn fault(&self) -> Option<&Fault> {
+        self.fault.as_ref()
+    }
+
+    /// Latches a fault, unless there is one already.
+    pub fn fail(&mut self, fault: Fault) {
+        self.fault.get_or_insert(fault);
+    }
+
+    /// Currents that were written last \[A\].
+    #[must_use]
+    pub fn written(&self) -> [f64; 2] {
+        self.written
+    }
+
+    /// Gauge readings at rest \[V\].
+    #[must_use]
+    pub fn bias(&self) -> [f64; 2] {
+        self.bias
+    }
+
+    /// Deadlines missed in all.
+    #[must_use]
+    pub fn missed(&self) -> u64 {
+        self.missed_in_all
+    }
+
+    /// A reading before the motors are enabled: the gauges' bias and the encoders' zero.
+    pub fn rest(&mut self, reading: &Reading) {
+        self.check(reading);
+        self.rest += 1;
+        #[allow(clippy::cast_precision_loss)]
+        let count = self.rest as f64;
+        for j in 0..2 {
+            self.sums[j] += reading.analog[j];
+            self.bias[j] = self.sums[j] / count;
+        }
+        self.zero = reading.counts;
+        self.previous = Some(reading.counts);
+    }
+
+    /// θ₁₁, θ₁₂, θ₂₁, θ₂₂ \[rad\] and both measured currents \[A\] of a reading that came `late` s after its instant.
+    pub fn read(&mut self, reading: &Reading, late: f64) -> [f64; 6] {
+        self.check(reading);
+        let mut hubs = [0.0; 2];
+        let mut bends = [0.0; 2];
+        for j in 0..2 {
+            let s = &self.settings;
+            hubs[j] = f64::from(reading.counts[j].wrapping_sub(self.zero[j])) * s.encoder_scale[j];
+            bends[j] = -(reading.analog[j] - self.bias[j]) * s.strain_scale[j];
+            if bends[j].abs() > s.deflection_limit[j] {
+                let (degrees, limit) = (bends[j].to_degrees(), s.deflection_limit[j].to_degrees());
+                self.fail(Fault::Deflection { stage: j + 1, degrees, limit });
+            }
+            self.follow(j, reading.counts[j]);
+            self.bends(j, reading.analog[j]);
+        }
+        self.previous = Some(reading.counts);
+        self.deadline(late);
+        if let Some(filters) = &mut self.filters {
+            for (filter, bend) in filters.iter_mut().zip(&mut bends) {
+                *bend = filter.step(*bend);
+            }
+        }
+        let scale = self.settings.sense_scale;
+        [hubs[0], bends[0], hubs[1], bends[1], -reading.analog[2] * scale, -reading.analog[3] * scale]
+    }
+
+    /// The innermost write: volts for both motors that no command can push outside the limits.
+    ///
+    /// Zero while a fault is latched; a command that is not finite latches one.
+    pub fn command(&mut self, current: [f64; 2]) -> [f64; 2] {
+        for (j, value) in current.iter().enumerate() {
+            if !value.is_finite() {
+                self.fail(Fault::Command { stage: j + 1, value: *value });
+            }
+        }
+        if self.fault.is_some() {
+            self.written = [0.0; 2];
+            return [0.0; 2];
+        }
+        let s = &self.settings;
+        let share = (s.step / s.thermal_time).min(1.0);
+        let mut volts = [0.0; 2];
+        for j in 0..2 {
+            let change = s.slew[j] * s.step;
+            let slewed = current[j]
+                .clamp(-s.current_limit[j], s.current_limit[j])
+                .clamp(self.written[j] - change, self.written[j] + change);
+            // The largest current that leaves the mean square at or below what the motor bears.
+            let room = self.heat[j] + (s.continuous[j] * s.continuous[j] - self.heat[j]) / share;
+            let bearable = room.max(0.0).sqrt().min(s.current_limit[j]);
+            let written = slewed.clamp(-bearable, bearable);
+            self.heat[j] += share * (written * written - self.heat[j]);
+            self.written[j] = written;
+            volts[j] = 0.0 - written / s.command_scale;
+        }
+        volts
+    }
+
+    fn check(&mut self, reading: &Reading) {
+        for line in 0..4 {
+            if reading.switches[line] == 0 {
+                self.fail(Fault::Switch { line });
+            }
+        }
+        for j in 0..2 {
+            let volts = reading.analog[j];
+            if volts.is_nan() || volts.abs() >= self.settings.saturation {
+                self.fail(Fault::Saturated { stage: j + 1, volts });
+            }
+            let volts = reading.analog[2 + j];
+            if !volts.is_finite() {
+                self.fail(Fault::Sense { stage: j + 1, volts });
+            }
+        }
+    }
+
+    fn follow(&mut self, j: usize, counts: i32) {
+        let Some(previous) = self.previous else { return };
+        let moved = i64::from(counts) - i64::from(previous[j]);
+        let s = &self.settings;
+        #[allow(clippy::cast_precision_loss)]
+        let far = (moved.abs() as f64) * s.encoder_scale[j] > s.fastest * s.step + 2.0 * s.encoder_scale[j];
+        if far {
+            self.fail(Fault::EncoderJump { stage: j + 1, counts: moved });
+        }
+        let s = &self.settings;
+        if moved != 0 {
+            self.still[j] = 0.0;
+        } else if self.written[j].abs() >= s.moving_current {
+            self.still[j] += s.step;
+            if self.still[j] > s.standstill {
+                let (seconds, current) = (self.still[j], s.moving_current);
+                self.fail(Fault::DeadEncoder { stage: j + 1, seconds, current });
+            }
+        }
+    }
+
+    /// Noise alone moves a gauge that lives; without any, a changed torque does.
+    fn bends(&mut self, j: usize, volts: f64) {
+        let (s, gauge) = (&self.settings, &mut self.gauges[j]);
+        #[allow(clippy::float_cmp)]
+        if gauge.volts != volts {
+            *gauge = Gauge { volts, written: self.written[j], still: 0.0 };
+        } else if (self.written[j] - gauge.written).abs() >= s.moving_current {
+            gauge.still += s.step;
+            if gauge.still > s.standstill {
+                let (seconds, current) = (gauge.still, s.moving_current);
+                self.fail(Fault::DeadGauge { stage: j + 1, volts, seconds, current });
+            }
+        }
+    }
+
+    fn deadline(&mut self, late: f64) {
+        let s = &self.settings;
+        if late > s.step {
+            self.missed += 1;
+            self.missed_in_all += 1;
+        } else {
+            self.missed = 0;
+        }
+        if late.is_nan() || late > s.late_limit {
+            self.fail(Fault::Late { milliseconds: 1e3 * late, limit: 1e3 * self.settings.late_limit });
+        } else if self.missed > s.missed_limit {
+            self.fail(Fault::Missed { count: self.missed });
+        }
+    }
+}
+
+/// What a strain gauge read last, the current written when it began to, and for how long a changed one has not moved it.
+#[derive(Debug, Clone, Copy, Default)]
+struct Gauge {
+    volts: f64,
+    written: f64,
+    still: f64,
+}
+
+/// A second-order low-pass in the bilinear transform, as a real-time model runs it.
+#[derive(Debug, Clone, Copy)]
+struct Filter {
+    input: [f64; 3],
+    output: [f64; 2],
+    past: [f64; 2],
+}
+
+impl Filter {
+    fn new(w: f64, damping: f64, step: f64) -> Self {
+        let k = w * step / 2.0;
+        let a = 1.0 + 2.0 * damping * k + k * k;
+        Self {
+            input: [k * k / a, 2.0 * k * k / a, k * k / a],
+            output: [2.0 * (k * k - 1.0) / a, (1.0 - 2.0 * damping * k + k * k) / a],
+            past: [0.0; 2],
+        }
+    }
+
+    fn step(&mut self, x: f64) -> f64 {
+        let y = self.input[0] * x + self.past[0];
+        self.past[0] = self.input[1] * x - self.output[0] * y + self.past[1];
+        self.past[1] = self.input[2] * x - self.output[1] * y;
+        y
+    }
+}

@@ -1,0 +1,243 @@
+//! Systems of integrals of whole order, solved by running sums instead of transforms: O(n² K) a term.
+//!
+//! In pulse means I^η of whole order is h^η/(η+1)!·A(z)/(1−z)^η with an Eulerian polynomial A of degree η. Written in
+//! powers of 1−z it is a sum of running sums Q^l, Q = 1/(1−z), l = 0 … η, so that a system of such integrals is
+//! y = G₀ + Q(G₁ + Q(G₂ + …)), each G_l linear in the unknowns and in what drives them: one state for each sum. The sums
+//! stay as small as the motion is, which a difference equation in y alone does not.
+
+use crate::error::{check_length, Error, Result};
+use crate::linalg::small;
+use crate::simd::{widest, Kernel};
+
+/// Highest order of an integral: beyond it transforms are as good.
+pub const MAX_SUMS: usize = 6;
+
+/// Right-hand sides that are solved for side by side: each alone waits for its own last term.
+pub const ABREAST: usize = 4;
+
+/// Terms at a time, so that what drives them stays near.
+const BLOCK: usize = 256;
+
+/// Weights of the running sums Q^0 … Q^η in I^η of pulse means.
+///
+/// By Frobenius' identity they are h^η/(η+1)!·(−1)^{η−l}·(l+1)!·S(η+1, l+1), S Stirling's numbers of the second kind.
+///
+/// ```
+/// // I^1 of a pulse: half of it within itself, all of it in every later one.
+/// assert_eq!(ftlm::series::running_sums::running_sums(1, 0.1), [-0.05, 0.1]);
+/// ```
+#[must_use]
+#[allow(clippy::cast_precision_loss)]
+pub fn running_sums(eta: usize, step: f64) -> Vec<f64> {
+    // S(η+1, l+1), row by row.
+    let mut stirling = vec![1.0];
+    for row in 1..=eta {
+        let mut next = vec![0.0; row + 1];
+        for (l, value) in next.iter_mut().enumerate() {
+            let same = stirling.get(l).map_or(0.0, |s| (l + 1) as f64 * s);
+            *value = same + if l > 0 { stirling[l - 1] } else { 0.0 };
+        }
+        stirling = next;
+    }
+    let scale = (1..=eta).fold(1.0, |product, k| product * step / (k + 1) as f64);
+    let mut factorial = 1.0;
+    let mut weights = Vec::with_capacity(eta + 1);
+    for (l, number) in stirling.iter().enumerate() {
+        factorial *= (l + 1) as f64;
+        let sign = if (eta - l) % 2 == 0 { 1.0 } else { -1.0 };
+        weights.push(scale * sign * factorial * number);
+    }
+    weights
+}
+
+/// What drives one equation: `weight` times I^`order` of a series.
+#[derive(Debug, Clone, Copy)]
+pub struct Source<'a> {
+    /// The equation.
+    pub equation: usize,
+    /// Whole order of the integral.
+    pub order: usize,
+    /// What it weighs.
+    pub weight: f64,
+    /// The series.
+    pub series: &'a [f64],
+}
+
+/// y_i = Σ c·I^η y_j + what drives, solved for any number of right-hand sides.
+#[derive(Debug, Clone)]
+pub struct Recursion {
+    n: usize,
+    /// Number of running sums of each equation.
+    sums: usize,
+    step: f64,
+    /// What each unknown adds to each sum of each equation: `[(i·(sums + 1) + l)·n + j]`.
+    own: Vec<f64>,
+    /// Inverse of the matrix of leading coefficients, row by row.
+    inverse: Vec<f64>,
+}
+
+impl Recursion {
+    /// n equations with terms (i, j, η, c): c·I^η y_j in equation i; `sums` is the highest η of them and of all sources.
+    ///
+    /// # Errors
+    /// [`Error::LeadingZero`] where the matrix of leading coefficients is singular, [`Error::Structure`] for an order
+    /// above `sums`, or above [`MAX_SUMS`].
+    pub fn new(n: usize, sums: usize, step: f64, terms: &[(usize, usize, usize, f64)]) -> Result<Self> {
+        let highest = terms.iter().map(|&(.., order, _)| order).max().unwrap_or(0);
+        if highest > sums || sums > MAX_SUMS {
+            let what = format!("integrals of order {highest} by {sums} running sums");
+            return Err(Error::Structure { what, remedy: format!("give the highest order, {MAX_SUMS} at most") });
+        }
+        let mut own = vec![0.0; n * (sums + 1) * n];
+        let mut leading: Vec<f64> = (0..n * n).map(|at| f64::from(u8::from(at / n == at % n))).collect();
+        for &(i, j, order, c) in terms {
+            for (l, weight) in running_sums(order, step).iter().enumerate() {
+                own[(i * (sums + 1) + l) * n + j] += c * weight;
+            }
+            leading[i * n + j] -= c * crate::fractional::kernels::first(whole(order), step);
+        }
+        Ok(Self { n, sums, step, own, inverse: small::inverse(&leading, n)? })
+    }
+
+    /// The n unknown series of m terms that each list of sources drives.
+    ///
+    /// # Errors
+    /// [`Error::Length`] for a source shorter than m.
+    ///
+    /// # Panics
+    /// Where a source names an equation that is not there or an order above the sums.
+    pub fn solve(&self, m: usize, lists: &[Vec<Source>]) -> Result<Vec<Vec<Vec<f64>>>> {
+        for source in lists.iter().flatten() {
+            if source.series.len() < m {
+                check_length("series that drives", m, source.series.len())?;
+            }
+        }
+        if self.n > 1 {
+            return Ok(lists.iter().map(|sources| self.many(m, sources)).collect());
+        }
+        let solve = match self.sums {
+            0 => Self::abreast::<1>,
+            1 => Self::abreast::<2>,
+            2 => Self::abreast::<3>,
+            3 => Self::abreast::<4>,
+            4 => Self::abreast::<5>,
+            5 => Self::abreast::<6>,
+            _ => Self::abreast::<7>,
+        };
+        let solved = lists.chunks(ABREAST).flat_map(|part| solve(self, m, part));
+        Ok(solved.map(|answer| vec![answer]).collect())
+    }
+
+    /// One unknown under up to [`ABREAST`] right-hand sides; L is one more than there are sums.
+    fn abreast<const L: usize>(&self, m: usize, lists: &[Vec<Source>]) -> Vec<Vec<f64>> {
+        let mut own = [0.0; L];
+        own.copy_from_slice(&self.own[..L]);
+        let driven: Vec<Vec<(Vec<f64>, &[f64])>> = lists
+            .iter()
+            .map(|list| list.iter().map(|source| (self.weights(source), source.series)).collect())
+            .collect();
+        let mut out = vec![vec![0.0; m]; lists.len()];
+        let mut states = [[0.0; ABREAST]; L];
+        let mut drive = vec![[[0.0; ABREAST]; L]; BLOCK.min(m)];
+        let mut answer = vec![[0.0; ABREAST]; BLOCK.min(m)];
+        for start in (0..m).step_by(BLOCK) {
+            let length = BLOCK.min(m - start);
+            drive[..length].fill([[0.0; ABREAST]; L]);
+            for (lane, sources) in driven.iter().enumerate() {
+                for (weights, series) in sources {
+                    for (given, value) in drive.iter_mut().zip(&series[start..start + length]) {
+                        given.iter_mut().zip(weights).for_each(|(sum, w)| sum[lane] += w * value);
+                    }
+                }
+            }
+            let (drive, answer) = (&drive[..length], &mut answer[..length]);
+            widest(Block { own: &own, inverse: self.inverse[0], states: &mut states, drive, answer });
+            for (lane, series) in out.iter_mut().enumerate() {
+                series[start..start + length].iter_mut().zip(&*answer).for_each(|(value, y)| *value = y[lane]);
+            }
+        }
+        out
+    }
+
+    /// What a source adds to each sum, by its series.
+    fn weights(&self, source: &Source) -> Vec<f64> {
+        running_sums(source.order, self.step).iter().map(|w| w * source.weight).collect()
+    }
+
+    fn many(&self, m: usize, sources: &[Source]) -> Vec<Vec<f64>> {
+        let (n, stride) = (self.n, self.sums + 1);
+        // Term by term, then equation by equation, what drives each sum.
+        let mut drive = vec![0.0; m * n * stride];
+        for source in sources {
+            let weights = self.weights(source);
+            for (row, &value) in drive.chunks_exact_mut(n * stride).zip(source.series) {
+                let part = &mut row[source.equation * stride..][..weights.len()];
+                part.iter_mut().zip(&weights).for_each(|(sum, w)| *sum += w * value);
+            }
+        }
+        let mut out: Vec<Vec<f64>> = (0..n).map(|_| Vec::with_capacity(m)).collect();
+        let (mut sums, mut open, mut y) = (vec![0.0; n * stride], vec![0.0; n], vec![0.0; n]);
+        for given in drive.chunks_exact(n * stride) {
+            for (i, sum) in open.iter_mut().enumerate() {
+                let at = i * stride;
+                *sum = given[at] + (1..stride).map(|l| given[at + l] + sums[at + l]).sum::<f64>();
+            }
+            for (i, value) in y.iter_mut().enumerate() {
+                *value = (0..n).map(|j| self.inverse[i * n + j] * open[j]).sum();
+                out[i].push(*value);
+            }
+            for i in 0..n {
+                let mut above = 0.0;
+                for l in (1..stride).rev() {
+                    let at = i * stride + l;
+                    let of_unknowns: f64 = (0..n).map(|j| self.own[at * n + j] * y[j]).sum();
+                    sums[at] += given[at] + of_unknowns + above;
+                    above = sums[at];
+                }
+            }
+        }
+        out
+    }
+}
+
+/// One unknown under [`ABREAST`] right-hand sides over a block of terms.
+struct Block<'a, const L: usize> {
+    own: &'a [f64; L],
+    inverse: f64,
+    states: &'a mut [[f64; ABREAST]; L],
+    drive: &'a [[[f64; ABREAST]; L]],
+    answer: &'a mut [[f64; ABREAST]],
+}
+
+impl<const L: usize> Kernel for Block<'_, L> {
+    type Output = ();
+
+    #[inline(always)]
+    fn run(self) {
+        let mut states = *self.states;
+        for (given, y) in self.drive.iter().zip(self.answer) {
+            let mut open = given[0];
+            for l in 1..L {
+                for w in 0..ABREAST {
+                    open[w] += given[l][w] + states[l][w];
+                }
+            }
+            let mut above = [0.0; ABREAST];
+            for w in 0..ABREAST {
+                y[w] = self.inverse * open[w];
+            }
+            for l in (1..L).rev() {
+                for w in 0..ABREAST {
+                    states[l][w] += given[l][w] + self.own[l] * y[w] + above[w];
+                }
+                above = states[l];
+            }
+        }
+        *self.states = states;
+    }
+}
+
+#[allow(clippy::cast_precision_loss)]
+fn whole(order: usize) -> f64 {
+    order as f64
+}

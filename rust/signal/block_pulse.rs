@@ -1,0 +1,317 @@
+//! From point samples to pulse means: the inter-sample behaviour of a record, integrated exactly.
+//!
+//! Row j of a record holds t = jh. An input that is a command is held over [jh, (j+1)h); a measured signal is read at
+//! jh and taken as linear in between. Samples taken for means bias every estimate, so this step is never skipped.
+//!
+//! What a signal is at times of its own, from its pulse means: readings whose clock jitters, rows that were lost.
+//!
+//! Four pulse means around a reading tell its value to fourth order where the signal is smooth: the slope of the quartic
+//! through the integral at their edges. It is not smooth where a held input jumps: I^η of a jump of size Δ at p is
+//! Δ (t − p)^η/Γ(η + 1), a corner that no polynomial follows, and the pulses see the jump spread over the pulse in which
+//! it stands. Both are known exactly, so a reading near a jump gets what its four means lack of that corner.
+
+use crate::error::{check_finite, check_points, Error, Result};
+
+/// What a signal does between two samples.
+#[derive(Debug, Clone, Copy, PartialEq, Eq)]
+pub enum Intersample {
+    /// Zero-order hold: row j holds until row j+1. A command.
+    Hold,
+    /// First-order hold: linear between rows. A measured signal.
+    Linear,
+}
+
+/// Means over `m` equal pulses of [0, (N−1)h] of a signal given by N samples. O(N + m).
+///
+/// `m` may be any number: N−1 is the record's own grid, a multiple of it refines the grid under the same
+/// inter-sample behaviour, less integrates it exactly.
+///
+/// # Errors
+/// Fewer than two samples, m = 0 or beyond memory, a sample that is not finite.
+///
+/// ```
+/// # fn main() -> ftlm::error::Result<()> {
+/// use ftlm::signal::block_pulse::{pulse_means, Intersample};
+/// assert_eq!(pulse_means(&[0.0, 1.0, 3.0], 2, Intersample::Linear)?, [0.5, 2.0]);
+/// assert_eq!(pulse_means(&[0.0, 1.0, 3.0], 2, Intersample::Hold)?, [0.0, 1.0]);
+/// # Ok(())
+/// # }
+/// ```
+#[allow(clippy::cast_precision_loss, clippy::cast_possible_truncation, clippy::cast_sign_loss)]
+pub fn pulse_means(samples: &[f64], m: usize, between: Intersample) -> Result<Vec<f64>> {
+    let Some(intervals) = samples.len().checked_sub(1).filter(|&n| n > 0) else {
+        return Err(Error::Length { name: "samples".into(), expected: 2, found: samples.len() });
+    };
+    if m == 0 {
+        return Err(Error::OutOfRange {
+            name: "m".into(),
+            value: 0.0,
+            range: "[1, ∞)".into(),
+            remedy: "ask for at least one pulse".into(),
+        });
+    }
+    check_points("m", m)?;
+    check_finite("samples", samples)?;
+    // Integral over interval j from its start to a fraction x of it.
+    let partial = |j: usize, x: f64| match between {
+        Intersample::Hold => samples[j] * x,
+        Intersample::Linear => x * (samples[j] + 0.5 * x * (samples[j + 1] - samples[j])),
+    };
+    // Edge k of the pulses stands at interval k·n/m: whole part and remainder in integers, so that edges are exact.
+    let edge = |k: usize| {
+        let product = k as u128 * intervals as u128;
+        let whole = (product / m as u128) as usize;
+        let fraction = (product % m as u128) as f64 / m as f64;
+        (whole, fraction)
+    };
+    let per_pulse = m as f64 / intervals as f64;
+    let mut means = Vec::with_capacity(m);
+    let (mut j, mut x) = edge(0);
+    for k in 1..=m {
+        let (next_j, next_x) = edge(k);
+        let mut integral = 0.0;
+        if next_j == j {
+            integral += slice_integral(samples, between, j, x, next_x);
+        } else {
+            integral += if x == 0.0 { partial(j, 1.0) } else { slice_integral(samples, between, j, x, 1.0) };
+            for i in j + 1..next_j {
+                integral += partial(i, 1.0);
+            }
+            if next_x > 0.0 {
+                integral += partial(next_j, next_x);
+            }
+        }
+        means.push(if m == intervals { integral } else { integral * per_pulse });
+        (j, x) = (next_j, next_x);
+    }
+    Ok(means)
+}
+
+/// Integral over interval j from fraction a to b, without the cancellation of two partial integrals.
+fn slice_integral(samples: &[f64], between: Intersample, j: usize, a: f64, b: f64) -> f64 {
+    match between {
+        Intersample::Hold => samples[j] * (b - a),
+        Intersample::Linear => {
+            (b - a) * (samples[j] + 0.5 * (a + b) * (samples.get(j + 1).unwrap_or(&samples[j]) - samples[j]))
+        }
+    }
+}
+
+/// Samples delayed by `delay` steps (whole and fractional): u_j ← (1−φ)·u_{j−d} + φ·u_{j−d−1}.
+///
+/// Exact means of a held command after a delay of (d+φ)h. `before` stands for the samples before the record.
+///
+/// # Errors
+/// A delay that is negative or not finite, a sample that is not finite.
+///
+/// ```
+/// # fn main() -> ftlm::error::Result<()> {
+/// assert_eq!(ftlm::signal::block_pulse::delayed(&[1.0, 2.0, 3.0], 1.5, 0.0)?, [0.0, 0.5, 1.5]);
+/// # Ok(())
+/// # }
+/// ```
+#[allow(clippy::cast_possible_truncation, clippy::cast_sign_loss, clippy::cast_precision_loss)]
+pub fn delayed(samples: &[f64], delay: f64, before: f64) -> Result<Vec<f64>> {
+    if !(delay >= 0.0 && delay.is_finite()) {
+        return Err(Error::OutOfRange {
+            name: "delay".into(),
+            value: delay,
+            range: "[0, ∞) steps".into(),
+            remedy: "an input acts after it is given".into(),
+        });
+    }
+    check_finite("samples", samples)?;
+    check_finite("before", &[before])?;
+    let whole = delay.floor();
+    let fraction = delay - whole;
+    let whole = whole.min(samples.len() as f64) as usize;
+    let at = |j: usize, back: usize| j.checked_sub(back).map_or(before, |i| samples[i]);
+    Ok((0..samples.len())
+        .map(|j| {
+            let near = at(j, whole);
+            if fraction == 0.0 {
+                near
+            } else {
+                (1.0 - fraction) * near + fraction * at(j, whole + 1)
+            }
+        })
+        .collect())
+}
+
+/// Point samples at 0, h, …, mh from m pulse means: the mean of the pulses on either side, second-order
+/// extrapolation at the two ends.
+#[must_use]
+pub fn point_samples(means: &[f64]) -> Vec<f64> {
+    let m = means.len();
+    if m < 2 {
+        return vec![means.first().copied().unwrap_or(0.0); m + 1];
+    }
+    let mut samples = Vec::with_capacity(m + 1);
+    samples.push(1.5 * means[0] - 0.5 * means[1]);
+    samples.extend(means.windows(2).map(|pair| 0.5 * (pair[0] + pair[1])));
+    samples.push(1.5 * means[m - 1] - 0.5 * means[m - 2]);
+    samples
+}
+
+/// Pulse means that a reading is made of.
+const STENCIL: usize = 4;
+/// Pulses after a jump within which a reading is mended: beyond them what the spreading leaves falls with the square of
+/// the step, like every other error of the scheme.
+const REACH: f64 = 16.0;
+
+/// A jump of a held signal near a reading, in pulses.
+#[derive(Debug, Clone, Copy, PartialEq)]
+struct Near {
+    /// How long before the reading; negative: after it.
+    before: f64,
+    /// First pulse of the reading's stencil, counted from that of the jump.
+    first: isize,
+    /// Share of its pulse that had passed at the jump.
+    share: f64,
+    size: f64,
+}
+
+/// Times of readings on a grid of pulses, and what each is made of.
+#[derive(Debug, Clone, PartialEq)]
+pub struct Readings {
+    first: Vec<usize>,
+    weights: Vec<[f64; STENCIL]>,
+    places: Vec<f64>,
+}
+
+/// Jumps of one held signal near each reading.
+#[derive(Debug, Clone, Default, PartialEq)]
+pub struct Jumps {
+    starts: Vec<usize>,
+    near: Vec<Near>,
+}
+
+impl Readings {
+    /// Readings at these places, in pulses from the first pulse's start, among m pulses.
+    ///
+    /// # Errors
+    /// Fewer than four pulses, a place that is not among them.
+    ///
+    /// ```
+    /// # fn main() -> ftlm::error::Result<()> {
+    /// // Means of t³ over pulses of 1 s.
+    /// let means: Vec<f64> = (0..6).map(|k| 0.25 * (f64::from(k + 1).powi(4) - f64::from(k).powi(4))).collect();
+    /// let readings = ftlm::signal::block_pulse::Readings::new(vec![0.3, 2.5, 5.9], 6)?;
+    /// let read = readings.read(&means);
+    /// assert!(read.iter().zip([0.3_f64, 2.5, 5.9]).all(|(y, t)| (y - t.powi(3)).abs() < 1e-9));
+    /// # Ok(())
+    /// # }
+    /// ```
+    #[allow(clippy::cast_possible_truncation, clippy::cast_sign_loss, clippy::cast_precision_loss)]
+    pub fn new(places: Vec<f64>, m: usize) -> Result<Self> {
+        if m < STENCIL {
+            return Err(Error::Length { name: "pulses around a reading".into(), expected: STENCIL, found: m });
+        }
+        check_finite("times of readings", &places)?;
+        if let Some(&value) = places.iter().find(|&&p| !(0.0..=m as f64).contains(&p)) {
+            let remedy = "leave out what was read before or after the inputs are known".into();
+            return Err(Error::OutOfRange {
+                name: "time of a reading".into(),
+                value,
+                range: format!("[0, {m}]"),
+                remedy,
+            });
+        }
+        let half = STENCIL / 2;
+        let first: Vec<usize> =
+            places.iter().map(|p| ((p + 0.5) as usize).saturating_sub(half).min(m - STENCIL)).collect();
+        let weights = places.iter().zip(&first).map(|(p, &f)| stencil(p - f as f64)).collect();
+        Ok(Self { first, weights, places })
+    }
+
+    /// How many there are.
+    #[must_use]
+    pub fn len(&self) -> usize {
+        self.first.len()
+    }
+
+    /// Whether there is none.
+    #[must_use]
+    pub fn is_empty(&self) -> bool {
+        self.first.is_empty()
+    }
+
+    /// Values of a signal at the readings from its pulse means, where it is smooth.
+    #[must_use]
+    pub fn read(&self, means: &[f64]) -> Vec<f64> {
+        let value = |(&first, weights): (&usize, &[f64; STENCIL])| -> f64 {
+            weights.iter().zip(&means[first..]).map(|(w, v)| w * v).sum()
+        };
+        self.first.iter().zip(&self.weights).map(value).collect()
+    }
+
+    /// The jumps of a held signal that matter to each reading, from their places in pulses (ascending) and sizes.
+    #[must_use]
+    #[allow(clippy::cast_possible_truncation, clippy::cast_possible_wrap, clippy::cast_precision_loss)]
+    pub fn jumps(&self, at: &[f64], sizes: &[f64]) -> Jumps {
+        let mut out = Jumps { starts: vec![0], near: Vec::new() };
+        for (&place, &first) in self.places.iter().zip(&self.first) {
+            let from = at.partition_point(|&p| p < place - REACH);
+            let to = at.partition_point(|&p| p < (first + STENCIL) as f64);
+            for (&p, &size) in
+                at[from..to.max(from)].iter().zip(sizes.iter().skip(from)).filter(|(_, size)| **size != 0.0)
+            {
+                let pulse = p.floor();
+                out.near.push(Near {
+                    before: place - p,
+                    first: first as isize - pulse as isize,
+                    share: p - pulse,
+                    size,
+                });
+            }
+            out.starts.push(out.near.len());
+        }
+        out
+    }
+
+    /// What the readings of I^η of a held signal lack: its corners at the jumps less what its pulse means show of them.
+    #[must_use]
+    #[allow(clippy::cast_precision_loss)]
+    pub fn corners(&self, jumps: &Jumps, eta: f64, step: f64) -> Vec<f64> {
+        let scale = libm::pow(step, eta);
+        let (corner, mean) = (scale / libm::tgamma(eta + 1.0), scale / libm::tgamma(eta + 2.0));
+        // Mean of the corner over the n-th pulse after a jump at a pulse's start.
+        let longest = jumps.near.iter().map(|near| near.first).max().unwrap_or(0).max(0) + STENCIL as isize;
+        let powers: Vec<f64> = (0..=longest + 1).map(|n| libm::pow(n as f64, eta + 1.0)).collect();
+        let of_pulse = |n: isize| usize::try_from(n).map_or(0.0, |n| mean * (powers[n + 1] - powers[n]));
+        let lacking = |near: &Near, weights: &[f64; STENCIL]| {
+            let there = match near.before {
+                before if before < 0.0 => 0.0,
+                before if eta == 0.0 && before == 0.0 => corner,
+                before => corner * libm::pow(before, eta),
+            };
+            let shown: f64 = (near.first..)
+                .zip(weights)
+                .map(|(n, w)| w * ((1.0 - near.share) * of_pulse(n) + near.share * of_pulse(n - 1)))
+                .sum();
+            near.size * (there - shown)
+        };
+        let spans = jumps.starts.iter().zip(jumps.starts.iter().skip(1)).zip(&self.weights);
+        spans.map(|((&from, &to), weights)| jumps.near[from..to].iter().map(|n| lacking(n, weights)).sum()).collect()
+    }
+}
+
+/// Weights of four pulse means for the value at x pulses from the first one's start: slopes of Lagrange's polynomials
+/// through the integral at the five edges.
+#[allow(clippy::cast_precision_loss)]
+fn stencil(x: f64) -> [f64; STENCIL] {
+    let slope = |m: usize| -> f64 {
+        let others: Vec<f64> = (0..=STENCIL).filter(|&j| j != m).map(|j| j as f64).collect();
+        let below: f64 = others.iter().map(|j| m as f64 - j).product();
+        let skipping =
+            |i: usize| others.iter().enumerate().filter(|(j, _)| *j != i).map(|(_, v)| x - v).product::<f64>();
+        (0..others.len()).map(skipping).sum::<f64>() / below
+    };
+    let mut weights = [0.0; STENCIL];
+    let mut sum = 0.0;
+    for k in (0..STENCIL).rev() {
+        sum += slope(k + 1);
+        weights[k] = sum;
+    }
+    weights
+}

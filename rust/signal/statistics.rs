@@ -1,0 +1,253 @@
+//! Numbers that tell of a series what it scatters by, how it hangs together, and whether it is white.
+//!
+//! Colour of noise: an autoregression of what a model leaves, and the autocovariances that it tells.
+
+use crate::fft::{plan, Bin, Workspace};
+use crate::simd::{dot, widest, Kernel};
+
+/// Median absolute deviation of a normal variable in units of its standard deviation.
+pub const MAD: f64 = 0.674_489_750_196_081_7;
+/// Residuals beyond so many deviations count by their size: 95 % of the precision of squares under normal noise.
+pub const BEND: f64 = 1.345;
+/// 99 % quantile of a normal variable: one in a hundred true models is refused.
+const NORMAL_99: f64 = 2.326_347_874_040_840_8;
+/// Lags that a test for whiteness looks at where nothing else is asked.
+pub const LAGS: usize = 25;
+/// Values that are summed one after another before sums are joined by pairs.
+const TOGETHER: usize = 128;
+
+/// Inner product of two rows of one length.
+struct Inner<'a>(&'a [f64], &'a [f64]);
+
+impl Kernel for Inner<'_> {
+    type Output = f64;
+
+    #[inline(always)]
+    fn run(self) -> f64 {
+        dot(self.0, self.1)
+    }
+}
+
+/// Σ a·b in the widest vectors at hand; rows are of one length.
+#[must_use]
+pub fn inner(a: &[f64], b: &[f64]) -> f64 {
+    widest(Inner(a, b))
+}
+
+/// Sum of values, halves of them by themselves: rounding grows with the logarithm of their number.
+#[must_use]
+pub fn sum(values: &[f64]) -> f64 {
+    if values.len() < 8 {
+        return values.iter().sum();
+    }
+    if values.len() > TOGETHER {
+        let half = values.len() / 2 / 8 * 8;
+        return sum(&values[..half]) + sum(&values[half..]);
+    }
+    let mut lanes = [0.0; 8];
+    lanes.copy_from_slice(&values[..8]);
+    let chunks = values[8..].chunks_exact(8);
+    let rest = chunks.remainder();
+    for chunk in chunks {
+        lanes.iter_mut().zip(chunk).for_each(|(lane, value)| *lane += value);
+    }
+    let [a, b, c, d, e, f, g, h] = lanes;
+    rest.iter().fold(((a + b) + (c + d)) + ((e + f) + (g + h)), |total, value| total + value)
+}
+
+/// Mean of values; not a number where there are none.
+#[must_use]
+#[allow(clippy::cast_precision_loss)]
+pub fn mean(values: &[f64]) -> f64 {
+    sum(values) / values.len() as f64
+}
+
+/// Root of the mean of squares; infinite beyond the numbers.
+#[must_use]
+pub fn root_mean_square(values: &[f64]) -> f64 {
+    mean(&values.iter().map(|v| v * v).collect::<Vec<_>>()).sqrt()
+}
+
+/// Deviation of normal values from the median of their sizes, which a few that are far off do not move; 0 of none.
+///
+/// ```
+/// let found = ftlm::signal::statistics::robust_deviation(&[1.0, -2.0, 3.0, -1000.0]);
+/// assert!((found - 2.5 / ftlm::signal::statistics::MAD).abs() < 1e-12);
+/// ```
+#[must_use]
+pub fn robust_deviation(values: &[f64]) -> f64 {
+    if values.is_empty() {
+        return 0.0;
+    }
+    median(values.iter().map(|v| v.abs()).collect()) / MAD
+}
+
+/// The middle one of values, or the mean of the two in the middle; not a number of none.
+///
+/// ```
+/// assert_eq!(ftlm::signal::statistics::median(vec![3.0, 1.0, 8.0, 2.0]), 2.5);
+/// ```
+#[must_use]
+pub fn median(mut values: Vec<f64>) -> f64 {
+    let count = values.len();
+    if count == 0 {
+        return f64::NAN;
+    }
+    let (below, &mut upper, _) = values.select_nth_unstable_by(count / 2, f64::total_cmp);
+    match count % 2 {
+        0 => f64::midpoint(below.iter().copied().fold(f64::NEG_INFINITY, f64::max), upper),
+        _ => upper,
+    }
+}
+
+/// Autocovariances of series at lags from 0 to `most`, and how many pairs each is the mean of. What is no number is not
+/// there; each series is taken about its own mean, and they are pooled. O(most · N).
+#[must_use]
+#[allow(clippy::cast_precision_loss)]
+pub fn autocovariances(series: &[&[f64]], most: usize) -> (Vec<f64>, Vec<f64>) {
+    let (mut sums, mut pairs) = (vec![0.0; most + 1], vec![0.0; most + 1]);
+    for values in series {
+        let there: Vec<f64> = values.iter().copied().filter(|v| !v.is_nan()).collect();
+        let centre = if there.is_empty() { 0.0 } else { mean(&there) };
+        let x: Vec<f64> = values.iter().map(|v| if v.is_nan() { 0.0 } else { v - centre }).collect();
+        let gaps = there.len() < values.len();
+        let known: Vec<f64> = if gaps { values.iter().map(|v| f64::from(!v.is_nan())).collect() } else { Vec::new() };
+        for lag in 0..(most + 1).min(x.len()) {
+            sums[lag] += inner(&x[lag..], &x[..x.len() - lag]);
+            pairs[lag] += if gaps { inner(&known[lag..], &known[..x.len() - lag]) } else { (x.len() - lag) as f64 };
+        }
+    }
+    sums.iter_mut().zip(&pairs).for_each(|(sum, count)| *sum /= count.max(1.0));
+    (sums, pairs)
+}
+
+/// Whether autocorrelations up to some lags could be those of white noise: Ljung and Box's test at 1 %. Where some values are
+/// not there, each correlation has the variance of its own pairs.
+#[must_use]
+#[allow(clippy::cast_precision_loss)]
+pub fn is_white(series: &[f64], lags: usize) -> bool {
+    if series.len() <= lags + 1 {
+        return true;
+    }
+    let (covariances, pairs) = autocovariances(&[series], lags);
+    if pairs[0] <= (lags + 1) as f64 {
+        return true;
+    }
+    let power = covariances[0] * pairs[0];
+    let of = |lag: usize| covariances[lag] * pairs[lag] / if power > 0.0 { power } else { 1.0 };
+    let summed: f64 = (1..=lags).map(|lag| of(lag) * of(lag) / pairs[lag].max(1.0)).sum();
+    (pairs[0] + 2.0) * pairs[0] * summed <= chi_squared(lags as f64, NORMAL_99)
+}
+
+/// Value that chi-squared exceeds as often as a normal variable exceeds `quantile`, by Wilson and Hilferty: good to 0.3 %
+/// from five degrees of freedom, to 1 % from one.
+#[must_use]
+pub fn chi_squared(degrees: f64, quantile: f64) -> f64 {
+    let spread = 2.0 / (9.0 * degrees);
+    degrees * libm::pow(1.0 - spread + quantile * spread.sqrt(), 3.0)
+}
+
+/// An autoregression has at most one coefficient for so many samples of the shortest run.
+const SAMPLES_A_COEFFICIENT: usize = 10;
+/// Least points of a circle of frequencies: on it a colour of 0.99 a sample has died away.
+const LEAST_CIRCLE: usize = 4096;
+
+/// The whitening filter 1, a₁, …, aₙ of series that share one colour, and the power that it leaves.
+///
+/// Yule-Walker's equations by Levinson and Durbin (doi:10.1093/biomet/47.3-4.233), covariances pooled over the series and
+/// each about its own mean; the order, `most` at most, is that of the least Bayesian information criterion. What is no
+/// number is not there.
+///
+/// ```
+/// // Every other value the opposite: x_k = −0.9 x_{k−1} and what does not follow from it.
+/// let mut x = vec![1.0];
+/// (0..399_u32).for_each(|k| x.push(-0.9 * x[k as usize] + f64::from(k % 7) / 7.0 - 3.0 / 7.0));
+/// let (filter, power) = ftlm::signal::statistics::coloured(&[&x], 5);
+/// assert!(filter.len() > 1 && power > 0.0);
+/// ```
+#[must_use]
+#[allow(clippy::cast_precision_loss)]
+pub fn coloured(series: &[&[f64]], most: usize) -> (Vec<f64>, f64) {
+    let counts: Vec<usize> = series.iter().map(|x| x.iter().filter(|v| !v.is_nan()).count()).collect();
+    let most = most.min(counts.iter().min().copied().unwrap_or(0) / SAMPLES_A_COEFFICIENT);
+    let (mut covariance, pairs) = autocovariances(series, most);
+    let (count, all) = (counts.iter().sum::<usize>() as f64, series.iter().map(|x| x.len()).sum::<usize>() as f64);
+    for (lag, (value, &of)) in covariance.iter_mut().zip(&pairs).enumerate() {
+        // A lag whose pairs are few counts for as little: all lags together remain those of one positive spectrum.
+        let whole = series.iter().map(|x| x.len().saturating_sub(lag)).sum::<usize>() as f64;
+        *value *= if of > 0.0 { (if whole > 0.0 { whole } else { 1.0 }) / all } else { 0.0 };
+    }
+    let (mut best, mut current) = (vec![1.0], vec![1.0]);
+    let mut power = covariance[0];
+    let mut left = power;
+    if power.is_nan() || power <= 0.0 {
+        return (best, 0.0);
+    }
+    let mut least = count * libm::log(power);
+    for order in 1..=most {
+        let reflection =
+            -current.iter().zip(covariance[1..=order].iter().rev()).map(|(a, c)| a * c).sum::<f64>() / power;
+        current.push(0.0);
+        let turned: Vec<f64> = current.iter().rev().copied().collect();
+        current.iter_mut().zip(turned).for_each(|(a, b)| *a += reflection * b);
+        power *= 1.0 - reflection * reflection;
+        if power.is_nan() || power <= 0.0 {
+            break;
+        }
+        let criterion = count * libm::log(power) + order as f64 * libm::log(count);
+        if criterion < least {
+            (least, left) = (criterion, power);
+            best.clone_from(&current);
+        }
+    }
+    (best, left)
+}
+
+/// Autocovariances at lags 0 to `count` − 1 of noise that a filter makes white, of this power then.
+#[must_use]
+pub fn covariances(filter: &[f64], power: f64, count: usize) -> Vec<f64> {
+    // Its spectrum, on a circle so fine that what wraps round has died away.
+    let size = power_above(2 * count + 8 * filter.len()).max(LEAST_CIRCLE);
+    let plan = plan(size);
+    let mut time = filter.to_vec();
+    time.resize(size, 0.0);
+    let (mut spectrum, mut workspace) = (vec![Bin::new(0.0, 0.0); plan.bins()], Workspace::new());
+    plan.forward(&mut time, &mut spectrum, &mut workspace);
+    spectrum.iter_mut().for_each(|bin| *bin = Bin::new(power / bin.norm_sqr(), 0.0));
+    plan.inverse(&mut spectrum, &mut time, &mut workspace);
+    time.truncate(count);
+    time
+}
+
+/// Rows times the matrix of a series' autocovariances, row by row: as a product on a circle that holds them. O(N log N) a
+/// row.
+#[must_use]
+pub fn weighted(rows: &[&[f64]], covariances: &[f64]) -> Vec<Vec<f64>> {
+    let count = covariances.len();
+    let size = power_above(2 * count);
+    let plan = plan(size);
+    let mut time = vec![0.0; size];
+    time[..count].copy_from_slice(covariances);
+    for lag in 1..count {
+        time[size - lag] = covariances[lag];
+    }
+    let (mut circle, mut workspace) = (vec![Bin::new(0.0, 0.0); plan.bins()], Workspace::new());
+    plan.forward(&mut time, &mut circle, &mut workspace);
+    let mut spectrum = circle.clone();
+    rows.iter()
+        .map(|row| {
+            time[..count].copy_from_slice(row);
+            time[count..].fill(0.0);
+            plan.forward(&mut time, &mut spectrum, &mut workspace);
+            // The spectrum of what is even is real.
+            spectrum.iter_mut().zip(&circle).for_each(|(bin, of)| *bin *= of.re);
+            plan.inverse(&mut spectrum, &mut time, &mut workspace);
+            time[..count].to_vec()
+        })
+        .collect()
+}
+
+/// The least power of two above a number.
+fn power_above(number: usize) -> usize {
+    1 << (usize::BITS - number.leading_zeros())
+}
