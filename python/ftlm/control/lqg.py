@@ -453,8 +453,8 @@ def lqg(
     measured, noise, rate, band, poles, coupling, sensor
         See :func:`observer`.
     process_noise
-        Process noise intensity: change of an input disturbance in a second; default a fifth of `max_input`. Larger values
-        give a faster observer and more noise in the command.
+        Process noise intensity: change of an input disturbance in a second; default a fifth of `max_input`. Larger
+        values give a faster observer and more noise in the command.
     limit
         Largest command.
     samples, seed

@@ -438,9 +438,9 @@ def _claims_of_tables(found: ReproductionData) -> list[Claim]:
                 f"{symbol(o)} " + ", ".join(f"{c} {min(q):.3g} to {max(q):.3g}" for c, q in t.ratios.items())
                 for o, t in tables.items()
             )
-            + f". A case holds where all are within a factor of {MAX_COEFFICIENT_RATIO:g}. Computed with the arm of whole "
-            "orders and friction, every angle scaled to the deviation that RMSE / NR implies, at the printed orders; errors "
-            f"are those of the equation, and K0 differ by a factor of {max(priors) / min(priors):.3g}.",
+            + f". A case holds where all are within a factor of {MAX_COEFFICIENT_RATIO:g}. Computed with the arm of "
+            "whole orders and friction, every angle scaled to the deviation that RMSE / NR implies, at the printed orders; "
+            f"errors are those of the equation, and K0 differ by a factor of {max(priors) / min(priors):.3g}.",
         ),
         Claim(
             "The printed orders are the best ones, by any error.",

@@ -83,7 +83,7 @@ impl Answering {
         Ok(match question {
             Question::Experiments(Sampling { every, decimation, first }) => {
                 let given: List<ExperimentArg<'_>> =
-                    self.runs.call_method1(py, "sampled", (every, decimation, first))?.extract(py)?;
+                    self.runs.call_method1(py, "sample", (every, decimation, first))?.extract(py)?;
                 Answer::Experiments(given.iter().map(experiment).collect::<PyResult<_>>()?)
             }
             Question::Records(m, inputs) => {
