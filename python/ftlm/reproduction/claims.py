@@ -439,8 +439,8 @@ def _claims_of_tables(found: ReproductionData) -> list[Claim]:
                 for o, t in tables.items()
             )
             + f". A case holds where all are within a factor of {MAX_COEFFICIENT_RATIO:g}. Computed with the arm of "
-            "whole orders and friction, every angle scaled to the deviation that RMSE / NR implies, at the printed orders; "
-            f"errors are those of the equation, and K0 differ by a factor of {max(priors) / min(priors):.3g}.",
+            "whole orders and friction, every angle scaled to the deviation that RMSE / NR implies, at the printed "
+            f"orders; errors are those of the equation, and K0 differ by a factor of {max(priors) / min(priors):.3g}.",
         ),
         Claim(
             "The printed orders are the best ones, by any error.",
