@@ -177,7 +177,7 @@ def two(seeds: int) -> None:
 def coupled_measured() -> None:
     """Hub and link of the real arm from the current alone, with friction and without, fitted on one unit."""
     runs = {
-        "psf": run_of(DATA / "two_link_psf" / "psf.csv", "Im1_meas_A", name="psf", slice=(1.1, 19.5)),
+        "psf": run_of(DATA / "two_link_psf" / "psf.csv", "Im1_meas_A", name="psf", window=(1.1, 19.5)),
         "lqr": run_of(DATA / "two_link_lqr" / "lqr.csv", "Im1_meas_A", name="lqr"),
     }
     whole = {"alpha1": 2.0, "gamma1": 1.0, "beta2": 0.0, "mu2": 1.0}
@@ -229,7 +229,7 @@ def run_of(path: Path, current: str, *, name: str, **options: Any) -> ftlm.Run:
 def measured() -> None:
     """Hubs of the real arm, from the current and the measured deflection."""
     runs = {
-        "psf": run_of(DATA / "two_link_psf" / "psf.csv", "Im1_meas_A", name="psf", slice=(1.1, 19.5)),
+        "psf": run_of(DATA / "two_link_psf" / "psf.csv", "Im1_meas_A", name="psf", window=(1.1, 19.5)),
         "lqr": run_of(DATA / "two_link_lqr" / "lqr.csv", "Im1_meas_A", name="lqr"),
     }
     for words in ("", RUBS):
@@ -250,7 +250,7 @@ def measured() -> None:
 def measured_stribeck() -> None:
     """The same hubs with friction that falls with speed, beside friction that does not."""
     runs = {
-        "psf": run_of(DATA / "two_link_psf" / "psf.csv", "Im1_meas_A", name="psf", slice=(1.1, 19.5)),
+        "psf": run_of(DATA / "two_link_psf" / "psf.csv", "Im1_meas_A", name="psf", window=(1.1, 19.5)),
         "lqr": run_of(DATA / "two_link_lqr" / "lqr.csv", "Im1_meas_A", name="lqr"),
     }
     for words in (RUBS, RUBS + FALLS):

@@ -32,9 +32,9 @@ TIP = "theta11 + theta12"
 WHOLE = {"alpha1": 2.0, "alpha2": 2.0, "beta2": 0.0, "mu2": 1.0, "gamma1": 1.0}
 #: Deviations as dear as 1 A, how fast what is not modelled may walk, and the noise of encoder and gauge [rad].
 WEIGHTS = {
-    "allowed": {"theta11": 0.02, "theta12": 0.02},
-    "effort": 1.0,
-    "drift": 0.5,
+    "max_deviation": {"theta11": 0.02, "theta12": 0.02},
+    "max_input": 1.0,
+    "process_noise": 0.5,
     "noise": {"theta11": 3e-4, "theta12": 2e-4},
 }
 #: Of the model's numbers, over which designs are judged.
@@ -140,7 +140,7 @@ def contenders(seed):
     run = moves.own_run(seed)
     models = {kind: identified(run, structure) for kind, structure in structures().items() if kind != "integer"}
     fractional, whole = models["fractional"], models["integer, no law"]
-    calm = {**WEIGHTS, "allowed": {"theta11": 0.2, "theta12": 0.2}}
+    calm = {**WEIGHTS, "max_deviation": {"theta11": 0.2, "theta12": 0.2}}
     slow = control.fractional_pid(fractional, output="theta11", input="I1", crossover=moves.SLOW, samples=SAMPLES)
     return fractional, {
         "fractional PID, 40 rad/s": designed("pid", fractional, SAMPLES)[0],

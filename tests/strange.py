@@ -123,7 +123,7 @@ def recipes():
         "rate": 500.0,
         "seed": 0,
         "parameters": "effective",
-        "paced": False,
+        "real_time": False,
         "watchdog": 0.1,
         "arm": False,
         "name": "control",
@@ -140,11 +140,11 @@ def recipes():
         "coupling": "simulated",
         "sensor": False,
     }
-    quick = watching | {"allowed": {"hub": 0.02}, "effort": 1.0}
+    quick = watching | {"max_deviation": {"hub": 0.02}, "max_input": 1.0}
     return {
         "input_shaper": (
             control.input_shaper,
-            {"model": link, "kind": "zv", "modes_shaped": 1, "coupling": "measured"},
+            {"model": link, "kind": "zv", "modes": 1, "coupling": "measured"},
         ),
         "input_shaper of a pole": (control.input_shaper, {"model": POLE, "kind": "zvd"}),
         "Shaper.filter": (shaper.filter, {"reference": np.ones(50), "rate": 500.0}),
@@ -163,15 +163,15 @@ def recipes():
                 "coupling": "simulated",
             },
         ),
-        "observer": (control.observer, watching | {"drift": 0.2}),
+        "observer": (control.observer, watching | {"process_noise": 0.2}),
         "lqg": (
             control.lqg,
             watching
             | {
-                "allowed": {"hub": 0.02, "hub + bend": 0.02},
-                "effort": 1.0,
+                "max_deviation": {"hub": 0.02, "hub + bend": 0.02},
+                "max_input": 1.0,
                 "output": "hub",
-                "drift": None,
+                "process_noise": None,
                 "limit": 5.0,
                 "samples": 2,
                 "seed": 0,

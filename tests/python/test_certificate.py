@@ -50,7 +50,7 @@ def rmse(run, equation, alpha, beta):
 def test_no_search_between_the_values_of_the_lattice_does_better(run, equation, proved):
     assert proved.open == 0
     assert 0.95 * proved.best * (1 - 1e-6) <= proved.at_least <= proved.best
-    assert proved.within <= 0.05 + 1e-6
+    assert proved.tolerance <= 0.05 + 1e-6
     assert rmse(run, equation, *proved.orders.values()) == pytest.approx(proved.best, rel=1e-6)
     fine: dict = {"alpha": "1.3:1.798:0.003", "beta": "0.5:0.899:0.003"}
     found = ftlm.search_orders(
@@ -73,11 +73,11 @@ def test_the_best_may_stand_on_an_edge(run, equation):
     edge = ftlm.order_grid(increment=0.1, alpha=(1.3, 1.5), beta=(0.85, 0.9))
     found = ftlm.certify_orders(run, equation, edge, tolerance=0.05, m=128)
     assert found.orders["alpha"] in (1.3, 1.5) or found.orders["beta"] in (0.85, 0.9)
-    lattice = ftlm.search_orders(
+    order_grid = ftlm.search_orders(
         run, equation, edge, criterion="equation-error", norm="l2", coefficients="least-squares", m=128
     )
-    assert found.lower_bound <= lattice.score
-    assert found.best <= lattice.score * (1 + 1e-9)
+    assert found.lower_bound <= order_grid.score
+    assert found.best <= order_grid.score * (1 + 1e-9)
     # Cells that an interval only touches have bounds of their own.
     assert found.open_cells == 0
     assert found.proved_tolerance <= 0.05 + 1e-6
@@ -96,11 +96,11 @@ def test_it_says_in_words_what_is_proved_and_what_is_not(run, equation, proved):
     assert "on a lattice or between" in text
     assert f"{proved.cells} boxes" in text
     assert "asked" not in text
-    cut = ftlm.certify_orders(run, equation, LATTICE, tolerance=0.05, m=128, max_cells=proved.cells - 1)
+    cut = ftlm.certify_orders(run, equation, LATTICE, tolerance=0.05, m=128, max_cells=proved.max_cells - 1)
     assert cut.open_cells > 0
     assert "was asked for" in str(cut) or "nothing is proved" in str(cut)
     nothing = replace(proved, at_least=0.0, open=7)
-    assert nothing.within == 1
+    assert nothing.tolerance == 1
     assert "nothing is proved" in str(nothing)
     document = json.loads(json.dumps(proved.to_dict()))
     assert document["at_least"] == proved.at_least
@@ -119,24 +119,24 @@ def test_it_says_in_words_what_is_proved_and_what_is_not(run, equation, proved):
     ("words", "options", "said"),
     [
         ("D^alpha y = a D^beta y + 3 u", {}, "known coefficients, and 1 of the terms of y"),
-        (WORDS, {"within": 0}, "within=0"),
-        (WORDS, {"within": "much"}, "within"),
-        (WORDS, {"within": float("nan")}, "within"),
-        (WORDS, {"apart": 0.0}, "apart = 0"),
-        (WORDS, {"apart": -1}, "apart = -1"),
-        (WORDS, {"cells": 0}, "cells = 0"),
-        (WORDS, {"cells": 1.5}, "cells = 1.5"),
-        (WORDS, {"cells": 2}, "allow more"),
-        (WORDS, {"largest": 0.1}, "largest"),
-        (WORDS, {"lattice": "fine"}, "lattice"),
+        (WORDS, {"tolerance": 0}, "within=0"),
+        (WORDS, {"tolerance": "much"}, "tolerance"),
+        (WORDS, {"tolerance": float("nan")}, "tolerance"),
+        (WORDS, {"min_separation": 0.0}, "apart = 0"),
+        (WORDS, {"min_separation": -1}, "apart = -1"),
+        (WORDS, {"max_cells": 0}, "cells = 0"),
+        (WORDS, {"max_cells": 1.5}, "cells = 1.5"),
+        (WORDS, {"max_cells": 2}, "allow more"),
+        (WORDS, {"max_term_ratio": 0.1}, "max_term_ratio"),
+        (WORDS, {"order_grid": "fine"}, "order_grid"),
         (WORDS, {"threads": 0}, "threads"),
-        (WORDS, {"lattice": ftlm.order_grid(alpha=(0.5, 0.6), beta=(0.58, 0.7))}, "no orders in these intervals"),
+        (WORDS, {"order_grid": ftlm.order_grid(alpha=(0.5, 0.6), beta=(0.58, 0.7))}, "no orders in these intervals"),
     ],
 )
 def test_what_cannot_be_had_is_said(run, words, options, said):
-    given = {"lattice": LATTICE, "m": 128} | options
-    if "3 u" in words and "lattice" not in options:
-        given["lattice"] = ftlm.order_grid(increment=0.1)
+    given = {"order_grid": LATTICE, "m": 128} | options
+    if "3 u" in words and "order_grid" not in options:
+        given["order_grid"] = ftlm.order_grid(increment=0.1)
     with pytest.raises(ModelError, match=said):
         ftlm.certify_orders(run, ftlm.equation(words, initial="rest"), **given)
 

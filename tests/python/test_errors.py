@@ -34,8 +34,8 @@ def identify(runs=None, words="D^1.5 y = a y + b u", **options):
     return ftlm.identify(run() if runs is None else runs, ftlm.equation(words), **{"method": "least-squares"} | options)
 
 
-def search(runs=None, words=WORDS, lattice=None, **options):
-    chosen = ftlm.order_grid(increment=0.5) if lattice is None else lattice
+def search(runs=None, words=WORDS, order_grid=None, **options):
+    chosen = ftlm.order_grid(increment=0.5) if order_grid is None else order_grid
     return ftlm.search_orders(run() if runs is None else runs, ftlm.equation(words), chosen, **{"m": 64} | options)
 
 
@@ -85,23 +85,25 @@ BAD = {
     "lattice of zero": (
         MODEL,
         "the lattice holds no candidate",
-        lambda: search(lattice=ftlm.order_grid(alpha=(0.5, 0.6), beta=[1.0, 2.0])),
+        lambda: search(order_grid=ftlm.order_grid(alpha=(0.5, 0.6), beta=[1.0, 2.0])),
     ),
     "lattice of 10^9": (
         MODEL,
         "more than the limit of",
-        lambda: search(words="D^alpha y = a D^b y + c D^e y + d D^f y + u", lattice=ftlm.order_grid(increment=0.001)),
+        lambda: search(
+            words="D^alpha y = a D^b y + c D^e y + d D^f y + u", order_grid=ftlm.order_grid(increment=0.001)
+        ),
     ),
     "lattice with a step of 0": (MODEL, "order alpha: step 0 is not positive", lambda: ftlm.order_grid(increment=0)),
     "lattice of an unknown order": (
         MODEL,
         "lattice order 'betta' is no free order; free are alpha, beta",
-        lambda: search(lattice=ftlm.order_grid(betta=1.0)),
+        lambda: search(order_grid=ftlm.order_grid(betta=1.0)),
     ),
     "lattice upside down": (
         MODEL,
         "order beta: interval 1:0 is empty",
-        lambda: search(lattice=ftlm.order_grid(beta=(1, 0))),
+        lambda: search(order_grid=ftlm.order_grid(beta=(1, 0))),
     ),
     "lattice of a million steps": (MODEL, "order alpha: 1.05:2:1e-09", lambda: ftlm.order_grid(increment=1e-9)),
     "nothing to search": (MODEL, "every order is a number", lambda: search(words="D^1.5 y = a y + b u")),
@@ -131,7 +133,7 @@ BAD = {
     ),
     # Settings
     "threads of 0": (MODEL, "threads = 0 is outside [1, 1024]", lambda: search(threads=0)),
-    "keep of 0": (MODEL, "keep = 0 is outside [1, 100000]", lambda: search(keep=0)),
+    "keep of 0": (MODEL, "top = 0 is outside [1, 100000]", lambda: search(top=0)),
     "p of 0": (MODEL, "innovation length p = 0", lambda: identify(method="multi-innovation", innovation_length=0)),
     "K0 of 0": (
         MODEL,
@@ -142,7 +144,7 @@ BAD = {
     "unknown method": (MODEL, "method = 'lsq' is not known", lambda: identify(method="lsq")),
     "unknown criterion": (MODEL, "criterion = 'rmse' is not known", lambda: search(criterion="rmse")),
     "unknown norm": (MODEL, "norm = 'linf' is not known", lambda: search(norm="linf")),
-    "unknown rows": (MODEL, "rows = 'fast' is not known", lambda: search(rows="fast")),
+    "unknown rows": (MODEL, "row_basis = 'fast' is not known", lambda: search(row_basis="fast")),
     "unknown coefficients": (MODEL, "coefficients = 'free' is not known", lambda: search(coefficients="free")),
     "unknown coupling": (
         MODEL,

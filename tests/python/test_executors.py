@@ -25,10 +25,10 @@ def run(small_run, with_noise):
     return with_noise(small_run, 0.003, 1)
 
 
-def search(run, executor=None, *, lattice=None, **options):
-    options = {"m": 32, "early_stopping": False, **options}
+def search(run, executor=None, *, order_grid=None, **options):
+    options = {"m": 32, "pruning": False, **options}
     equation = ftlm.equation(EQUATION, initial="rest")
-    return ftlm.search_orders(run, equation, lattice or ftlm.order_grid(increment=0.1), executor=executor, **options)
+    return ftlm.search_orders(run, equation, order_grid or ftlm.order_grid(increment=0.1), executor=executor, **options)
 
 
 def bytes_of(found):
@@ -87,10 +87,10 @@ def test_threads_give_the_same_bytes(run, expected):
 @pytest.mark.parametrize(
     "options",
     [
-        {"early_stopping": True},
-        {"early_stopping": True, "criterion": "equation-error", "norm": "l2", "rows": "time"},
-        {"coefficients": "least-squares", "norm": "l2", "keep": 3},
-        {"early_stopping": True, "coefficients": "instrumental-variables", "lattice": ftlm.order_grid(increment=0.2)},
+        {"pruning": True},
+        {"pruning": True, "criterion": "equation-error", "norm": "l2", "row_basis": "time"},
+        {"coefficients": "least-squares", "norm": "l2", "top": 3},
+        {"pruning": True, "coefficients": "instrumental-variables", "order_grid": ftlm.order_grid(increment=0.2)},
     ],
 )
 def test_every_kind_of_search_gives_the_same_bytes(run, options):
@@ -170,7 +170,7 @@ def test_an_error_of_the_search_is_the_one_of_one_machine(run):
         for here in (None, pool):
             with pytest.raises(ModelError, match=r"order 0\.7 of u is above alpha = 0\.5"):
                 search(
-                    run, here, lattice=ftlm.OrderGrid(orders={"alpha": [0.5], "nu": [0.7], "beta": [0.1], "mu": [0]})
+                    run, here, order_grid=ftlm.OrderGrid(orders={"alpha": [0.5], "nu": [0.7], "beta": [0.1], "mu": [0]})
                 )
 
 
@@ -191,9 +191,9 @@ def stage_run(plant, drive, with_noise):
 
 
 def search_stage(run, executor=None, **options):
-    lattice = ftlm.OrderGrid(increment=0.1, orders={"alpha": (1.8, 2.0)})
-    options = {"m": 64, "keep": 8, "coefficients": "least-squares", **options}
-    return ftlm.search_orders(run, ftlm.flexible_link(form="published"), lattice, executor=executor, **options)
+    order_grid = ftlm.OrderGrid(increment=0.1, orders={"alpha": (1.8, 2.0)})
+    options = {"m": 64, "top": 8, "coefficients": "least-squares", **options}
+    return ftlm.search_orders(run, ftlm.flexible_link(form="published"), order_grid, executor=executor, **options)
 
 
 @pytest.fixture(scope="module")
@@ -226,9 +226,9 @@ def test_an_identification_by_the_lattice_shares_its_searches_out(stage_run, law
     structure = ftlm.flexible_link(form="published", laws=laws, coupling="measured")
     options = {
         "method": "least-squares",
-        "lattice": ftlm.OrderGrid(increment=0.3, alpha=(1.8, 2.0)),
+        "order_grid": ftlm.OrderGrid(increment=0.3, alpha=(1.8, 2.0)),
         "m": 64,
-        "keep": 5,
+        "top": 5,
     }
     with ThreadPoolExecutor(2) as pool:
         found = ftlm.identify(stage_run, structure, executor=pool, **options)
@@ -295,7 +295,7 @@ def test_a_cluster_gives_the_same_bytes_of_a_stage(stage_run, stage_expected, tm
 
 @pytest.mark.slow
 def test_ten_million_candidates_on_a_cluster_that_loses_a_worker(run, tmp_path):
-    options = {"lattice": ftlm.order_grid(increment=0.0205), "m": 256, "early_stopping": True}
+    options = {"order_grid": ftlm.order_grid(increment=0.0205), "m": 256, "pruning": True}
     began = time.monotonic()
     whole = search(run, **options, threads=2)
     alone = time.monotonic() - began

@@ -287,7 +287,7 @@ BAD_CALLS = {
     "columns table": ({"columns": {"inputs": 3, "outputs": ["y"]}}, ["inputs=", "int"]),
     "columns units": ({"columns": {"units": "deg", "outputs": ["y"]}}, ["units=", "str"]),
     "columns missing": ({"columns": "no_such.toml"}, ["no_such.toml", "does not exist"]),
-    "slice": ({**HEADED, "slice": (0, 99)}, ["slice", "99"]),
+    "window": ({**HEADED, "window": (0, 99)}, ["window", "99"]),
     "name": ({**HEADED, "name": "@x"}, ["name='@x'"]),
 }
 

@@ -384,6 +384,6 @@ def test_hints_are_kept_by_what_changes_a_structure_and_stand_in_no_file_text_or
     assert fixed.hints.order_names_by_coefficient["a1"] == "beta1"
     assert replace(structure, hints=UNSET) == structure
     assert "hints" not in repr(structure) + str(structure)
-    job = make_job([clean_a], structure.equation("theta11"), ftlm.order_grid(increment=0.5), m=64, rows="time")
+    job = make_job([clean_a], structure.equation("theta11"), ftlm.order_grid(increment=0.5), m=64, row_basis="time")
     assert b"hints" not in msgspec.msgpack.encode(job.request("theta11"))
     assert set(structure.equation("theta11").order_names) == {"alpha1", "beta1", "gamma1", "mu1"}

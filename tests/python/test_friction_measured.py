@@ -30,7 +30,7 @@ def run_of(path: str, current: str, *, clip: float = np.inf, **options) -> ftlm.
 
 @pytest.mark.parametrize(
     ("path", "options", "least"),
-    [("two_link_psf/psf.csv", {"slice": (1.1, 19.5)}, 98.0), ("two_link_lqr/lqr.csv", {}, 99.0)],
+    [("two_link_psf/psf.csv", {"window": (1.1, 19.5)}, 98.0), ("two_link_lqr/lqr.csv", {}, 99.0)],
 )
 def test_a_hub_with_friction_follows_its_current(path: str, options, least: float) -> None:
     run = run_of(path, "Im1_meas_A", **options)

@@ -108,7 +108,7 @@ def test_a_store_is_written_as_it_was_then(folder, tmp_path, monkeypatch, name):
     else:
         structure = ftlm.equation("D^alpha y = a D^beta y + c D^mu y + b u", initial="rest")
         lattice = ftlm.order_grid(increment=0.05, beta=(0.0, 1.0), mu=(0.0, 1.0))
-        options = {"m": 32, "early_stopping": False, "threads": 1, "keep": 5, "store": path}
+        options = {"m": 32, "pruning": False, "threads": 1, "top": 5, "store": path}
         ftlm.search_orders(run, structure, lattice, **options)
     now, then = payloads(path), payloads(folder / f"{name}.ftlm")
     assert (now[0].pop("version"), then[0].pop("version")) == (ftlm.__version__, folder.name)

@@ -39,7 +39,7 @@ def sine():
 def identified(runs, method, **orders):
     structure = ftlm.equation(WORDS, orders=orders)
     searched = method != "output-error" and structure.order_names
-    options = {"lattice": ftlm.order_grid(increment=0.2)} if searched else {}
+    options = {"order_grid": ftlm.order_grid(increment=0.2)} if searched else {}
     return ftlm.identify(runs, structure, method=method, threads=1, **options)
 
 

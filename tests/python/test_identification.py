@@ -155,8 +155,8 @@ def test_known_coefficients_stay_what_they_are(small_run):
 
 def test_orders_of_one_equation_are_searched(small_run):
     words = ftlm.equation("D^alpha y = a D^nu y + c y + b u")
-    lattice = ftlm.order_grid(increment=0.2, alpha=(1.2, 2.0))
-    found = ftlm.identify(small_run, words, method="least-squares", order_grid=lattice, m=512)
+    order_grid = ftlm.order_grid(increment=0.2, alpha=(1.2, 2.0))
+    found = ftlm.identify(small_run, words, method="least-squares", order_grid=order_grid, m=512)
     assert found.orders == {"alpha": 1.6, "nu": 0.6}
     assert found.coefficients == {n: pytest.approx(v, rel=2e-3) for n, v in TRUTH.items()}
     (search,) = found.searches.values()
@@ -172,8 +172,8 @@ def test_orders_of_one_equation_are_searched(small_run):
 @pytest.mark.parametrize("norm", ["l1", "l2"])
 def test_search_settings_are_handed_on(small_run, criterion, norm):
     words = ftlm.equation("D^alpha y = a D^nu y + c y + b u")
-    options = {"criterion": criterion, "norm": norm, "keep": 3, "threads": 1, "m": 128}
-    lattice = ftlm.order_grid(increment=0.2, alpha=(1.2, 2.0))
+    options = {"criterion": criterion, "norm": norm, "top": 3, "threads": 1, "m": 128}
+    order_grid = ftlm.order_grid(increment=0.2, alpha=(1.2, 2.0))
     told = []
     found = ftlm.identify(
         small_run,
@@ -181,14 +181,14 @@ def test_search_settings_are_handed_on(small_run, criterion, norm):
         method="multi-innovation",
         innovation_length=3,
         prior_covariance=50.0,
-        order_grid=lattice,
+        order_grid=order_grid,
         progress=lambda done, total: told.append((done, total)),
         **options,
     )
     same = ftlm.search_orders(
         small_run,
         words,
-        lattice,
+        order_grid,
         coefficients="multi-innovation",
         innovation_length=3,
         prior_covariance=50.0,
@@ -201,7 +201,7 @@ def test_search_settings_are_handed_on(small_run, criterion, norm):
 
 def test_equations_without_a_law_are_searched_one_by_one(clean_a):
     structure = ftlm.flexible_link(form="published", laws=(), coupling="measured")
-    lattice = ftlm.OrderGrid(
+    order_grid = ftlm.OrderGrid(
         orders={
             "alpha1": [1.95, 2.0],
             "beta1": [0.75],
@@ -213,7 +213,7 @@ def test_equations_without_a_law_are_searched_one_by_one(clean_a):
             "mu2": [0.1],
         }
     )
-    found = ftlm.identify(clean_a, structure, method="least-squares", order_grid=lattice)
+    found = ftlm.identify(clean_a, structure, method="least-squares", order_grid=order_grid)
     assert list(found.searches) == ["theta11", "theta12"]
     assert [s.candidates for s in found.searches.values()] == [4, 4]
     assert found.orders == {
@@ -233,13 +233,13 @@ def test_equations_without_a_law_are_searched_one_by_one(clean_a):
             clean_a,
             half,
             method="least-squares",
-            order_grid=replace(lattice, orders={n: v for n, v in lattice.orders.items() if n.endswith("2")}),
+            order_grid=replace(order_grid, orders={n: v for n, v in order_grid.orders.items() if n.endswith("2")}),
         ).searches
     ) == ["theta12"]
 
 
 def test_law_search_recovers_the_five_free_orders_of_plant_a(clean_a, plants):
-    lattice = ftlm.OrderGrid(
+    order_grid = ftlm.OrderGrid(
         increment=0.05,
         orders={
             "alpha1": (1.9, 2.0),
@@ -249,7 +249,7 @@ def test_law_search_recovers_the_five_free_orders_of_plant_a(clean_a, plants):
             "mu2": (0.75, 0.95),
         },
     )
-    found = ftlm.identify(clean_a, ftlm.flexible_link(form="published"), method="least-squares", order_grid=lattice)
+    found = ftlm.identify(clean_a, ftlm.flexible_link(form="published"), method="least-squares", order_grid=order_grid)
     assert found.orders == plants["A"]["free_orders"]
     assert list(found.searches) == ["stage"]
     assert found.searches["stage"].candidates > 300
@@ -270,8 +270,8 @@ def test_law_search_recovers_the_five_free_orders_of_plant_a(clean_a, plants):
 def test_printed_figures_are_those_of_compare(small_run, second, with_noise, method, initial, tmp_path):
     runs = [with_noise(small_run, 0.01, 1), with_noise(second, 0.02, 2).slice(1.0, None)]
     words = ftlm.equation("D^alpha y = a D^nu y + c y + b u", initial=initial)
-    lattice = ftlm.order_grid(increment=0.2, alpha=(1.4, 1.8))
-    found = ftlm.identify(runs, words, method=method, order_grid=lattice, m=128)
+    order_grid = ftlm.order_grid(increment=0.2, alpha=(1.4, 1.8))
+    found = ftlm.identify(runs, words, method=method, order_grid=order_grid, m=128)
     saved = ftlm.load_model(found.model.save(tmp_path / "model.json"))
     for again in (found.model.compare(runs), ftlm.compare(found.model, runs), saved.compare(runs)):
         assert again.m == 128
@@ -283,7 +283,7 @@ def test_printed_figures_are_those_of_compare(small_run, second, with_noise, met
     if initial == "caputo":
         return  # each run's free run then fits its own initial terms, which a search does not
     if len(found.comparison.initial[0]["y"]) == 0:
-        alone = ftlm.identify(runs[0], words, method=method, order_grid=lattice, m=128)
+        alone = ftlm.identify(runs[0], words, method=method, order_grid=order_grid, m=128)
         # Searches rank by pulse means, as the paper's (45).
         means = compare_means(alone.model, runs[0], m=128)
         assert means.output_error["y"].error == pytest.approx(alone.searches["y"].score, rel=1e-9)
@@ -394,7 +394,7 @@ def test_a_discretisation_that_is_itself_unstable_is_named():
 @pytest.mark.parametrize("rows", ["haar", "time"])
 @pytest.mark.parametrize("p", [1, 7])
 def test_the_last_row_of_a_trace_is_the_closed_form(small_run, structure, p, rows):
-    options = {"innovation_length": p, "prior_covariance": 10.0, "rows": rows, "m": 256}
+    options = {"innovation_length": p, "prior_covariance": 10.0, "row_basis": rows, "m": 256}
     trace = ftlm.multi_innovation_trace(small_run, structure, **options)
     assert trace.innovation_length == p
     assert trace.step.tolist() == list(range(1, 257))
@@ -456,7 +456,7 @@ def test_a_trace_that_diverges_is_infinite_there():
         (WORDS, {"innovation_length": 0}, "innovation length p = 0"),
         (WORDS, {"prior_covariance": 0}, "prior covariance K0 = 0 is not positive"),
         (WORDS, {"m": 300}, "m = 300 is no power of two"),
-        (WORDS, {"rows": "x"}, "rows = 'x' is not known"),
+        (WORDS, {"row_basis": "x"}, "row_basis = 'x' is not known"),
     ],
 )
 def test_traces_of_nothing_are_refused(small_run, words, options, message):
@@ -495,14 +495,14 @@ def test_output_error_is_the_default_and_gives_intervals(small_run, with_noise):
         ({"method": "genetics"}, "method = 'genetics' is not known; use "),
         ({"criterion": "error"}, "criterion = 'error' is not known"),
         ({"norm": "l0"}, "norm = 'l0' is not known"),
-        ({"rows": "columns"}, "rows = 'columns' is not known"),
+        ({"row_basis": "columns"}, "row_basis = 'columns' is not known"),
         ({"innovation_length": 0}, "innovation length p = 0 is no whole number from 1; the paper's is 7"),
         ({"prior_covariance": -1}, "prior covariance K0 = -1 is not positive; a large one is a weak prior"),
-        ({"keep": 0}, "keep = 0 is outside [1, 100000]"),
+        ({"top": 0}, "top = 0 is outside [1, 100000]"),
         ({"threads": 0}, "threads = 0 is outside [1, 1024]"),
         ({"m": 600}, "m = 600 is more than run 'small, simulated' carries: 513 rows are 512 pulses"),
-        ({"lattice": {"alpha": 1}}, "lattice is dict, not a Lattice"),
-        ({"lattice": ftlm.order_grid(beta=0.1)}, "lattice order 'beta' is no free order; free are none"),
+        ({"order_grid": {"alpha": 1}}, "lattice is dict, not a Lattice"),
+        ({"order_grid": ftlm.order_grid(beta=0.1)}, "lattice order 'beta' is no free order; free are none"),
     ],
 )
 @pytest.mark.parametrize("method", ["output-error", *METHODS])
@@ -539,11 +539,13 @@ def test_regressors_that_cannot_be_told_apart_are_refused(small_run):
 def test_arguments_are_never_changed(small_run, structure):
     before = {n: small_run[n].copy() for n in small_run.signals}
     words = str(structure)
-    lattice = ftlm.order_grid(increment=0.4, alpha=(1.2, 2.0))
-    ftlm.identify(small_run, ftlm.equation("D^alpha y = a y + b u"), method="least-squares", order_grid=lattice, m=64)
+    order_grid = ftlm.order_grid(increment=0.4, alpha=(1.2, 2.0))
+    ftlm.identify(
+        small_run, ftlm.equation("D^alpha y = a y + b u"), method="least-squares", order_grid=order_grid, m=64
+    )
     assert all(np.array_equal(small_run[n], before[n]) for n in before)
     assert str(structure) == words
-    assert lattice == ftlm.order_grid(increment=0.4, alpha=(1.2, 2.0))
+    assert order_grid == ftlm.order_grid(increment=0.4, alpha=(1.2, 2.0))
 
 
 def test_the_record_that_is_estimated_on_is_that_of_the_core(small_run, structure):

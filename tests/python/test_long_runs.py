@@ -127,8 +127,8 @@ def test_what_is_left_is_told(words, monkeypatch):
     monkeypatch.setattr(long, "LONG_RECORD_INTERVALS", 1000)
     model, run = ftlm.Model(ftlm.equation(words)), record(2001, u=switched(2001, every=7))
     fine = simulate_refined(model, run, None, tolerance=1e-9, max_m=1 << 18)
-    for largest_m in (1 << 13, 1 << 14, 1 << 15):
-        found = simulate_refined(model, run, None, tolerance=1e-9, max_m=largest_m)
+    for max_m in (1 << 13, 1 << 14, 1 << 15):
+        found = simulate_refined(model, run, None, tolerance=1e-9, max_m=max_m)
         assert error(found.outputs, fine.outputs) <= 2.5 * (float(found.change[0]) + float(fine.change[0])) + 1e-12
 
 

@@ -112,7 +112,7 @@ CASES = {
     "one equation": (ONE, {"coefficients": "least-squares"}),
     "by recursion": (ONE, {"coefficients": "multi-innovation"}),
     "by instruments": (ONE, {"coefficients": "instrumental-variables"}),
-    "brute force": (ONE, {"coefficients": "least-squares", "early_stopping": False}),
+    "brute force": (ONE, {"coefficients": "least-squares", "pruning": False}),
 }
 
 

@@ -437,7 +437,7 @@ BAD = {
     "long seed": ({"seed": -(10**5000)}, None, "seed = an integer of 16610 bits"),
     "seed": ({"seed": -1}, None, "seed = -1"),
     "period": ({"period": 0.01}, None, "period = 0.01 s is not between"),
-    "like": ({"like": 7}, None, "like is int, not a Run"),
+    "reference_run": ({"reference_run": 7}, None, "like is int, not a Run"),
 }
 
 
@@ -541,14 +541,14 @@ def test_a_rig_takes_what_is_written(tmp_path: Path) -> None:
 
 def test_the_command_says_writes_and_refuses(found: ftlm.Identification, tmp_path: Path) -> None:
     assert found.task is not None
-    model, like, out, picture = (str(tmp_path / n) for n in ("m.json", "first.csv", "next.csv", "next.svg"))
+    model, reference_run, out, picture = (str(tmp_path / n) for n in ("m.json", "first.csv", "next.csv", "next.svg"))
     found.model.save(model)
-    found.task.runs[0].to_csv(like)
+    found.task.runs[0].to_csv(reference_run)
     words = [
         "design-input",
         model,
         "--like",
-        like,
+        reference_run,
         "--limit",
         "y=0.9",
         "--for",

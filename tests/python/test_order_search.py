@@ -130,15 +130,15 @@ def search(runs, **options):
 )
 def test_table_is_that_of_enumeration(run, criterion, norm, coefficients, rows):
     options = {"criterion": criterion, "norm": norm, "coefficients": coefficients}
-    weighted = {"rows": rows} if coefficients == "multi-innovation" else {}
-    found = search(run, keep=10, **options, **weighted)
+    weighted = {"row_basis": rows} if coefficients == "multi-innovation" else {}
+    found = search(run, top=10, **options, **weighted)
     assert len(found.table) == 10
     assert_is_table(found, enumerate_all([Record(run)], rows=rows, **options))
 
 
 @pytest.mark.parametrize(("p", "k0"), [(1, 0.01), (3, 100.0), (200, 1e6)])
 def test_innovation_length_and_prior_are_those_asked_for(run, p, k0):
-    options = {"criterion": "output-error", "norm": "l1", "coefficients": "multi-innovation", "rows": "haar"}
+    options = {"criterion": "output-error", "norm": "l1", "coefficients": "multi-innovation", "row_basis": "haar"}
     found = search(run, innovation_length=p, prior_covariance=k0, **options)
     assert_is_table(found, enumerate_all([Record(run)], p=p, k0=k0, **options))
     assert found.settings["innovation_length"] == p
@@ -150,7 +150,7 @@ def test_innovation_length_and_prior_are_those_asked_for(run, p, k0):
 def test_several_runs_are_one_fit(run, second, norm, coefficients):
     options = {"criterion": "output-error", "norm": norm, "coefficients": coefficients}
     found = search([run, second], **options)
-    assert_is_table(found, enumerate_all([Record(run), Record(second)], rows="haar", **options))
+    assert_is_table(found, enumerate_all([Record(run), Record(second)], row_basis="haar", **options))
     assert found.model.about["runs"] == f"{run.name}, {second.name}"
     assert found.table != search(run, **options).table
 
@@ -160,7 +160,7 @@ def test_initial_terms_belong_to_each_run(run, second):
     options = {"criterion": "output-error", "norm": "l2", "coefficients": "least-squares"}
     structure = ftlm.equation(EQUATION, initial=(0.0, 1.0))
     found = ftlm.search_orders(moved, structure, ftlm.OrderGrid(orders=GRID), m=M, **options)
-    expected = enumerate_all([Record(r) for r in moved], rows="time", exponents=(0.0, 1.0), **options)
+    expected = enumerate_all([Record(r) for r in moved], row_basis="time", exponents=(0.0, 1.0), **options)
     assert_is_table(found, expected, rtol=1e-6)
 
 
@@ -176,14 +176,14 @@ def exactly(found):
 @pytest.mark.parametrize("coefficients", ["least-squares", "multi-innovation"])
 def test_threads_and_early_stopping_change_no_bit_of_the_table(run, second, criterion, coefficients):
     structure = ftlm.equation(EQUATION)
-    lattice = ftlm.order_grid(increment=0.1, alpha=(1.3, 1.9), nu=(0, 0.3))
-    options = {"criterion": criterion, "coefficients": coefficients, "m": 128, "keep": 7}
-    brute = ftlm.search_orders([run, second], structure, lattice, threads=1, pruning=False, **options)
+    order_grid = ftlm.order_grid(increment=0.1, alpha=(1.3, 1.9), nu=(0, 0.3))
+    options = {"criterion": criterion, "coefficients": coefficients, "m": 128, "top": 7}
+    brute = ftlm.search_orders([run, second], structure, order_grid, threads=1, pruning=False, **options)
     assert brute.candidates == sum(n * (n - 1) // 2 * 4 for n in range(13, 20))
     assert brute.exclusion_counts["stopped early"] == 0
     counts = set()
     for threads, stopping in itertools.product((1, 2, 3, 8), (True, False)):
-        found = ftlm.search_orders([run, second], structure, lattice, threads=threads, pruning=stopping, **options)
+        found = ftlm.search_orders([run, second], structure, order_grid, threads=threads, pruning=stopping, **options)
         assert exactly(found) == exactly(brute), (threads, stopping)
         assert sum(found.exclusion_counts.values()) + len(found.table) == found.candidates
         if stopping:
@@ -197,14 +197,14 @@ def test_threads_and_early_stopping_change_no_bit_of_the_table(run, second, crit
 @pytest.mark.parametrize("threads", [1, 2, 3, 8])
 @pytest.mark.parametrize("stopping", [True, False])
 def test_threads_and_early_stopping_change_no_bit_of_a_stage(drive, plant, with_noise, threads, stopping):
-    found = stage_search(drive, plant, with_noise, threads=threads, early_stopping=stopping)
-    alone = stage_search(drive, plant, with_noise, threads=1, early_stopping=False)
+    found = stage_search(drive, plant, with_noise, threads=threads, pruning=stopping)
+    alone = stage_search(drive, plant, with_noise, threads=1, pruning=False)
     assert exactly(found) == exactly(alone)
     assert sum(found.exclusion_counts.values()) + len(found.table) == found.candidates == alone.candidates
 
 
 def test_keeping_more_rows_only_makes_the_table_longer(run):
-    few, many, all_rows = (search(run, keep=keep, coefficients="least-squares") for keep in (1, 10, 1000))
+    few, many, all_rows = (search(run, top=top, coefficients="least-squares") for top in (1, 10, 1000))
     assert exactly(many)[:1] == exactly(few)
     assert exactly(all_rows)[:10] == exactly(many)
     assert len(all_rows.table) == all_rows.candidates == 36
@@ -226,7 +226,7 @@ STAGE = {
 def stage_search(drive, plant, with_noise, **options):
     made = plant("A").simulate(drive("A", samples=601), tolerance=1e-5)
     noisy = with_noise(made, 1e-5, 3)
-    settings = {"coefficients": "least-squares", "m": M, "keep": 12} | options
+    settings = {"coefficients": "least-squares", "m": M, "top": 12} | options
     return ftlm.search_orders(noisy, ftlm.flexible_link(form="published"), ftlm.OrderGrid(orders=STAGE), **settings)
 
 
@@ -292,9 +292,9 @@ def test_failures_under_a_law_are_listed_with_their_reason(run):
     # The same current twice: where the law gives both terms one order they cannot be told apart.
     twice = ftlm.Run.from_arrays(step=run.step, inputs={"u": run["u"], "v": run["u"]}, outputs={"y": run["y"]})
     structure = ftlm.equation("D^alpha y = a D^(alpha-1) y + b u + c D^(alpha-1.5) v", initial="rest")
-    lattice = ftlm.order_grid(increment=0.1, alpha=(1.3, 1.7))
+    order_grid = ftlm.order_grid(increment=0.1, alpha=(1.3, 1.7))
     for threads in (1, 2):
-        found = ftlm.search_orders(twice, structure, lattice, m=M, coefficients="least-squares", threads=threads)
+        found = ftlm.search_orders(twice, structure, order_grid, m=M, coefficients="least-squares", threads=threads)
         assert found.failures == [({"alpha": 1.5}, "singular")]
         assert found.exclusion_counts["singular"] == 1
         assert sum(found.exclusion_counts.values()) + len(found.table) == found.candidates == 5
@@ -306,8 +306,8 @@ def test_an_empty_lattice_names_its_signal(run):
 
 
 def search_empty(run):
-    lattice = ftlm.OrderGrid(orders={"alpha": [0.5], "beta": [1.0], "mu": [1.1]})
-    return ftlm.search_orders(run, ftlm.equation(EQUATION), lattice, m=M)
+    order_grid = ftlm.OrderGrid(orders={"alpha": [0.5], "beta": [1.0], "mu": [1.1]})
+    return ftlm.search_orders(run, ftlm.equation(EQUATION), order_grid, m=M)
 
 
 def test_progress_shows_rate_share_pruned_and_time_left(monkeypatch, run):
@@ -349,8 +349,8 @@ def test_one_equation_under_a_law_is_searched_too(run):
 # What the orders may be
 
 
-def values(lattice, text=EQUATION, **options):
-    return lattice.values(ftlm.equation(text, **options))
+def values(order_grid, text=EQUATION, **options):
+    return order_grid.values(ftlm.equation(text, **options))
 
 
 def test_default_lattice_is_the_papers():
@@ -396,10 +396,10 @@ def test_other_orders_end_at_the_largest_alpha():
 
 def test_candidates_obey_the_ranges_and_are_counted_once(run):
     structure = ftlm.equation("D^alpha y = a D^beta y + c D^mu y + b D^nu u", initial="rest")
-    lattice = ftlm.OrderGrid(
+    order_grid = ftlm.OrderGrid(
         orders={"alpha": [0.5, 1.0], "beta": [0.0, 0.4, 0.5, 0.9, 1.5], "mu": [0.0, 0.4], "nu": [0.7, -0.2, 1.0]}
     )
-    found = ftlm.search_orders(run, structure, lattice, m=M, coefficients="least-squares", top=1000)
+    found = ftlm.search_orders(run, structure, order_grid, m=M, coefficients="least-squares", top=1000)
     expected = set()
     for alpha in (0.5, 1.0):
         for beta, mu, nu in itertools.product((0.0, 0.4, 0.5, 0.9, 1.5), (0.0, 0.4), (0.7, -0.2, 1.0)):
@@ -413,12 +413,12 @@ def test_candidates_obey_the_ranges_and_are_counted_once(run):
 
 def test_fixed_coefficients_make_own_orders_distinguishable(run):
     orders = {"beta": [0.0, 0.6], "mu": [0.0, 0.6]}
-    lattice = ftlm.OrderGrid(orders=orders)
+    order_grid = ftlm.OrderGrid(orders=orders)
     free, tied = (
         ftlm.search_orders(
             run,
             ftlm.equation("D^1.6 y = a D^beta y + c D^mu y + b u", fixed=fixed),
-            lattice,
+            order_grid,
             m=M,
             coefficients="least-squares",
         )
@@ -435,8 +435,8 @@ def test_orders_on_the_edge_of_their_interval_are_named(run):
     structure = ftlm.equation("D^alpha y = a D^beta y + c y + b u", initial="rest")
 
     def edges(**orders):
-        lattice = ftlm.order_grid(increment=0.1, **orders)
-        found = ftlm.search_orders(run, structure, lattice, m=256, coefficients="least-squares")
+        order_grid = ftlm.order_grid(increment=0.1, **orders)
+        found = ftlm.search_orders(run, structure, order_grid, m=256, coefficients="least-squares")
         return found.at_grid_edge, str(found)
 
     assert edges(alpha=(1.4, 1.8), beta=(0.3, 0.9))[0] == {}
@@ -469,14 +469,14 @@ def test_dependent_regressors_are_a_reason_on_the_row(run):
         step=run.step, inputs={"u": run["u"], "v": 2 * run["u"]}, outputs={"y": run["y"]}, name="twice"
     )
     structure = ftlm.equation("D^1.6 y = a D^beta y + c y + b u + d D^nu v", initial="rest")
-    lattice = ftlm.OrderGrid(orders={"beta": [0.4, 0.6], "nu": [0.0, 0.3]})
-    found = ftlm.search_orders(twice, structure, lattice, m=M, coefficients="least-squares")
+    order_grid = ftlm.OrderGrid(orders={"beta": [0.4, 0.6], "nu": [0.0, 0.3]})
+    found = ftlm.search_orders(twice, structure, order_grid, m=M, coefficients="least-squares")
     assert found.candidates == 4
     assert found.exclusion_counts["singular"] == 2
     assert found.failures == [({"beta": b, "nu": 0.0}, "singular") for b in (0.6, 0.4)]
     assert {r.orders["nu"] for r in found.table} == {0.3}
     # A prior tells them apart.
-    assert ftlm.search_orders(twice, structure, lattice, m=M).exclusion_counts["singular"] == 0
+    assert ftlm.search_orders(twice, structure, order_grid, m=M).exclusion_counts["singular"] == 0
     with pytest.raises(ftlm.ModelError, match="none of 2 candidates has a finite score"):
         ftlm.search_orders(
             twice,
@@ -493,8 +493,8 @@ def test_diverging_candidates_are_a_reason_on_the_row():
     u = np.where(np.arange(n) % 80 < 40, 1.0, -1.0)
     growing = ftlm.Run.from_arrays(step=0.1, inputs={"u": u}, outputs={"y": np.cumsum(u)})
     structure = ftlm.equation("D^alpha y = 5 y + b u", initial="rest")
-    lattice = ftlm.OrderGrid(orders={"alpha": [0.8, 1.0, 3.0]})
-    brute = ftlm.search_orders(growing, structure, lattice, m=2000, coefficients="least-squares", pruning=False)
+    order_grid = ftlm.OrderGrid(orders={"alpha": [0.8, 1.0, 3.0]})
+    brute = ftlm.search_orders(growing, structure, order_grid, m=2000, coefficients="least-squares", pruning=False)
     assert brute.exclusion_counts["diverged"] == 2
     assert brute.failures == [({"alpha": 0.8}, "diverged"), ({"alpha": 1.0}, "diverged")]
     assert [r.orders["alpha"] for r in brute.table] == [3.0]
@@ -519,7 +519,7 @@ def test_the_model_is_that_of_the_first_row(run):
 
 
 def test_the_table_prints_and_is_json(run):
-    found = search(run, keep=2, coefficients="least-squares", norm="l2")
+    found = search(run, top=2, coefficients="least-squares", norm="l2")
     head, first, second_row, last = str(found).splitlines()
     assert head.split() == ["rank", "RMSE", "alpha", "beta", "mu", "nu", "a", "c", "b"]
     assert first.split()[0] == "1"
@@ -529,7 +529,7 @@ def test_the_table_prints_and_is_json(run):
     assert document["candidates"] == 36
     assert document["settings"] == {"criterion": "output-error", "norm": "l2", "coefficients": "least-squares"}
     assert document["table"][0]["orders"] == found.orders
-    assert "error" in str(search(run, keep=2, coefficients="least-squares")).splitlines()[0]
+    assert "error" in str(search(run, top=2, coefficients="least-squares")).splitlines()[0]
 
 
 # ----------------------------------------------------------------------------------------------------------------------
@@ -595,7 +595,7 @@ def progress(done, total):
     last[:] = done, total
     print("started", done, total, flush=True)
 try:
-    ftlm.search_orders(run, structure, early_stopping=False, m=4096, coefficients="least-squares", progress=progress)
+    ftlm.search_orders(run, structure, pruning=False, m=4096, coefficients="least-squares", progress=progress)
     print("finished")
 except KeyboardInterrupt:
     print("interrupted", last[0] < last[1])
@@ -643,11 +643,11 @@ def test_control_c_ends_a_search(large):
         ({"norm": "l3"}, "norm = 'l3' is not known in this version; use 'l1' or 'l2'"),
         ({"coefficients": "ridge"}, "coefficients = 'ridge' is not known in this version; use 'multi-innovation' or"),
         ({"coefficients": "genetic"}, "coefficients = 'genetic' is not known in this version"),
-        ({"rows": "fourier"}, "rows = 'fourier' is not known in this version; use 'haar' or 'time'"),
-        ({"keep": 0}, "keep = 0 is outside [1, 100000]"),
-        ({"keep": 100_001}, "keep = 100001 is outside"),
-        ({"keep": 2.5}, "keep = 2.5 is outside"),
-        ({"keep": "all"}, "keep = 'all' is outside"),
+        ({"row_basis": "fourier"}, "row_basis = 'fourier' is not known in this version; use 'haar' or 'time'"),
+        ({"top": 0}, "top = 0 is outside [1, 100000]"),
+        ({"top": 100_001}, "top = 100001 is outside"),
+        ({"top": 2.5}, "top = 2.5 is outside"),
+        ({"top": "all"}, "top = 'all' is outside"),
         ({"threads": 0}, "threads = 0 is outside [1, 1024]"),
         ({"threads": 10_000}, "threads = 10000 is outside [1, 1024]; leave it out to use all cores"),
         ({"threads": 1025}, "threads = 1025 is outside [1, 1024]"),
@@ -661,7 +661,7 @@ def test_control_c_ends_a_search(large):
         ({"prior_covariance": float("nan")}, "prior covariance K0 = nan is not positive"),
         ({"prior_covariance": "weak"}, "prior covariance K0 = 'weak' is not a number"),
         ({"m": 513}, "m = 513 is more than run 'small, simulated"),
-        ({"m": 100}, "m = 100 is no power of two, which Haar rows need; take m = 64 or 128, or rows='time'"),
+        ({"m": 100}, "m = 100 is no power of two, which Haar rows need; take m = 64 or 128, or row_basis='time'"),
         ({"m": 0}, "m = 0 is no number of pulses"),
     ],
 )
@@ -706,7 +706,7 @@ TOO_MANY = "candidates, more than the limit of"
 
 
 @pytest.mark.parametrize(
-    ("text", "lattice", "message"),
+    ("text", "order_grid", "message"),
     [
         (EQUATION, {"orders": {"alpha": [0.5], "beta": [1.0]}}, "the lattice holds no candidate"),
         (EQUATION, {"orders": {"alpha": [0.0]}}, "order alpha = 0 is outside (0, 10]; move the interval of alpha"),
@@ -720,9 +720,9 @@ TOO_MANY = "candidates, more than the limit of"
         ("D^alpha y = a y + b u; D^beta z = c z", {}, "one by one: pass .equation('y') or use identify"),
     ],
 )
-def test_nothing_or_too_much_to_search_is_refused(run, text, lattice, message):
+def test_nothing_or_too_much_to_search_is_refused(run, text, order_grid, message):
     with pytest.raises(ftlm.ModelError) as refused:
-        ftlm.search_orders(run, ftlm.equation(text), ftlm.OrderGrid(**lattice), m=M, threads=1)
+        ftlm.search_orders(run, ftlm.equation(text), ftlm.OrderGrid(**order_grid), m=M, threads=1)
     assert message in str(refused.value)
 
 
@@ -759,7 +759,7 @@ def test_settings_state_what_matters_and_nothing_else():
         "coefficients": "multi-innovation",
         "innovation_length": 7,
         "prior_covariance": 1.0,
-        "rows": "haar",
+        "row_basis": "haar",
     }
     plain = replace(made, coefficients="least-squares")
     assert not plain.needs_haar
@@ -775,22 +775,22 @@ def test_power_means_of_the_oracle_are_those_of_a_power():
 
 
 @pytest.mark.parametrize(("share", "orders"), [(1, 100), (50, 2), (100, 1)])
-@pytest.mark.parametrize("early_stopping", [True, False])
-def test_a_share_of_candidates_that_fail_are_rows_with_a_reason(run, tmp_path, share, orders, early_stopping):
+@pytest.mark.parametrize("pruning", [True, False])
+def test_a_share_of_candidates_that_fail_are_rows_with_a_reason(run, tmp_path, share, orders, pruning):
     """R6: two channels of one current make every candidate singular in which both have one order."""
     twin = ftlm.Run.from_arrays(
         step=run.step, inputs={"u": run["u"], "v": run["u"]}, outputs={"y": run["y"]}, name="twin"
     )
     structure = ftlm.equation("D^1.6 y = a D^0.6 y + b D^nu u + c D^mu v", initial="rest")
-    lattice = ftlm.OrderGrid(orders={"nu": [k / 100 for k in range(orders)], "mu": [0.0]})
-    options = {"coefficients": "least-squares", "m": M, "early_stopping": early_stopping}
+    order_grid = ftlm.OrderGrid(orders={"nu": [k / 100 for k in range(orders)], "mu": [0.0]})
+    options = {"coefficients": "least-squares", "m": M, "pruning": pruning}
     if share == 100:
         for more in ({}, {"store": tmp_path / "s.ftlm"}):
             with pytest.raises(ftlm.ModelError, match="none of 1 candidates has a finite score"):
-                ftlm.search_orders(twin, structure, lattice, **options, **more)
+                ftlm.search_orders(twin, structure, order_grid, **options, **more)
         return
-    found = ftlm.search_orders(twin, structure, lattice, **options)
-    kept = ftlm.search_orders(twin, structure, lattice, **options, store=tmp_path / "s.ftlm")
+    found = ftlm.search_orders(twin, structure, order_grid, **options)
+    kept = ftlm.search_orders(twin, structure, order_grid, **options, store=tmp_path / "s.ftlm")
     assert kept.to_dict() == found.to_dict()
     assert found.candidates == orders
     assert len(found.table) + sum(found.exclusion_counts.values()) == found.candidates
@@ -806,19 +806,19 @@ def test_a_share_of_candidates_that_diverge_are_rows_with_a_reason(tmp_path, sha
     growing = ftlm.Run.from_arrays(step=0.1, inputs={"u": u}, outputs={"y": np.cumsum(u)})
     structure = ftlm.equation("D^alpha y = 5 y + b u", initial="rest")
     diverging = [0.6 + k / 200 for k in range(share)]
-    lattice = ftlm.OrderGrid(orders={"alpha": diverging + [2.0 + k / 100 for k in range(100 - share)]})
-    for early_stopping in (False, True):
-        options = {"m": 2000, "coefficients": "least-squares", "early_stopping": early_stopping}
-        for more in ({}, {"store": tmp_path / f"{early_stopping}.ftlm"}):
+    order_grid = ftlm.OrderGrid(orders={"alpha": diverging + [2.0 + k / 100 for k in range(100 - share)]})
+    for pruning in (False, True):
+        options = {"m": 2000, "coefficients": "least-squares", "pruning": pruning}
+        for more in ({}, {"store": tmp_path / f"{pruning}.ftlm"}):
             if share == 100:
                 with pytest.raises(ftlm.ModelError, match="none of 100 candidates has a finite score"):
-                    ftlm.search_orders(growing, structure, lattice, **options, **more)
+                    ftlm.search_orders(growing, structure, order_grid, **options, **more)
                 continue
-            found = ftlm.search_orders(growing, structure, lattice, **options, **more)
+            found = ftlm.search_orders(growing, structure, order_grid, **options, **more)
             assert len(found.table) + sum(found.exclusion_counts.values()) == found.candidates == 100
             assert all(row.orders["alpha"] >= 2 for row in found.table)
             assert all(reason == "diverged" and orders["alpha"] < 1.27 for orders, reason in found.failures)
-            if not early_stopping:
+            if not pruning:
                 assert found.exclusion_counts["diverged"] == share
                 assert [orders["alpha"] for orders, _ in found.failures] == pytest.approx(diverging)
 
@@ -833,14 +833,14 @@ def test_a_share_of_candidates_that_diverge_are_rows_with_a_reason(tmp_path, sha
         {},
         {"norm": "l2"},
         {"criterion": "equation-error", "norm": "l2", "coefficients": "least-squares"},
-        {"coefficients": "instrumental-variables", "lattice": ftlm.order_grid(increment=0.2)},
-        {"early_stopping": False, "lattice": ftlm.order_grid(increment=0.2)},
+        {"coefficients": "instrumental-variables", "order_grid": ftlm.order_grid(increment=0.2)},
+        {"pruning": False, "order_grid": ftlm.order_grid(increment=0.2)},
     ],
 )
 def test_the_oldest_machine_ranks_as_the_newest(run, with_noise, options):
     """R4: the whole table and all counts, from kernels compiled for the machine at hand and for any."""
     noisy = with_noise(run, 0.003, 1)
-    options = {"lattice": ftlm.order_grid(increment=0.1), "m": 256, "threads": 2, **options}
+    options = {"order_grid": ftlm.order_grid(increment=0.1), "m": 256, "threads": 2, **options}
     words = ftlm.equation("D^alpha y = a D^beta y + c D^mu y + b D^nu u", initial="rest")
     tables = []
     for portable in (False, True):

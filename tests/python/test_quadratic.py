@@ -24,7 +24,7 @@ def model(text):
 
 
 def designed(text=BROKEN, **options):
-    return control.lqg(model(text), **{"allowed": DEAR, "effort": 1.0, "noise": QUIET, **options})
+    return control.lqg(model(text), **{"max_deviation": DEAR, "max_input": 1.0, "noise": QUIET, **options})
 
 
 def by_powers(w):
@@ -218,7 +218,7 @@ def test_the_first_sample_kicks_nothing_and_the_limit_winds_nothing_up():
 
 def test_designs_are_made_over_the_intervals_or_refused_in_words():
     text = "D^2 y = -63 D^0.95 y + 140 I"
-    options = {"allowed": {"y": 0.02}, "effort": 1.0, "noise": {"y": 3e-4}, "samples": 40}
+    options = {"max_deviation": {"y": 0.02}, "max_input": 1.0, "noise": {"y": 3e-4}, "samples": 40}
     good = control.lqg(uncertain(text, {4: 0.01, 2: 3.0}), **options)
     assert len(good.samples) == 40
     assert good.stable_share == 1.0
@@ -261,14 +261,14 @@ def test_a_tip_comes_to_rest_on_the_virtual_arm_without_any_shaper():
 
 
 REFUSED = [
-    ({"allowed": {}}, "allowed = {} is no mapping"),
-    ({"allowed": [0.1]}, "is no mapping"),
-    ({"allowed": {"hub + bent": 0.1}}, "did you mean 'bend'"),
-    ({"allowed": {"hub": 0.0}}, r"allowed\['hub'\] = 0.0 is not a finite number above 0"),
-    ({"allowed": {"bend": 0.01}}, "allow for deviations of every output that integrates"),
-    ({"effort": -1.0}, "effort = -1.0"),
-    ({"effort": "1"}, "effort = '1' is not a number"),
-    ({"drift": math.inf}, "drift = inf"),
+    ({"max_deviation": {}}, "allowed = {} is no mapping"),
+    ({"max_deviation": [0.1]}, "is no mapping"),
+    ({"max_deviation": {"hub + bent": 0.1}}, "did you mean 'bend'"),
+    ({"max_deviation": {"hub": 0.0}}, r"allowed\['hub'\] = 0.0 is not a finite number above 0"),
+    ({"max_deviation": {"bend": 0.01}}, "allow for deviations of every output that integrates"),
+    ({"max_input": -1.0}, "effort = -1.0"),
+    ({"max_input": "1"}, "effort = '1' is not a number"),
+    ({"process_noise": math.inf}, "drift = inf"),
     ({"noise": {"hub": 1e-4}}, "noise of bend is not known"),
     ({"noise": {"hob": 1e-4}}, "did you mean 'hub'"),
     ({"noise": 1e-4}, "noise = 0.0001 is no mapping"),
@@ -280,9 +280,9 @@ REFUSED = [
     ({"noise": {("hub",): 1e-4}}, r"noise of \('hub',\) is of nothing"),
     ({"noise": {"hub": 1e308, "bend": 1e-4}}, "noise of hub = 1e.308 is outside"),
     ({"noise": {"hub": 1e30, "bend": 1e-4}}, "no observer from hub, bend .*; measure more, or narrow the band"),
-    ({"allowed": {"hub": 5e-324}}, "= 5e-324 is outside"),
-    ({"allowed": {7: 0.1}}, "allowed = 7 is not a sum"),
-    ({"allowed": 10**5000}, "allowed = an integer of 16610 bits is no mapping"),
+    ({"max_deviation": {"hub": 5e-324}}, "= 5e-324 is outside"),
+    ({"max_deviation": {7: 0.1}}, "allowed = 7 is not a sum"),
+    ({"max_deviation": 10**5000}, "allowed = an integer of 16610 bits is no mapping"),
     ({"band": (1e-320, 100.0)}, "; use a narrower band"),
     ({"band": (10**5000,)}, "band = a tuple is no pair"),
     ({"measured": ["bend"], "noise": {"bend": 1e-4}}, "no observer from bend"),
@@ -299,7 +299,7 @@ REFUSED = [
     ({"seed": 0.5}, "seed = 0.5"),
     ({"coupling": "loose"}, "coupling = 'loose'"),
     ({"sensor": "yes"}, "sensor = 'yes' is neither"),
-    ({"allowed": {"hub": 1e-5, "bend": 1e-5}, "effort": 10.0}, "no guaranteed margins"),
+    ({"max_deviation": {"hub": 1e-5, "bend": 1e-5}, "max_input": 10.0}, "no guaranteed margins"),
     ({"text": WHOLE.replace("- 30 D hub", "+ 30 D hub")}, "not stable .[12] of its poles"),
     ({"text": "D hub = -hub + sat(I, 0.5)"}, "I passes a saturation"),
     ({"text": "D^2 hub = -hub - D hub - fc*sign(D hub) + I", "fixed": {"fc": 0.1}}, "has friction"),
@@ -309,7 +309,7 @@ REFUSED = [
 @pytest.mark.parametrize("case", range(len(REFUSED)))
 def test_what_is_no_loop_is_refused(case):
     options, words = REFUSED[case]
-    given = {"allowed": DEAR, "effort": 1.0, "noise": QUIET, **options}
+    given = {"max_deviation": DEAR, "max_input": 1.0, "noise": QUIET, **options}
     text, fixed = given.pop("text", WHOLE), given.pop("fixed", {})
     told = ftlm.Model(ftlm.equation(text, coupling="simulated", fixed=fixed))
     with pytest.raises(ftlm.ModelError, match=words):

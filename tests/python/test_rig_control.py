@@ -85,10 +85,10 @@ def test_each_sample_is_answered_at_the_next_and_recorded(bench, tmp_path):
 def test_the_loop_closes_the_same_way_on_both_rigs_and_in_real_time(tmp_path, monkeypatch):
     runs = [run_with(Bench(kind, tmp_path, monkeypatch), proportional) for kind in ("virtual", "q8")]
     borne(monkeypatch)
-    paced = rig.control(proportional, HOLD, parameters="linear", duration=0.4, real_time=True, watchdog=1.0)
+    real_time = rig.control(proportional, HOLD, parameters="linear", duration=0.4, real_time=True, watchdog=1.0)
     for name in ("theta11", "theta12", "I1", "I2"):
         assert np.abs(runs[0][name] - runs[1][name]).max() < 1e-12
-        assert np.array_equal(runs[0][name], paced[name])
+        assert np.array_equal(runs[0][name], real_time[name])
     assert 0.05 < runs[0]["theta11"][-1] < 0.11
 
 
@@ -281,7 +281,7 @@ REFUSED = [
     ({"reference": np.zeros((200, 2)), "rig": 10**5000}, ftlm.ModelError, "rig is a int"),
     ({"reference": np.zeros((200, 2)), "rate": 10**5000}, ftlm.ModelError, "rate = an integer of"),
     ({"reference": np.zeros((200, 2)), "watchdog": "0.1"}, ftlm.ModelError, "watchdog = '0.1' is not a number"),
-    ({"reference": np.zeros((200, 2)), "paced": None}, ftlm.ModelError, "paced = None is neither True nor False"),
+    ({"reference": np.zeros((200, 2)), "real_time": None}, ftlm.ModelError, "paced = None is neither True nor False"),
     ({"reference": np.zeros((200, 2)), "arm": "no"}, ftlm.ModelError, "arm = 'no' is neither True nor False"),
     ({"reference": np.zeros((200, 2)), "progress": 5}, ftlm.ModelError, "progress is a int"),
     ({"reference": np.zeros((200, 2)), "offset": "ab"}, ftlm.ModelError, "offset = 'ab' is not a pair"),

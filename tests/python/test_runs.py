@@ -48,7 +48,7 @@ def pulses(n=N):
 # --- what is refused --------------------------------------------------------------------------------------------------
 
 BAD_ARRAYS = {
-    "nan": ({"inputs": {"u": put(ramp(), [3, 9], np.nan)}}, ["'u'", "NaN", "row 3", "2 in all", "slice="]),
+    "nan": ({"inputs": {"u": put(ramp(), [3, 9], np.nan)}}, ["'u'", "NaN", "row 3", "2 in all", "window="]),
     "infinity": ({"outputs": {"y": put(ramp(), [7], np.inf)}}, ["'y'", "infinity", "row 7", "1 in all"]),
     "minus infinity": ({"outputs": {"y": put(ramp(), [7, 8], -np.inf)}}, ["'y'", "-inf", "row 7", "2 in all"]),
     "1e308": ({"outputs": {"y": put(ramp(), [4, 5, 6], 1e308)}}, ["'y'", "1e+308", "row 4", "3 in all"]),
@@ -114,16 +114,16 @@ BAD_ARRAYS = {
     "intersample unknown": ({"intersample": {"u": "spline"}}, ["'spline'", "'u'", "'foh'"]),
     "intersample of an output": ({"intersample": {"y": "zoh"}}, ["'y'", "not an input"]),
     "time unit without time": ({"time_unit": "ms"}, ["time_unit='ms'"]),
-    "slice not a pair": ({"slice": (1, 2, 3)}, ["slice=(1, 2, 3)", "pair"]),
-    "slice text": ({"slice": ("0", 1)}, ["slice", "'0'"]),
-    "slice nan": ({"slice": (math.nan, 1)}, ["slice", "finite"]),
-    "slice outside": ({"slice": (0.0, 0.6)}, ["slice", "0.6", "out of range", "0.5 s"]),
-    "slice before": ({"slice": (-0.1, 0.3)}, ["slice", "-0.1", "out of range"]),
-    "slice decreasing": ({"slice": (0.3, 0.1)}, ["slice", "do not increase"]),
-    "slice short": ({"slice": (0.1, 0.12)}, ["2 rows in the slice"]),
-    "slice nothing": ({"slice": (0.101, 0.102)}, ["no row lies between"]),
+    "slice not a pair": ({"window": (1, 2, 3)}, ["window=(1, 2, 3)", "pair"]),
+    "slice text": ({"window": ("0", 1)}, ["window", "'0'"]),
+    "slice nan": ({"window": (math.nan, 1)}, ["window", "finite"]),
+    "slice outside": ({"window": (0.0, 0.6)}, ["window", "0.6", "out of range", "0.5 s"]),
+    "slice before": ({"window": (-0.1, 0.3)}, ["window", "-0.1", "out of range"]),
+    "slice decreasing": ({"window": (0.3, 0.1)}, ["window", "do not increase"]),
+    "slice short": ({"window": (0.1, 0.12)}, ["2 rows in the slice"]),
+    "slice nothing": ({"window": (0.101, 0.102)}, ["no row lies between"]),
     "nan in the slice counts from the file": (
-        {"slice": (0.1, 0.3), "inputs": {"u": put(ramp(), [2, 15, 16], np.nan)}},
+        {"window": (0.1, 0.3), "inputs": {"u": put(ramp(), [2, 15, 16], np.nan)}},
         ["'u'", "row 15", "2 in all"],
     ),
     "resample zero": ({"resample": 0.0}, ["resample=0.0"]),
@@ -141,7 +141,7 @@ BAD_TIMES = {
     "constant": (np.zeros(N), ["time", "repeated", "row 1", "49 in all"]),
     "jitter": (grid() + 0.001 * np.sin(np.arange(N)), ["time", "jitter", "%", "resample=STEP"]),
     "one late row": (put(grid(), [20], 0.203), ["time", "jitter", "row 20", "1 in all"]),
-    "gap": (np.concatenate([grid(20), grid(30) + 5.0]), ["time", "gap of 4.81 s", "row 20", "1 in all", "slice="]),
+    "gap": (np.concatenate([grid(20), grid(30) + 5.0]), ["time", "gap of 4.81 s", "row 20", "1 in all", "window="]),
     "dropped rows": (
         np.delete(grid(N + 2), [10, 30]),
         ["time", "gap of 0.02 s", "row 10", "2 in all", "resample=STEP"],
@@ -386,8 +386,8 @@ def test_a_little_jitter_is_taken_as_regular_and_said():
 
 def test_a_gap_can_be_avoided_with_slice():
     times = np.concatenate([grid(20), grid(30) + 5.0])
-    before = make(step=None, time=times, slice=(0, 0.2))
-    after = make(step=None, time=times, slice=(5, None))
+    before = make(step=None, time=times, window=(0, 0.2))
+    after = make(step=None, time=times, window=(5, None))
     assert (before.length, before.start, before.step) == (20, 0.0, 0.01)
     assert (after.length, after.start, after.step) == (30, 5.0, 0.01)
     np.testing.assert_array_equal(after["u"], ramp()[20:])
@@ -395,24 +395,24 @@ def test_a_gap_can_be_avoided_with_slice():
 
 def test_limits_of_a_slice_are_exact_beside_a_gap_of_any_length():
     times = np.concatenate([grid(25), grid(25) + 1e7])
-    assert make(step=None, time=times, slice=(0.05, 0.1)).length == 5
+    assert make(step=None, time=times, window=(0.05, 0.1)).length == 5
     nan = put(grid(), [40], np.nan)
-    assert make(step=None, time=nan, slice=(0, 0.3)).length == 30
+    assert make(step=None, time=nan, window=(0, 0.3)).length == 30
     messages = [
         ((0, 0.5), "NaN, first at row 40, 1 in all"),
         ((0.35, None), "NaN, first at row 40, 1 in all"),
     ]
     for limits, words in messages:
         with pytest.raises(DataError, match=words):
-            make(step=None, time=nan, slice=limits)
+            make(step=None, time=nan, window=limits)
     with pytest.raises(DataError, match="not finite, first at row 0, 1 in all"):
-        make(step=None, time=put(grid(), [0], np.nan), slice=(0, 0.3))
+        make(step=None, time=put(grid(), [0], np.nan), window=(0, 0.3))
 
 
 def test_slice_of_a_clock_that_starts_again_is_refused():
     times = np.concatenate([grid(25), grid(25)])
     with pytest.raises(DataError, match=r"decreasing time.* row 25, 1 in all"):
-        make(step=None, time=times, slice=(0, 0.1))
+        make(step=None, time=times, window=(0, 0.1))
 
 
 def test_resample_of_irregular_times_holds_and_interpolates_and_says_so():
@@ -472,7 +472,7 @@ def test_slice_shares_no_row_and_keeps_the_source_time():
 def test_bad_slices_are_refused(limits, words):
     with pytest.raises(DataError) as caught:
         make().window(*limits)
-    assert [word for word in ["slice", *words] if word not in str(caught.value)] == [], str(caught.value)
+    assert [word for word in ["window", *words] if word not in str(caught.value)] == [], str(caught.value)
 
 
 def test_resample_of_a_run():

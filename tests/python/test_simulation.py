@@ -240,7 +240,7 @@ def test_a_response_that_does_not_stand_still_says_so():
         ({"tolerance": -1e-6}, "tolerance = -1e-06 is not positive"),
         ({"tolerance": float("nan")}, "tolerance = nan is not positive"),
         ({"tolerance": "small"}, "tolerance = 'small' is not a number"),
-        ({"largest_m": 100}, "run 'small, simulated' has 512 intervals, more than 100; slice it"),
+        ({"max_m": 100}, "run 'small, simulated' has 512 intervals, more than 100; slice it"),
     ],
 )
 def test_options_out_of_range_are_refused(small_model, small_run, options, message):

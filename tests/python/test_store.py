@@ -44,10 +44,10 @@ def run(small_run, with_noise):
     return with_noise(small_run, 0.003, 1)
 
 
-def search(run, path=None, *, lattice=COARSE, **options):
+def search(run, path=None, *, order_grid=COARSE, **options):
     """Brute force has the shortest rounds: five of them, in three waves."""
-    options = {"m": 32, "early_stopping": False, **options}
-    return ftlm.search_orders(run, ftlm.equation(EQUATION, initial="rest"), lattice, store=path, **options)
+    options = {"m": 32, "pruning": False, **options}
+    return ftlm.search_orders(run, ftlm.equation(EQUATION, initial="rest"), order_grid, store=path, **options)
 
 
 def bytes_of(found):
@@ -67,9 +67,9 @@ def whole(run, tmp_path_factory):
     return path.read_bytes()
 
 
-def job_of(run, structure, lattice, *, m, keep=20, early_stopping=True):
-    settings = Settings.check("output-error", "l1", "multi-innovation", 7, 1.0, "haar", keep, None, early_stopping)
-    return make_job(run, structure, lattice, settings, m=m)
+def job_of(run, structure, order_grid, *, m, top=20, pruning=True):
+    settings = Settings.check("output-error", "l1", "multi-innovation", 7, 1.0, "haar", top, None, pruning)
+    return make_job(run, structure, order_grid, settings, m=m)
 
 
 def rows_of(contents):
@@ -86,10 +86,10 @@ def rows_of(contents):
     "options",
     [
         {},
-        {"early_stopping": True},
-        {"early_stopping": True, "criterion": "equation-error", "norm": "l2", "rows": "time"},
-        {"coefficients": "least-squares", "norm": "l2", "keep": 3, "threads": 3},
-        {"early_stopping": True, "coefficients": "instrumental-variables", "lattice": ftlm.order_grid(increment=0.2)},
+        {"pruning": True},
+        {"pruning": True, "criterion": "equation-error", "norm": "l2", "row_basis": "time"},
+        {"coefficients": "least-squares", "norm": "l2", "top": 3, "threads": 3},
+        {"pruning": True, "coefficients": "instrumental-variables", "order_grid": ftlm.order_grid(increment=0.2)},
     ],
 )
 def test_a_search_with_a_store_is_the_search_without(run, tmp_path, options):
@@ -119,7 +119,7 @@ def test_several_runs_a_delay_and_a_sensor_filter_survive_in_a_store(run, tmp_pa
 
 def test_rounds_do_not_depend_on_how_they_are_cut_up(run):
     """R4: any number of threads, any stretch of rounds, in any order."""
-    job = job_of(run, ftlm.equation(EQUATION, initial="rest"), COARSE, m=32, early_stopping=False)
+    job = job_of(run, ftlm.equation(EQUATION, initial="rest"), COARSE, m=32, pruning=False)
     work = job.equation_problem()
     count, ends, _ = work.plan()
     assert count == 19_295
@@ -387,10 +387,10 @@ def stage_run(plant, drive, with_noise):
     return with_noise(plant("A").simulate(drive("A", samples=301), tolerance=1e-5), 1e-5, 3)
 
 
-def search_stage(run, path=None, *, structure=None, lattice=None, **options):
-    options = {"m": 64, "keep": 8, **options}
-    lattice = lattice or ftlm.OrderGrid(orders=STAGE)
-    return ftlm.search_orders(run, structure or ftlm.flexible_link(form="published"), lattice, store=path, **options)
+def search_stage(run, path=None, *, structure=None, order_grid=None, **options):
+    options = {"m": 64, "top": 8, **options}
+    order_grid = order_grid or ftlm.OrderGrid(orders=STAGE)
+    return ftlm.search_orders(run, structure or ftlm.flexible_link(form="published"), order_grid, store=path, **options)
 
 
 @pytest.fixture
@@ -416,15 +416,15 @@ def stage_store(stage_run, small_pieces, tmp_path):
     "options",
     [
         {},
-        {"early_stopping": False, "threads": 3},
-        {"criterion": "equation-error", "norm": "l2", "rows": "time", "keep": 30},
+        {"pruning": False, "threads": 3},
+        {"criterion": "equation-error", "norm": "l2", "row_basis": "time", "top": 30},
         {"coefficients": "instrumental-variables", "norm": "l2", "threads": 1},
         {
             "structure": ftlm.flexible_link(form="published", laws=("orders",), coupling="measured"),
             "coefficients": "least-squares",
         },
         # More candidates than the first pass follows at a time, so that some are left early and followed further.
-        {"lattice": ftlm.OrderGrid(increment=0.1, orders={"alpha": (1.8, 2.0)}), "coefficients": "least-squares"},
+        {"order_grid": ftlm.OrderGrid(increment=0.1, orders={"alpha": (1.8, 2.0)}), "coefficients": "least-squares"},
     ],
 )
 def test_the_search_of_a_stage_with_a_store_is_the_search_without(stage_run, small_pieces, tmp_path, options):
@@ -555,13 +555,13 @@ def test_a_stage_that_is_interrupted_goes_on(stage_run, stage_expected, small_pi
     ("change", "message"),
     [
         (lambda run, path: search_stage(run, path, m=32), "asked is other data"),
-        (lambda run, path: search_stage(run, path, keep=9), "asked is other settings: keep = 9"),
+        (lambda run, path: search_stage(run, path, top=9), "asked is other settings: top = 9"),
         (
             lambda run, path: search_stage(run, path, structure=PUBLISHED.with_coefficients({"g1": 40.0})),
             "asked is another equation",
         ),
         (
-            lambda run, path: search_stage(run, path, lattice=ftlm.OrderGrid(orders=STAGE | {"alpha2": 2.0})),
+            lambda run, path: search_stage(run, path, order_grid=ftlm.OrderGrid(orders=STAGE | {"alpha2": 2.0})),
             "asked is another lattice",
         ),
     ],
@@ -576,7 +576,7 @@ def test_the_search_of_another_stage_is_refused(stage_run, stage_store, tmp_path
 
 def test_verdicts_that_do_not_fit_their_search_are_refused(stage_run, small_pieces, tmp_path):
     """What a forger would write: whole frames, under digests that are right."""
-    job = job_of(stage_run, ftlm.flexible_link(form="published"), ftlm.OrderGrid(orders=STAGE), m=64, keep=8)
+    job = job_of(stage_run, ftlm.flexible_link(form="published"), ftlm.OrderGrid(orders=STAGE), m=64, top=8)
     work = job.coupled_problem()
     wave = sum(last - first for _, first, last, _ in work.build_evaluator(keeps_course=True).wanted())
     for number, (first, last, kind, message) in enumerate(
@@ -617,8 +617,8 @@ def test_verdicts_that_do_not_fit_their_search_are_refused(stage_run, small_piec
 )
 def test_an_identification_keeps_its_searches(stage_run, small_pieces, tmp_path, structure, names):
     path = tmp_path / "s.ftlm"
-    lattice = ftlm.OrderGrid(orders=STAGE) if names == ["stage"] else ftlm.OrderGrid(increment=0.3, alpha=(1.8, 2.0))
-    options = {"method": "least-squares", "lattice": lattice, "m": 64, "keep": 5, "threads": 1}
+    order_grid = ftlm.OrderGrid(orders=STAGE) if names == ["stage"] else ftlm.OrderGrid(increment=0.3, alpha=(1.8, 2.0))
+    options = {"method": "least-squares", "order_grid": order_grid, "m": 64, "top": 5, "threads": 1}
     plain = ftlm.identify(stage_run, structure, **options)
     calls = []
 
@@ -687,7 +687,7 @@ def another(text):
     [
         (lambda run, path: search(run.slice(0.0, 8.0), path), "asked is other data"),
         (lambda run, path: search(run, path, m=64), "asked is other data"),
-        (lambda run, path: search(run, path, lattice=ftlm.order_grid(increment=0.2)), "asked is another lattice"),
+        (lambda run, path: search(run, path, order_grid=ftlm.order_grid(increment=0.2)), "asked is another lattice"),
         (lambda run, path: search(run, path, norm="l2"), "asked is other settings: norm = l2"),
         (another("D^alpha y = a D^beta y + c D^mu y + b u"), "asked is another equation"),
         (another("D^alpha y = a D^beta y + c D^mu y + 5 D^nu u"), "asked is another equation"),
@@ -718,7 +718,7 @@ def test_a_store_of_another_algorithm_is_read_where_it_is_finished_and_refused_w
 
 def test_only_what_another_algorithm_does_otherwise_is_refused_half_done(run, tmp_path, monkeypatch):
     """Algorithm 5 ranks free runs otherwise than 4, and squared equation errors of a small lattice as all before it."""
-    free, squares = {"early_stopping": True}, {"early_stopping": True, "criterion": "equation-error", "norm": "l2"}
+    free, squares = {"pruning": True}, {"pruning": True, "criterion": "equation-error", "norm": "l2"}
     for name, options in {"free": free, "squares": squares}.items():
         finished, half = tmp_path / f"{name}.ftlm", tmp_path / f"half-{name}.ftlm"
         expected = bytes_of(search(run, finished, **options))
@@ -778,7 +778,7 @@ def test_a_full_disk_leaves_the_store_whole(run, expected, tmp_path, monkeypatch
 
 def _header(run, path):
     """A store whose search has only begun: its size."""
-    job = job_of(run, ftlm.equation(EQUATION, initial="rest"), COARSE, m=32, early_stopping=False)
+    job = job_of(run, ftlm.equation(EQUATION, initial="rest"), COARSE, m=32, pruning=False)
     Store(path, [job.request("y")]).close()
     return path.stat().st_size
 
@@ -882,7 +882,7 @@ def test_paths_that_hold_no_store_are_refused(run, tmp_path):
 
 
 def test_the_core_refuses_checkpoints_and_parts_of_another_search(run):
-    job = job_of(run, ftlm.equation(EQUATION, initial="rest"), COARSE, m=32, early_stopping=False)
+    job = job_of(run, ftlm.equation(EQUATION, initial="rest"), COARSE, m=32, pruning=False)
     work = job.equation_problem()
     ready = work.build_evaluator()
     counts = (0, 0, 0, 0, 0, 0, 0)
