@@ -266,8 +266,8 @@ def identify(
         "norm": norm,
         "innovation_length": innovation_length,
         "prior_covariance": prior_covariance,
-        "rows": row_basis,
-        "keep": top,
+        "row_basis": row_basis,
+        "top": top,
     }
     words = {n: value for n, value in words.items() if value is not None}
     if loss is not None:
@@ -282,7 +282,7 @@ def identify(
     others = {
         "loss": loss,
         "intervals": intervals,
-        "lattice": order_grid,
+        "order_grid": order_grid,
         "genetic": genetic,
         "store": store,
         "executor": executor,

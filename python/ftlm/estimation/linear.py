@@ -285,7 +285,7 @@ class Streaming:
     """Online estimator of the coefficients of a structure for a run that starts at rest.
 
     Each sample costs the same, whatever the length of the run: the past is held by about a hundred numbers a signal.
-    After the last sample the coefficients are those of ``identify(method="multi-innovation", rows="time")`` at the
+    After the last sample the coefficients are those of ``identify(method="multi-innovation", row_basis="time")`` at the
     same orders on the run's own grid, to rounding.
 
     Parameters

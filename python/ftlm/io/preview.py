@@ -474,7 +474,7 @@ class _FilePreview:
             options["time"] = clock.name
         asked = self.asked
         more = {
-            "slice": asked.window,
+            "window": asked.window,
             "resample": asked.resample,
             "time_unit": asked.time_unit,
             "missing": asked.missing,

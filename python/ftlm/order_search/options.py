@@ -21,13 +21,13 @@ METHOD_CHOICES = ("output-error", "instrumental-variables", "multi-innovation", 
 _GRID_SEARCH_METHODS = METHOD_CHOICES[1:4]
 #: Methods of `identify` that use an option; options that are not listed (runs, structure, m, …) apply to all methods.
 METHODS_BY_OPTION: dict[str, tuple[str, ...]] = {
-    "lattice": METHOD_CHOICES[1:],
+    "order_grid": METHOD_CHOICES[1:],
     "criterion": _GRID_SEARCH_METHODS,
     "norm": METHOD_CHOICES[1:],
-    "keep": _GRID_SEARCH_METHODS,
+    "top": _GRID_SEARCH_METHODS,
     "innovation_length": ("multi-innovation",),
     "prior_covariance": ("multi-innovation",),
-    "rows": ("multi-innovation",),
+    "row_basis": ("multi-innovation",),
     "genetic": ("genetic",),
     "loss": METHOD_CHOICES[:1],
     "reference": METHOD_CHOICES[:1],
@@ -37,7 +37,7 @@ METHODS_BY_OPTION: dict[str, tuple[str, ...]] = {
     "executor": _GRID_SEARCH_METHODS,
 }
 #: Options of the order search; grid methods use them only if an order is free.
-SEARCH_OPTIONS = ("lattice", "criterion", "norm", "keep", "store", "executor")
+SEARCH_OPTIONS = ("order_grid", "criterion", "norm", "top", "store", "executor")
 #: Innovation lengths of the paper's tables.
 COMPARED_INNOVATION_LENGTHS = (1, 3, 5, 7)
 #: Bound on the refined-instrumental-variables iterations per candidate; most converge earlier.
@@ -106,7 +106,7 @@ class Settings:
             ("criterion", criterion, ("output-error", "equation-error")),
             ("norm", norm, ("l1", "l2")),
             ("coefficients", coefficients, ("multi-innovation", "least-squares", "instrumental-variables")),
-            ("rows", row_basis, ("haar", "time")),
+            ("row_basis", row_basis, ("haar", "time")),
         ):
             if value not in known:
                 raise ModelError(
@@ -140,5 +140,5 @@ class Settings:
         out: dict[str, Any] = {"criterion": self.criterion, "norm": self.norm, "coefficients": self.coefficients}
         if self.coefficients == "multi-innovation":
             out |= {"innovation_length": self.innovation_length, "prior_covariance": self.prior_covariance}
-            out["rows"] = self.row_basis
+            out["row_basis"] = self.row_basis
         return out

@@ -314,7 +314,7 @@ def search_orders(
     if executor is not None and threads is None:
         threads = 1
     checked = as_runs(runs)
-    weighted = {"innovation_length": innovation_length, "prior_covariance": prior_covariance, "rows": row_basis}
+    weighted = {"innovation_length": innovation_length, "prior_covariance": prior_covariance, "row_basis": row_basis}
     words: dict[str, Any] = {n: value for n, value in weighted.items() if value is not None}
     settings = Settings.check(criterion, norm, coefficients, top=top, threads=threads, pruning=pruning, **words)
     check_options_used(coefficients, words, argument="coefficients")

@@ -226,7 +226,7 @@ def settings_rows(settings: Mapping[str, Any], *, searched: bool) -> list[list[C
         rows += [
             ["innovation length, p", int(settings["innovation_length"])],
             [Markup("prior covariance, K<sub>0</sub>"), Exact(settings["prior_covariance"])],
-            ["rows of the recursion", ROW_BASIS_TEXTS.get(settings["rows"], settings["rows"])],
+            ["rows of the recursion", ROW_BASIS_TEXTS.get(settings["row_basis"], settings["row_basis"])],
         ]
     if "refinement" in settings:
         rows += [
