@@ -14,6 +14,7 @@ from ftlm.control.fractional_pid import least_certain_parameter
 from ftlm.control.stability_margins import LoopDesign, Plant
 from ftlm.errors import DataError, ModelError
 from ftlm.model.model import ModelData
+from ftlm.utils.parameters import setting
 from ftlm.utils.validation import Complex, Floats, real_number, short_repr
 
 #: Length of the transform relative to the path, and exponent of its weight exp(-t): the weight suppresses the periodic
@@ -124,7 +125,8 @@ def point_to_point(
         raise ModelError(f"before = {dwell_before!r} and after = {dwell_after!r} are not seconds from 0")
     if times[0] * times[1] < 10:
         raise ModelError(
-            f"duration = {short_repr(duration)} s has fewer than ten samples at {times[1]:g} Hz; give it more time"
+            f"{setting('duration')} {short_repr(duration)} s has fewer than ten samples at {times[1]:g} Hz; give it "
+            "more time"
         )
     rows = (sum(rests) + times[0]) * times[1] + 1
     if rows > MAX_PATH_ROWS:
@@ -182,7 +184,7 @@ def inverse_dynamics(
     count, start = check_samples(samples, seed)
     most = check_limit(limit)
     names = tuple(p.output for p in design.plants)
-    row = sum_row("of", names[0] if output is None and len(names) == 1 else output, names)
+    row = sum_row("output", names[0] if output is None and len(names) == 1 else output, names)
     size = 1 << math.ceil(math.log2(TRANSFORM_LENGTH_FACTOR * len(rows)))
     # On a line right of all poles and left of the zeros that a tip has there: s = jw, its real part above 0.
     fall = WEIGHT_DECAY * design.rate / size

@@ -18,6 +18,7 @@ from ftlm.control.stability_margins import LoopDesign, Margins, Plant, margins_o
 from ftlm.data.run import Run
 from ftlm.errors import DataError, ModelError
 from ftlm.model.model import ModelData, check_model
+from ftlm.utils.parameters import parameter, setting
 from ftlm.utils.validation import Complex, Floats, nearest, short_repr
 
 #: Name of the input disturbance in the estimates.
@@ -82,7 +83,7 @@ class Observer:
         if abs(run.step * self.realisation.rate - 1.0) > 1e-6:
             raise DataError(
                 f"run {run.name} has a step of {run.step:g} s, and the observer one of "
-                f"{1.0 / self.realisation.rate:g} s; make it for rate={1.0 / run.step:g}"
+                f"{1.0 / self.realisation.rate:g} s; make it for {parameter('rate')}{1.0 / run.step:g}"
             )
         a, b, c = self.matrices
         y = np.array([run[n] for n in self.measured])
@@ -167,7 +168,7 @@ def observer(
         fit_realization(plants, band, poles),
         names,
         noise_deviations(model, names, noise),
-        positive("drift", process_noise),
+        positive("process_noise", process_noise),
     )
 
 
@@ -215,7 +216,7 @@ def noise_deviations(
 ) -> tuple[float, ...]:
     """Standard deviation of the noise of each measured output."""
     if given is not None and not isinstance(given, Mapping):
-        raise ModelError(f"noise = {short_repr(given)} is no mapping from outputs to standard deviations")
+        raise ModelError(f"{setting('noise')} {short_repr(given)} is no mapping from outputs to standard deviations")
     for name in given or {}:
         if name not in measured:
             near = nearest(name, measured) if isinstance(name, str) else ""
@@ -228,7 +229,7 @@ def noise_deviations(
         if value is None:
             raise ModelError(
                 f"the noise of {name} is not known, since this model does not say what its fit left; give its standard "
-                f"deviation in noise (--noise {name}=0.001)"
+                f"deviation in {parameter('noise', {name: 0.001})}"
             )
         out.append(positive(f"noise of {name}", value))
     return tuple(out)
@@ -479,8 +480,8 @@ def lqg(
     on the exact response decides.
     """
     count, start = check_samples(samples, seed)
-    dear = positive("effort", max_input)
-    walks = 0.2 * dear if process_noise is None else positive("drift", process_noise)
+    dear = positive("max_input", max_input)
+    walks = 0.2 * dear if process_noise is None else positive("process_noise", process_noise)
     plants = plants_of(model, input, rate, coupling, sensor=sensor)
     names = tuple(p.output for p in plants)
     read = select_outputs("measured", measured, names)
@@ -521,8 +522,8 @@ def lqg(
         raise ModelError(
             f"the intervals are too wide to design on: in {len(broken)} of {len(margins)} samples of the model's "
             f"numbers the loop is not stable or has a largest sensitivity above {MAX_SENSITIVITY:g}; "
-            f"{least_certain_parameter(model)}; "
-            "identify from a longer or richer run (ftlm design-input lays it out), or make effort smaller"
+            f"{least_certain_parameter(model)}; identify from a longer or richer run (ftlm design-input lays it "
+            f"out), or lower {parameter('max_input')}"
         )
     return LqgDesign(controller, realisation, nominal, margins, tuple(plants))
 
@@ -539,12 +540,11 @@ def _weights(max_deviation: Mapping[str, float], names: tuple[str, ...]) -> list
     """Return coefficients of sums of outputs, with their maximum acceptable deviations."""
     if not isinstance(max_deviation, Mapping) or not max_deviation:
         raise ModelError(
-            f"max_deviation = {short_repr(max_deviation)} is no mapping from outputs, or sums of them, to deviations; "
-            "give such as "
-            f"{{{names[0]!r}: 0.01}}"
+            f"{setting('max_deviation')} {short_repr(max_deviation)} is no mapping from outputs, or sums of them, to "
+            "deviations; give such as {{names[0]!r}: 0.01}"
         )
     return [
-        (sum_row("allowed", text, names), positive(f"allowed[{short_repr(text)}]", size))
+        (sum_row("max_deviation", text, names), positive(f"max_deviation[{short_repr(text)}]", size))
         for text, size in max_deviation.items()
     ]
 

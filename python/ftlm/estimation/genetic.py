@@ -19,6 +19,7 @@ from ftlm.structure.equation import Equation
 from ftlm.structure.order import Order
 from ftlm.structure.order_grid import OrderGrid
 from ftlm.structure.structure import Structure
+from ftlm.utils.parameters import choose_text, parameter, setting
 from ftlm.utils.validation import Floats, check_threads, whole_number
 
 #: Increment of the coded orders. It is as fine as the paper prints, so regressors are shared.
@@ -73,14 +74,15 @@ class Genetic:
     def __post_init__(self) -> None:
         population = whole_number(self.population)
         if population is None or not 8 <= population <= 100_000:
-            raise ModelError(f"population = {self.population!r} is outside [8, 100000]")
+            raise ModelError(f"{setting('population')} {self.population!r} is outside [8, 100000]")
         if self.evaluations is not None and (whole_number(self.evaluations) or 0) < 2 * self.population:
             raise ModelError(
-                f"evaluations = {self.evaluations!r} is less than two generations of {self.population}; give more"
+                f"{setting('evaluations')} {self.evaluations!r} is less than two generations of {self.population}; "
+                "give more"
             )
         seeds = [whole_number(s) for s in self.seeds] if not isinstance(self.seeds, str) else [None]
         if not seeds or any(s is None or not 0 <= s < 1 << 32 for s in seeds):
-            raise ModelError(f"seeds = {self.seeds!r}: give one or more whole numbers from 0 to 4294967295")
+            raise ModelError(f"{setting('seeds')} {self.seeds!r}: give one or more whole numbers from 0 to 4294967295")
         for name, pair in self.bounds.items():
             if not (isinstance(pair, (tuple, list)) and len(pair) == 2 and -math.inf < pair[0] < pair[1] < math.inf):
                 raise ModelError(f"bounds of {name} = {pair!r} are no interval; write (low, high)")
@@ -276,18 +278,18 @@ def genetic_search(
     if records[0].offset != "none":
         raise ModelError(
             f"the genetic baseline knows no offset, and offset = {records[0].offset!r}; "
-            "use method='output-error', or offset='none'"
+            f"use {parameter('method', 'output-error')}, or {parameter('offset', 'none')}"
         )
     if records[0].start != (False, []):
         raise ModelError(
             "the genetic baseline knows no initial terms and needs runs that start at rest; "
-            "slice the runs, or give the structure initial='rest'"
+            f"slice the runs, or give the structure {parameter('initial', 'rest')}"
         )
     problem = GeneticProblem(records, structure, order_grid, settings, norm, check_threads(threads))
     wanted = settings.evaluations or problem.size
     if settings.evaluations is None and wanted > MAX_DEFAULT_EVALUATIONS:
         raise ModelError(
-            f"the lattice has {wanted} candidates, too many to evaluate one by one; give Genetic(evaluations=…)"
+            f"the lattice has {wanted} candidates, too many to evaluate one by one; give {choose_text('Genetic(evaluations=…)', '--evaluations')}"
         )
     wanted = max(wanted, 2 * settings.population)
     total = wanted * len(settings.seeds)

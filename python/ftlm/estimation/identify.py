@@ -49,6 +49,7 @@ from ftlm.simulation.discretization import default_m
 from ftlm.structure.order_grid import OrderGrid, check_order_grid, check_order_grid_names
 from ftlm.structure.structure import History, Structure, check_offset
 from ftlm.utils.files import PACKAGE_LOGGER
+from ftlm.utils.parameters import parameter
 from ftlm.utils.statistics import NEGLIGIBLE_RESIDUAL_SHARE
 from ftlm.utils.validation import check_choice
 from ftlm.validation.comparison import Comparison, compare_samples, finite, simulate_runs
@@ -104,7 +105,7 @@ def _history_offset_warnings(fit: Fit) -> list[str]:
     return [
         f"what {', '.join(fit.model.outputs)} did before the runs is estimated with {joint.initial_terms} powers of "
         f"time; an unknown constant in the equation explains as much with {less} numbers fewer: if a sensor's zero, a "
-        "load or a mean may be there, offset='auto' estimates it"
+        f"load or a mean may be there, {parameter('offset', 'auto')} estimates it"
     ]
 
 
@@ -276,8 +277,8 @@ def identify(
         check_choice("intervals", intervals, INTERVAL_CHOICES)
     if intervals == "profile" and reference is not None:
         raise ModelError(
-            "intervals='profile' needs a cost that has its minimum at the estimate, and reference= has none; use "
-            "intervals='quadratic', or leave it out"
+            f"{parameter('intervals', 'profile')} needs a cost that has its minimum at the estimate, and "
+            f"{parameter('reference')} has none; use {parameter('intervals', 'quadratic')}, or leave it out"
         )
     others = {
         "loss": loss,
@@ -297,8 +298,8 @@ def identify(
         settings = replace(settings, threads=1)
     if structure.offset == "auto" and store is not None:
         raise ModelError(
-            "offset='auto' may need two searches, and a store keeps those of one; use offset='none' or "
-            "offset='constant' with store="
+            f"{parameter('offset', 'auto')} may need two searches, and a store keeps those of one; use "
+            f"{parameter('offset', 'none')} or {parameter('offset', 'constant')} with {parameter('store')}"
         )
     if not (start is None or isinstance(start, (Identification, ModelData, Mapping))):
         raise ModelError(f"start is {type(start).__name__}; give an identification, a model, or values by name")
@@ -331,13 +332,18 @@ def _check_friction(structure: Structure, method: str, reference: str | None) ->
     """Raise ModelError for options that do not support friction."""
     words = f"the equation of {structure.outputs[structure.friction_equations[0]]} has friction, which"
     if method != "output-error":
-        raise ModelError(f"{words} method={method!r} does not know; use method='output-error'")
+        raise ModelError(
+            f"{words} {parameter('method', method)} does not know; use {parameter('method', 'output-error')}"
+        )
     if reference is not None:
-        raise ModelError(f"{words} the instrument reference={reference!r} does not know; leave one of the two out")
+        raise ModelError(
+            f"{words} the instrument {parameter('reference', reference)} does not know; leave one of the two out"
+        )
     if structure.offset == "auto":
         raise ModelError(
-            f"{words} the test of offset='auto' does not know; use offset='constant', whose interval says whether it "
-            "is 0, or offset='none'"
+            f"{words} the test of {parameter('offset', 'auto')} does not know; use "
+            f"{parameter('offset', 'constant')}, whose interval says whether it "
+            f"is 0, or {parameter('offset', 'none')}"
         )
 
 

@@ -28,6 +28,7 @@ from ftlm.io.load import (
 )
 from ftlm.io.load_frequency import is_response
 from ftlm.io.table import Column, FileTable, Pool, date_order_assumption
+from ftlm.utils.parameters import NAMED_COLUMNS, Placeholder, parameter
 from ftlm.utils.validation import CSV_TIME, join_names
 
 _INPUT_WORDS = frozenset(
@@ -408,7 +409,11 @@ class _FilePreview:
             return clock, (assumed,), ""
         if wanted.time is None and clock.matrix is not None:
             words = f"the time is the first column of the matrix, {clock.name!r}"
-            return clock, (Assumption("time", clock.name, words, "time=COLUMN", False),), ""
+            return (
+                clock,
+                (Assumption("time", clock.name, words, parameter("time", Placeholder("COLUMN")), False),),
+                "",
+            )
         return clock, (), ""
 
     def _roles(
@@ -437,13 +442,21 @@ class _FilePreview:
         if guessed:
             inputs, outputs = join_names(wanted.inputs.values(), 10), join_names(wanted.outputs.values(), 10)
             words = f"{inputs} {'drives' if len(wanted.inputs) == 1 else 'drive'} {outputs}, by their names"
-            said.append(Assumption("inputs", inputs, words, "inputs={name: column}, outputs={name: column}"))
+            said.append(
+                Assumption(
+                    "inputs",
+                    inputs,
+                    words,
+                    f"{parameter('inputs', NAMED_COLUMNS)}, {parameter('outputs', NAMED_COLUMNS)}",
+                )
+            )
         left = ""
         if not wanted.outputs:
             choice = join_names((c.name for c in every if c is not clock and _has_numbers(c)), 20)
             left = (
                 "which columns are inputs and which are outputs, their names do not say; name them with "
-                f"inputs={{name: column}} and outputs={{name: column}}; there are {choice or 'none'}"
+                f"{parameter('inputs', NAMED_COLUMNS)} and {parameter('outputs', NAMED_COLUMNS)}; there are "
+                f"{choice or 'none'}"
             )
             wordy = (c for c in every if c is not clock and not _has_numbers(c) and c.timestamps is None)
             others = [f"{c.name!r} ({_first_bad_cell(c)})" for c in wordy]
@@ -464,7 +477,7 @@ class _FilePreview:
         if self.asked.time_unit is not None or known or clock.problem is not None:
             return ()
         words = f"the numbers of {clock.name!r} are seconds, as no unit is stated"
-        return (Assumption("time_unit", "s", words, "time_unit=UNIT", False),)
+        return (Assumption("time_unit", "s", words, parameter("time_unit", Placeholder("UNIT")), False),)
 
     def _options(self, clock: Column | None, of_clock: tuple[Assumption, ...]) -> dict[str, Any]:
         """Return the arguments of `load` that give the same run."""

@@ -8,6 +8,7 @@ from dataclasses import dataclass
 from typing import Any, Literal
 
 from ftlm.errors import ModelError
+from ftlm.utils.parameters import parameter, setting
 from ftlm.utils.resources import memory_limit
 from ftlm.utils.validation import check_threads, real_number, whole_number
 
@@ -65,12 +66,15 @@ def check_options_used(method: str, given: Iterable[str], *, free: bool = True, 
     count = len(useless) + len(fixed)
     others = f", nor {count - 1} other{'s' if count > 2 else ''} given here" if count > 1 else ""
     if useless:
-        users = " or ".join(f"{argument}={m!r}" for m in METHODS_BY_OPTION[useless[0]])
-        raise ModelError(f"{useless[0]}= is not used by {argument}={method!r}{others}; leave it out, or use {users}")
+        users = " or ".join(parameter(argument, m) for m in METHODS_BY_OPTION[useless[0]])
+        raise ModelError(
+            f"{parameter(useless[0])} is not used by {parameter(argument, method)}{others}; leave it out, or use "
+            f"{users}"
+        )
     if fixed:
         raise ModelError(
-            f"{fixed[0]}= is not used{others}: it is for order searches, and every order here is a number; leave it "
-            "out, or free an order"
+            f"{parameter(fixed[0])} is not used{others}: it is for order searches, and every order here is a number; "
+            "leave it out, or free an order"
         )
 
 
@@ -110,16 +114,20 @@ class Settings:
         ):
             if value not in known:
                 raise ModelError(
-                    f"{name} = {value!r} is not known in this version; use {' or '.join(map(repr, known))}"
+                    f"{setting(name)} {value!r} is not known in this version; use {' or '.join(map(repr, known))}"
                 )
         rows_kept, p = whole_number(top), whole_number(innovation_length)
         if rows_kept is None or not 1 <= rows_kept <= 100_000:
-            raise ModelError(f"top = {top!r} is outside [1, 100000]; keep as many rows as you will read")
+            raise ModelError(f"{setting('top')} {top!r} is outside [1, 100000]; keep as many rows as you will read")
         if p is None or not 1 <= p < 1 << 62:
-            raise ModelError(f"innovation length p = {innovation_length!r} is no whole number from 1; the paper's is 7")
-        k0 = real_number("prior covariance K0", prior_covariance)
+            raise ModelError(
+                f"{setting('innovation_length')} {innovation_length!r} is no whole number from 1; the paper's is 7"
+            )
+        k0 = real_number("prior_covariance", prior_covariance)
         if not 0 < k0 < math.inf:
-            raise ModelError(f"prior covariance K0 = {prior_covariance!r} is not positive; a large one is a weak prior")
+            raise ModelError(
+                f"{setting('prior_covariance')} {prior_covariance!r} is not positive; a large one is a weak prior"
+            )
         return cls(criterion, norm, coefficients, p, k0, row_basis, rows_kept, check_threads(threads), pruning)
 
     @property

@@ -11,6 +11,7 @@ from ftlm.model.model import Model
 from ftlm.svg.html_page import Table
 from ftlm.utils.files import to_frame
 from ftlm.utils.formatting import Cell, Exact, number, symbol, symbol_html
+from ftlm.utils.parameters import parameter
 
 
 @dataclass(frozen=True)
@@ -287,7 +288,7 @@ class StoreStatus:
                 f"\n{self.truncated} bytes of an unfinished write at its end: being written now, or dropped on resuming"
             )
         if self.corruption is not None:
-            text += f"\ndamaged: {self.corruption}; resume with --salvage to keep what stands before"
+            text += f"\ndamaged: {self.corruption}; resume with {parameter('recover', True)} to keep what stands before"
         return text
 
 
