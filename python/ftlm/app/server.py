@@ -22,7 +22,7 @@ from ftlm.app import views as view
 from ftlm.app.forms import parse_fields
 from ftlm.app.session import STATE_MADE, Session
 from ftlm.errors import DataError, FtlmError, ModelError
-from ftlm.utils.parameters import setting
+from ftlm.utils.parameters import setting, use_interface
 
 if TYPE_CHECKING:
     from uvicorn.protocols.http.h11_impl import H11Protocol
@@ -472,7 +472,8 @@ def serve(files: Sequence[str] = (), *, port: int | None = None, browser: bool =
     sock, note = open_socket(port)
     if note:
         print(f"ftlm: {note}", file=sys.stderr)
-    with sock, contextlib.suppress(KeyboardInterrupt):
+    # The page turns parameters of Python into labels of its fields.
+    with sock, use_interface("python"), contextlib.suppress(KeyboardInterrupt):
         asyncio.run(_serve(sock, paths, browser))
     print("\nftlm app has ended; its files are removed", file=sys.stderr)
 

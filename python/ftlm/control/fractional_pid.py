@@ -15,7 +15,7 @@ from ftlm.control.stability_margins import LoopDesign, Margins, Plant, margins_o
 from ftlm.errors import ModelError
 from ftlm.model.model import ModelData, check_model
 from ftlm.simulation.discretization import check_linear
-from ftlm.utils.parameters import setting
+from ftlm.utils.parameters import parameter, setting
 from ftlm.utils.validation import Complex, Floats, nearest, real_number, short_repr, whole_number
 
 #: Poles extend this factor beyond the band on both sides.
@@ -464,7 +464,7 @@ def plant_of(
         if name is None and len(known) == 1:
             names.append(known[0])
         elif name is None:
-            raise ModelError(f"the model has several {what}s: say which, {what}=…; it has {', '.join(known)}")
+            raise ModelError(f"the model has several {what}s: say which, {parameter(what)}…; it has {', '.join(known)}")
         elif not isinstance(name, str) or name not in known:
             near = nearest(name, known) if isinstance(name, str) else ""
             raise ModelError(

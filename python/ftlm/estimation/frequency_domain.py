@@ -668,13 +668,14 @@ def _match_records(records: Sequence[FrequencyData], structure: Structure) -> li
                 if len(known) > 1:
                     raise DataError(
                         f"{record.name} does not say its {side}, and the equations have {', '.join(known)}; say "
-                        f"{side}= when loading it"
+                        f"{parameter(side)} when loading it"
                     )
                 own[side] = known[0]
             elif own[side] not in known:
                 raise DataError(
                     f"{record.name} has the {side} {own[side]!r}, which is no {side} of the equations; these have "
-                    f"{', '.join(known)}: write the equation in the names of the data, or say {side}= when loading"
+                    f"{', '.join(known)}: write the equation in the names of the data, or say {parameter(side)} when "
+                    "loading"
                 )
         found.append(replace(record, output=own["output"], input=own["input"]))
     for output in outputs:

@@ -23,7 +23,7 @@ from ftlm.svg.figure import SMALL_WIDTH_PX, Figure
 from ftlm.svg.html_page import Section, Table, write_page
 from ftlm.svg.line_chart import line_chart
 from ftlm.utils.formatting import Cell, format_bound, number, symbol, wrap_text
-from ftlm.utils.parameters import choose_text
+from ftlm.utils.parameters import choose_text, parameter
 from ftlm.utils.statistics import NORMAL_95
 from ftlm.utils.validation import Complex, Floats
 from ftlm.validation.findings import LEVEL_DO_NOT_USE, LEVEL_WITH_CARE, group_warnings
@@ -471,8 +471,8 @@ def assign_signals(model: Model, record: FrequencyData) -> FrequencyData:
             out[side] = known[0]
         if out[side] not in known:
             raise DataError(
-                f"{record.name} has the {side} {out[side]!r}, and the model {', '.join(known)}; say {side}= when "
-                "loading it"
+                f"{record.name} has the {side} {out[side]!r}, and the model {', '.join(known)}; say "
+                f"{parameter(side)} when loading it"
             )
     return replace(record, output=out["output"], input=out["input"])
 

@@ -289,7 +289,8 @@ def genetic_search(
     wanted = settings.evaluations or problem.size
     if settings.evaluations is None and wanted > MAX_DEFAULT_EVALUATIONS:
         raise ModelError(
-            f"the lattice has {wanted} candidates, too many to evaluate one by one; give {choose_text('Genetic(evaluations=…)', '--evaluations')}"
+            f"the lattice has {wanted} candidates, too many to evaluate one by one; give "
+            f"{choose_text('Genetic(evaluations=…)', '--evaluations')}"
         )
     wanted = max(wanted, 2 * settings.population)
     total = wanted * len(settings.seeds)

@@ -17,7 +17,6 @@ import numpy.typing as npt
 
 from ftlm.data.export import Header
 from ftlm.errors import DataError
-from ftlm.io.binary_reader import SHEET_CHOICE_HINT
 from ftlm.io.cell_parsing import Timestamps
 from ftlm.io.delimited_text import parse_text
 from ftlm.io.dialect import Assumption, Layout
@@ -27,6 +26,8 @@ from ftlm.utils.validation import bad_rows
 
 _READER_PATH = Path(__file__).with_name("binary_reader.py")
 _READER_TIMEOUT_S = 60.0
+#: Remedy of the reader that the parent completes with the parameter of the interface in use.
+_SHEET_CHOICE_HINT = "say which sheet"
 
 
 @dataclass(frozen=True)
@@ -204,7 +205,7 @@ class _ReaderOutput:
         header, arrays, cells = answer
         if "error" in header:
             remedy = str(header["way_out"])
-            if remedy == SHEET_CHOICE_HINT:
+            if remedy == _SHEET_CHOICE_HINT:
                 remedy += f" with {layout_parameter(sheet=Placeholder('NAME'))}"
             raise DataError(f"{str(path)!r}: {header['error']}; {remedy}")
         if "sheet" in header:

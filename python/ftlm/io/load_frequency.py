@@ -234,7 +234,7 @@ def load_frequency(
     if "real" in found and "imag" in found:
         if magnitude_unit is not None or phase_unit is not None:
             which = "magnitude_unit" if magnitude_unit is not None else "phase_unit"
-            raise DataError(f"{which}= is not used: the file gives real and imaginary part; leave it out")
+            raise DataError(f"{parameter(which)} is not used: the file gives real and imaginary part; leave it out")
         response, factor, unit = _cartesian(found, negated, notes)
         if "magnitude" in found:
             _compare(found, response / factor, notes)

@@ -28,7 +28,7 @@ from ftlm.io.load import (
 )
 from ftlm.io.load_frequency import is_response
 from ftlm.io.table import Column, FileTable, Pool, date_order_assumption
-from ftlm.utils.parameters import NAMED_COLUMNS, Placeholder, parameter
+from ftlm.utils.parameters import NAMED_COLUMNS, Placeholder, flag_of, parameter
 from ftlm.utils.validation import CSV_TIME, join_names
 
 _INPUT_WORDS = frozenset(
@@ -287,23 +287,17 @@ class OpenedFile:
         # Options that are detected reliably or equal the default are omitted.
         plain = {a.option for a in self.assumed if not a.counts and a.option != "time"}
         words = []
-        for key, option in (
-            ("time", "--time"),
-            ("step", "--sampling"),
-            ("time_unit", "--time-unit"),
-            ("resample", "--resample"),
-            ("missing", "--missing"),
-        ):
+        for key in ("time", "step", "time_unit", "resample", "missing"):
             if key in told and key not in plain:
-                words += [option, str(told[key])]
-        if "slice" in told:
-            words += ["--slice", ":".join("" if end is None else repr(end) for end in told["slice"])]
-        for key, option in (("inputs", "-u"), ("outputs", "-y"), ("units", "--unit"), ("intersample", "--intersample")):
+                words += [flag_of(key), str(told[key])]
+        if "window" in told:
+            words += [flag_of("window"), ":".join("" if end is None else repr(end) for end in told["window"])]
+        for key in ("inputs", "outputs", "units", "intersample"):
             bare = key in ("inputs", "outputs")
             pairs = (name if bare and name == value else f"{name}={value}" for name, value in told.get(key, {}).items())
-            words += [w for pair in pairs for w in (option, pair)]
+            words += [w for pair in pairs for w in (flag_of(key), pair)]
         told_layout: Layout = told.get("layout", Layout())
-        words += [w for k, v in told_layout.to_dict().items() if k not in plain for w in (f"--{k}", str(v))]
+        words += [w for k, v in told_layout.to_dict().items() if k not in plain for w in (flag_of(k), str(v))]
         return words
 
 

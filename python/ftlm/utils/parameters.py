@@ -51,6 +51,11 @@ def use_interface(name: Interface) -> Iterator[None]:
         _Current.interface = before
 
 
+def flag_of(name: str) -> str:
+    """Return the flag of a parameter on the command line."""
+    return FLAG_BY_PARAMETER.get(name, f"--{name.replace('_', '-')}")
+
+
 def parameter(name: str, value: object = None) -> str:
     """Reference to a parameter, alone or with a value.
 
@@ -74,7 +79,7 @@ def parameter(name: str, value: object = None) -> str:
     """
     if _Current.interface == "python":
         return f"{name}=" if value is None else f"{name}={value!r}"
-    flag = FLAG_BY_PARAMETER.get(name, f"--{name.replace('_', '-')}")
+    flag = flag_of(name)
     if value is None or value is True:
         return flag
     if value is False:
