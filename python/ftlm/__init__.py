@@ -162,7 +162,7 @@ _PUBLIC_MODULES = frozenset(
     }
 )
 
-__all__ = [*sorted({*_MODULE_BY_NAME, "rig"}, key=lambda name: (not name.isupper(), not name[0].isupper(), name))]
+__all__ = list(sorted({*_MODULE_BY_NAME, "rig"}, key=lambda name: (not name.isupper(), not name[0].isupper(), name)))
 
 
 def __getattr__(name: str) -> object:
