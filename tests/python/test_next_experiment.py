@@ -350,7 +350,7 @@ def test_peak_swing_and_slew_are_kept_and_said(found: ftlm.Identification, desig
 
 
 def test_the_widest_axis_is_shorter_by_its_own_criterion(found: ftlm.Identification) -> None:
-    options = {"names": ["alpha", "a1"], "limits": {"y": 0.9}, "duration": 4.0}
+    options = {"parameters": ["alpha", "a1"], "limits": {"y": 0.9}, "duration": 4.0}
     both = {c: ftlm.design_input(found, criterion=c, **options) for c in ("D", "E")}
     laid = ModelFit.of(found.model, parameter_set_of(found.model).noise)
     widest, all_of_it = Criterion("E", (0, 1), (1.0, abs(laid.values[1]))), Criterion("D", (0, 1), (1.0, 1.0))
@@ -417,9 +417,9 @@ BAD = {
     "slew": ({"slew": 1e-3}, None, "slew of u = 0.001 a second takes"),
     "limit of an input": ({"limits": {"u": 1}}, None, "limits names 'u'.*none of y"),
     "limit below 0": ({"limits": {"y": -1}}, None, "limits of y = -1 is not above 0"),
-    "names": ({"names": ["alhpa"]}, None, r"names\[0\] = 'alhpa'.*did you mean 'alpha'"),
-    "no names": ({"names": []}, None, "names is empty"),
-    "twice": ({"names": ["a0", "a0"]}, None, "'a0' twice"),
+    "parameters": ({"parameters": ["alhpa"]}, None, r"names\[0\] = 'alhpa'.*did you mean 'alpha'"),
+    "no names": ({"parameters": []}, None, "names is empty"),
+    "twice": ({"parameters": ["a0", "a0"]}, None, "'a0' twice"),
     "criterion": ({"criterion": "A"}, None, "criterion = 'A' is not known"),
     "duration": ({"duration": -1.0}, None, "duration = -1 is not a length"),
     "not a number": ({"step": math.nan}, None, "step = nan is not a step"),
@@ -432,8 +432,8 @@ BAD = {
     "tiny noise": ({"noise": 1e-320}, None, "noise of y = .* is no size"),
     "criteria": ({"criterion": np.array(["D", "E"])}, None, "criterion = array"),
     "progress": ({"progress": 5}, None, "progress is a int"),
-    "no list": ({"names": 5}, None, "names is a int"),
-    "no name": ({"names": [["alpha"]]}, None, r"names\[0\] = \['alpha'\] is no free number"),
+    "no list": ({"parameters": 5}, None, "names is a int"),
+    "no name": ({"parameters": [["alpha"]]}, None, r"names\[0\] = \['alpha'\] is no free number"),
     "long seed": ({"seed": -(10**5000)}, None, "seed = an integer of 16610 bits"),
     "seed": ({"seed": -1}, None, "seed = -1"),
     "period": ({"period": 0.01}, None, "period = 0.01 s is not between"),

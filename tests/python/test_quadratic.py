@@ -152,7 +152,7 @@ def test_an_observer_along_a_run_is_the_recursion_and_takes_noise_away():
 def closed(controller, factor):
     """Largest eigenvalue of SciPy's plant, times a factor, under a controller: plant, what acts now, controller."""
     a, b, c = whole_system()
-    own, into = controller._closed()
+    own, into = controller._transition_matrices()
     gains = controller._gains
     # The command of a sample is the controller's next state; it acts from the next sample on.
     size, width = len(a), len(own)
@@ -417,14 +417,14 @@ PATHS = [
     ({"path": [1.0, 2.0]}, ftlm.DataError, "no array of 16"),
     ({"path": np.zeros(100)}, ftlm.DataError, "stands still"),
     ({"path": np.r_[np.zeros(50), 1e308, 1e308]}, ftlm.DataError, r"beyond 1e.100 at row 50 .2 such"),
-    ({"of": 10**5000}, ftlm.ModelError, "of = an integer of 16610 bits is not a sum"),
+    ({"output": 10**5000}, ftlm.ModelError, "of = an integer of 16610 bits is not a sum"),
     ({"path": np.arange(100.0)}, ftlm.DataError, "does not begin at rest"),
     ({"path": np.r_[0, 0, np.arange(100.0)]}, ftlm.DataError, "does not end at rest"),
     ({"path": np.r_[0, 0, np.nan, np.inf, np.ones(50)]}, ftlm.DataError, r"not finite at row 2 .2 such"),
     ({"limit": 0.2}, ftlm.ModelError, r"needs a command of .* over the limit of 0.2; give it more time"),
     ({"limit": "1"}, ftlm.ModelError, "limit = '1' is not a number"),
-    ({"of": "hub + bned"}, ftlm.ModelError, "did you mean 'bend'"),
-    ({"of": None}, ftlm.ModelError, "of = None is not a sum"),
+    ({"output": "hub + bned"}, ftlm.ModelError, "did you mean 'bend'"),
+    ({"output": None}, ftlm.ModelError, "of = None is not a sum"),
     ({"samples": 1.5}, ftlm.ModelError, "samples = 1.5"),
     ({"seed": -1}, ftlm.ModelError, "seed = -1"),
     ({"path": control.point_to_point(0.3, 0.2, dwell_before=0.0)}, ftlm.ModelError, "rest longer before its move"),
@@ -440,7 +440,7 @@ def ready():
 def test_what_cannot_be_followed_is_refused(case, ready):
     options, kind, words = PATHS[case]
     with pytest.raises(kind, match=words):
-        control.inverse_dynamics(ready, **{"path": control.point_to_point(0.3, 0.5), "of": "hub + bend", **options})
+        control.inverse_dynamics(ready, **{"path": control.point_to_point(0.3, 0.5), "output": "hub + bend", **options})
 
 
 def test_intervals_too_wide_for_a_path_are_refused_in_words():
@@ -456,8 +456,8 @@ def test_intervals_too_wide_for_a_path_are_refused_in_words():
 @pytest.mark.parametrize(
     ("options", "words"),
     [
-        ({"size": math.nan}, "size = nan"),
-        ({"size": "20"}, "size = '20'"),
+        ({"distance": math.nan}, "size = nan"),
+        ({"distance": "20"}, "size = '20'"),
         ({"duration": 0.0}, "duration = 0.0"),
         ({"duration": 0.01}, "fewer than ten samples"),
         ({"duration": 1e6}, "longer than 100000"),
@@ -468,4 +468,4 @@ def test_intervals_too_wide_for_a_path_are_refused_in_words():
 )
 def test_what_is_no_move_is_refused(options, words):
     with pytest.raises(ftlm.ModelError, match=words):
-        control.point_to_point(**{"size": 0.3, "duration": 0.5, **options})
+        control.point_to_point(**{"distance": 0.3, "duration": 0.5, **options})
