@@ -246,7 +246,7 @@ def test_a_folder_that_cannot_be_written_is_said_before_any_work(tmp_path, ident
 def test_intervals_that_are_none_are_said(tmp_path, small_run, with_noise):
     found = ftlm.identify(with_noise(small_run, 0.02, 1), ftlm.equation("D^alpha y = a D^0.6 y + c y + b u"))
     broken = replace(found.fit, covariance=np.full_like(found.fit.covariance, np.nan))
-    result = replace(found, joint=broken)
+    result = replace(found, fit=broken)
     text = " ".join(Page(result.report(tmp_path / "p.html").read_text("utf-8")).text)
     assert text.count("undefined") >= 3 * 4
     assert "the standard errors of alpha, a, c, b are not defined" in text

@@ -77,7 +77,7 @@ class Trajectory:
         return {
             "rows": len(self.path),
             "largest_command": float(np.max(np.abs(self.command))),
-            "left": self.residual_vibration,
+            "residual_vibration": self.residual_vibration,
             "plain": self.plain,
         }
 

@@ -247,11 +247,11 @@ class RunArguments:
         """Return the half-open range of rows inside the data window."""
         first, last = 0, times.size
         if self.window is not None:
-            first, last = window_rows(times, self.window, "slice", self.time_label)
+            first, last = window_rows(times, self.window, "window", self.time_label)
         if last - first < MIN_RUN_SAMPLES:
             thing = self.label_of((*self.inputs, *self.outputs)[0]) if self.time is None else self.time_label
             raise DataError(
-                f"{thing}: {last - first} rows{' in the slice' if self.window is not None else ''}, "
+                f"{thing}: {last - first} rows{' in the window' if self.window is not None else ''}, "
                 f"{MIN_RUN_SAMPLES} are needed; use a longer record"
             )
         return first, last

@@ -155,7 +155,7 @@ class Run:
             Recorded in `warnings`. Nonuniform or missing samples are kept in `sample_times`: the output error is
             simulated with the original inputs and evaluated at the original output times. Equation-error methods use
             the resampled signals.
-        slice : pair of float or None, optional
+        window : pair of float or None, optional
             Use the rows with a ≤ t < b only, [s] since the first row; applied before any other check of the rows.
         time_unit : {"s", "ms", "us", "min", "h"}, default "s"
             Unit of `time`.
@@ -354,7 +354,7 @@ class Run:
         ----------
         start, stop : float or None
             [s] since this run's first row, 0 ≤ start < stop ≤ N·step; None for the first row or past the last one.
-            The row at `stop` is left out, so ``run.slice(0, b)`` and ``run.slice(b, None)`` share no row.
+            The row at `stop` is left out, so ``run.window(0, b)`` and ``run.window(b, None)`` share no row.
 
         Returns
         -------
@@ -366,9 +366,9 @@ class Run:
         DataError
             If a limit lies outside the run, the limits do not increase, or fewer than three rows remain.
         """
-        first, last = window_rows(uniform_times(self.length, self.step), (start, stop), "slice")
+        first, last = window_rows(uniform_times(self.length, self.step), (start, stop), "window")
         if last - first < MIN_RUN_SAMPLES:
-            raise DataError(f"slice: {last - first} rows remain, {MIN_RUN_SAMPLES} are needed; widen the limits")
+            raise DataError(f"window: {last - first} rows remain, {MIN_RUN_SAMPLES} are needed; widen the limits")
         data = {name: values[first:last] for name, values in self._data.items()}
         # Digits beyond the twelfth are rounding errors of the sum.
         begin = self.start if first == 0 else float(f"{self.start + first * self.step:.12g}")

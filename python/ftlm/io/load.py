@@ -90,7 +90,7 @@ def load(
         Intersample behavior of an input; default ``"zoh"``.
     step : float, optional
         Time between rows [s], > 0, in place of `time`.
-    slice : pair of float or None, optional
+    window : pair of float or None, optional
         Use the rows with a ≤ t < b only, [s] since the first row.
     resample : float, optional
         Resample to this step [s]: interval means of held inputs, linear interpolation of all other signals.

@@ -224,7 +224,7 @@ def find_dead_channel(run: Run, name: str) -> Iterator[Finding]:
     if resting and not inputs_moved:
         return
     begin, end = first * run.step, (first + rows) * run.step
-    after = f"use window({end:.4g}, None)" if first < run.length // 20 else "check the sensor, or slice it away"
+    after = f"use window({end:.4g}, None)" if first < run.length // 20 else "check the sensor, or cut it away"
     yield Finding(
         "dead",
         name,

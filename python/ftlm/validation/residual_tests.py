@@ -77,7 +77,7 @@ class FeedbackTest:
     def to_dict(self) -> dict[str, Any]:
         """For JSON."""
         shown = {"statistic": finite(self.statistic), "limit": finite(self.limit)}
-        return {**shown, "found": self.has_feedback, "instant": self.instant, "decided": self.conclusive}
+        return {**shown, "has_feedback": self.has_feedback, "instant": self.instant, "conclusive": self.conclusive}
 
 
 def past_regressors(
@@ -284,7 +284,7 @@ class CorrelationTest:
             "values": list(map(finite, self.values.tolist())),
             **{n: finite(getattr(self, n)) for n in ("band", "statistic", "limit")},
             "passed": self.passed,
-            "decided": self.conclusive,
+            "conclusive": self.conclusive,
         }
 
 
@@ -415,7 +415,7 @@ class Residuals:
         """For JSON."""
         return {
             "passed": self.passed,
-            "decided": self.conclusive,
+            "conclusive": self.conclusive,
             "runs": list(self.runs),
             "refinement": self.refinement,
             "outputs": {name: output.to_dict() for name, output in self.outputs.items()},
