@@ -130,7 +130,7 @@ def cell(seeds: int) -> Iterator[str]:
             ended.append((z, time.process_time() - start, found))
         z = np.array([e[0] for e in ended])
         last = ended[-1][2]
-        words = ", ".join(f"{n} {last.joint_values[n]:.5g} ± {last.standard_errors[n]:.2g}" for n in truth)
+        words = ", ".join(f"{n} {last.parameter_values[n]:.5g} ± {last.standard_errors[n]:.2g}" for n in truth)
         yield (
             f"cell, {hold}, 50 000 rows, 1 % noise, {seeds} seeds: mean z "
             f"{', '.join(f'{v:.2f}' for v in z.mean(axis=0))}, covered {100 * np.mean(np.abs(z) < 1.96):.0f} %; the "

@@ -59,7 +59,7 @@ if _typing.TYPE_CHECKING:
     from ftlm.io.preview import open_file as open_file
     from ftlm.model.model import Estimate as Estimate
     from ftlm.model.model import Model as Model
-    from ftlm.model.model import load_model as load_model
+    from ftlm.model.serialization import load_model as load_model
     from ftlm.order_search.certificate import certify_orders as certify_orders
     from ftlm.order_search.result import OrderCertificate as OrderCertificate
     from ftlm.order_search.result import SearchResult as SearchResult
@@ -125,7 +125,8 @@ _MODULE_BY_NAME = {
         "io.load": "load",
         "io.load_frequency": "load_frequency",
         "io.preview": "FileColumn OpenedFile open_file",
-        "model.model": "Estimate Model load_model",
+        "model.model": "Estimate Model",
+        "model.serialization": "load_model",
         "order_search.certificate": "certify_orders",
         "order_search.result": "OrderCertificate SearchResult SearchRow StoreStatus",
         "order_search.search": "resume_search search_orders search_status",

@@ -644,7 +644,7 @@ def test_names_with_scripts_in_them_are_text(used, loop):
     text=st.sampled_from(["D y = a y + b u", '"); import os #', "x\n'''", *NAMED_STRUCTURES]) | st.text(min_size=1),
 )
 def test_a_script_is_python_whatever_names_are_in_it(name, text):
-    options = {"time": name, "inputs": {name: text}, "units": {name: "V"}, "slice": [0.5, None], "step": 0.1}
+    options = {"time": name, "inputs": {name: text}, "units": {name: "V"}, "window": [0.5, None], "step": 0.1}
     recipe = FitRequest(RunSource(name, options), RunSource(name), structure=(text,), method="least-squares")
     script = recipe._script(None)
     tree = ast.parse(script.encode())
@@ -665,7 +665,7 @@ def test_fields_become_arguments():
     ]
     said = {"columns": columns, "step": "", "from": "1.5", "to": "", "header": "1", "decimal": "comma", "missing": ""}
     assert parse_fields(said) == {
-        "slice": [1.5, None],
+        "window": [1.5, None],
         "layout": {"decimal": "comma", "header": 1},
         "time": "t",
         "inputs": {"u": "u [V]"},
@@ -709,7 +709,7 @@ def test_roles_are_changed_and_what_is_missing_is_said(page, content):
     status, _, text = page.own("POST", f"files/{key}", {"columns": columns, "from": "1", "to": "9"})
     assert status == 200
     assert "To do" not in text
-    assert page.desk.files[key].preview["options"]["slice"] == [1.0, 9.0]
+    assert page.desk.files[key].told["options"]["window"] == [1.0, 9.0]
     assert page.desk.files[key].told["length"] == 160
     assert page.own("DELETE", f"files/{key}")[0] == 200
     assert list(page.desk.folder.iterdir()) == []

@@ -161,7 +161,7 @@ def test_what_cannot_be_done_is_said(small_run, monkeypatch):
         ftlm.identify(small_run, structure, method="least-squares", genetic=Genetic())
     with pytest.raises(ftlm.ModelError, match="genetic is dict, not Genetic"):
         ftlm.identify(small_run, structure, method="genetic", genetic={"seeds": 1})
-    late = small_run.slice(2.0, None)
+    late = small_run.window(2.0, None)
     with pytest.raises(ftlm.ModelError, match="knows no initial terms and needs runs that start at rest"):
         ftlm.identify(late, structure, method="genetic", genetic=Genetic(evaluations=400))
     monkeypatch.setitem(sys.modules, "pygad", None)

@@ -119,7 +119,7 @@ def test_default_m_is_what_the_runs_carry(small_run, second, structure):
 
 def test_runs_that_do_not_start_at_rest_get_initial_terms(small_run, structure):
     # From t = 3 s on nothing before is known: a history is estimated, of this run alone, and reported.
-    piece = replace_name(small_run.slice(3.0, None), "piece")
+    piece = replace_name(small_run.window(3.0, None), "piece")
     found = ftlm.identify([small_run, piece], structure, method="least-squares", m=256)
     assert found.settings["initial"] == "history, 10 powers of t up to 2.25"
     assert found.coefficients == {n: pytest.approx(v, rel=0.05) for n, v in TRUTH.items()}
@@ -268,7 +268,7 @@ def test_law_search_recovers_the_five_free_orders_of_plant_a(clean_a, plants):
 @pytest.mark.parametrize("method", METHODS)
 @pytest.mark.parametrize("initial", ["auto", "caputo"])
 def test_printed_figures_are_those_of_compare(small_run, second, with_noise, method, initial, tmp_path):
-    runs = [with_noise(small_run, 0.01, 1), with_noise(second, 0.02, 2).slice(1.0, None)]
+    runs = [with_noise(small_run, 0.01, 1), with_noise(second, 0.02, 2).window(1.0, None)]
     words = ftlm.equation("D^alpha y = a D^nu y + c y + b u", initial=initial)
     order_grid = ftlm.order_grid(increment=0.2, alpha=(1.4, 1.8))
     found = ftlm.identify(runs, words, method=method, order_grid=order_grid, m=128)

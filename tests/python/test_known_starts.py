@@ -40,7 +40,7 @@ def test_what_is_not_known_does_nothing_at_first():
 
 def test_a_richer_structure_from_a_simpler_one_is_never_worse(run, simple):
     rich = ftlm.identify(run, ftlm.equation(RICH, initial="rest"), start=simple, intervals="quadratic", threads=1)
-    assert rich.fit.noise["y"] <= simple.joint.noise["y"] * (1 + 1e-6)
+    assert rich.fit.noise["y"] <= simple.fit.noise["y"] * (1 + 1e-6)
     from_model = ftlm.identify(
         run, ftlm.equation(RICH, initial="rest"), start=simple.model, intervals="quadratic", threads=1
     )

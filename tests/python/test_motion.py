@@ -249,7 +249,7 @@ def test_the_length_follows_the_noise_never_the_fit(halves):
         resolve_initial_conditions(run, worse) == resolve_initial_conditions(run, structure) == history(run, structure)
     )
     assert history(run, ftlm.equation("D^4.2 y = a y + b u"))[-3:] == (2.0, 3.0, 4.0)
-    short = run.slice(None, 3.0)
+    short = run.window(None, 3.0)
     assert history(short, structure) == (0.0, 0.25, 0.5, 0.75, 1.0, 2.0)
 
 

@@ -511,8 +511,8 @@ def test_it_prints_goes_into_a_frame_and_json_and_is_drawn(designed: ftlm.Design
     frame = designed.to_frame()
     assert frame.loc["a0", "designed"] == designed.errors["designed"]["a0"]
     document = json.loads(json.dumps(designed.to_dict(), allow_nan=False))
-    assert document["chosen"] == ["alpha"]
-    assert document["reached"]["y"]["limit"] == 0.9
+    assert document["parameters"] == ["alpha"]
+    assert document["predicted_extremes"]["y"]["limit"] == 0.9
     figure = ftlm.plot.design(designed)
     assert [a.get_xlabel() for a in figure.axes] == ["time [s]", "time [s]", "frequency [Hz]"]
     with pytest.raises(ftlm.ModelError, match="give what design_input returns"):

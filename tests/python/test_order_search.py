@@ -156,7 +156,7 @@ def test_several_runs_are_one_fit(run, second, norm, coefficients):
 
 
 def test_initial_terms_belong_to_each_run(run, second):
-    moved = [r.slice(2.0, None) for r in (run, second)]
+    moved = [r.window(2.0, None) for r in (run, second)]
     options = {"criterion": "output-error", "norm": "l2", "coefficients": "least-squares"}
     structure = ftlm.equation(EQUATION, initial=(0.0, 1.0))
     found = ftlm.search_orders(moved, structure, ftlm.OrderGrid(orders=GRID), m=M, **options)

@@ -330,7 +330,7 @@ def test_a_number_that_is_not_seen_has_the_whole_line() -> None:
         on_grid=values,
         covariance=np.diag([1.0, np.inf, np.inf]),
     )
-    seen = replace(plain, task=task, joint=joint).profile(threads=1)
+    seen = replace(plain, task=task, fit=joint).profile(threads=1)
     assert (seen["b"].low, seen["e"].high) == (-math.inf, math.inf)
     assert -4.0 in seen["a"]
     assert not seen["a"].is_open

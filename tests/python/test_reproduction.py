@@ -316,8 +316,8 @@ def test_output_error_finds_the_simulated_arm_and_its_intervals_say_so(reproduct
     for number, stage in reproduction.stages.items():
         result = stage.candidates["output error"].result
         truth = reproduction.truth[number]
-        for name in (*result.orders, *result.joint.coefficients):
-            value = {**result.orders, **result.joint.coefficients}[name]
+        for name in (*result.orders, *result.fit.coefficients):
+            value = {**result.orders, **result.fit.coefficients}[name]
             assert abs(value - truth[name]) < 4 * result.standard_errors[name], name
         # What is left is the noise that was put on the angles.
         assert all(f.rmse == pytest.approx(1e-4, rel=0.05) for f in result.output_error.values())
@@ -432,8 +432,8 @@ def test_measured_runs_of_one_stage(reproduction, tmp_path):
 
 def test_a_long_run_that_does_not_start_at_rest(reproduction, tmp_path, monkeypatch):
     own = ["I2", "theta21", "theta22"]
-    moving = reproduction.square.select(own).slice(1.3, 4.3)
-    other = reproduction.sine.select(own).slice(0.7, 3.7)
+    moving = reproduction.square.select(own).window(1.3, 4.3)
+    other = reproduction.sine.select(own).window(0.7, 3.7)
     monkeypatch.setattr("ftlm.reproduction.stage_models.MAX_REGRESSION_SAMPLES", 1000)
     monkeypatch.setattr("ftlm.reproduction.stage_models.JOINT_ROWS", 500)
     told = []

@@ -111,7 +111,7 @@ def test_several_runs_a_delay_and_a_sensor_filter_survive_in_a_store(run, tmp_pa
         "D^alpha y = a D^beta y + b u", delay={"u": 0.01}, sensor_filter=ftlm.SensorFilter.low_pass(["y"])
     )
     path = tmp_path / "s.ftlm"
-    runs = [run, run.slice(1.0, 6.0)]
+    runs = [run, run.window(1.0, 6.0)]
     found = ftlm.search_orders(runs, structure, m=128, store=path)
     assert bytes_of(found) == bytes_of(ftlm.search_orders(runs, structure, m=128))
     assert bytes_of(ftlm.resume_search(path)["y"]) == bytes_of(found)
@@ -685,7 +685,7 @@ def another(text):
 @pytest.mark.parametrize(
     ("change", "message"),
     [
-        (lambda run, path: search(run.slice(0.0, 8.0), path), "asked is other data"),
+        (lambda run, path: search(run.window(0.0, 8.0), path), "asked is other data"),
         (lambda run, path: search(run, path, m=64), "asked is other data"),
         (lambda run, path: search(run, path, order_grid=ftlm.order_grid(increment=0.2)), "asked is another lattice"),
         (lambda run, path: search(run, path, norm="l2"), "asked is other settings: norm = l2"),

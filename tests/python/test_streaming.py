@@ -47,7 +47,7 @@ def test_every_length_of_a_stream_is_the_closed_form_of_that_length(run, stage):
     for rows in (40, 41, 300, 1001):
         stream.push(samples(stream, run)[done:rows])
         done = rows
-        part = run.slice(0.0, rows * run.step)
+        part = run.window(0.0, rows * run.step)
         assert part.length == rows
         truth = batch(part, stage)
         for name, value in stream.coefficients.items():

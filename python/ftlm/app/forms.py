@@ -210,7 +210,7 @@ class FitRequest:
             lines += self.estimation.script("run")
         else:
             lines += self.estimation.script("whole")
-            lines.append(f"run, other = whole.slice(None, {cut!r}), whole.slice({cut!r}, None)")
+            lines.append(f"run, other = whole.window(None, {cut!r}), whole.window({cut!r}, None)")
         if self.validation is not None:
             lines += self.validation.script("other")
         if not self.is_choice:
@@ -346,7 +346,7 @@ def parse_fields(said: Mapping[str, Any]) -> dict[str, Any]:
             asked[name] = _text(said, name)
     ends = [parse_number(name, _text(said, name)) if _text(said, name) else None for name in ("from", "to")]
     if ends != [None, None]:
-        asked["slice"] = ends
+        asked["window"] = ends
     layout: dict[str, Any] = {name: _text(said, name) for name in TEXT_LAYOUT_FIELDS if _text(said, name)}
     layout |= {name: _parse_line_count(name, _text(said, name)) for name in INTEGER_LAYOUT_FIELDS if _text(said, name)}
     if layout:

@@ -44,7 +44,7 @@ from ftlm.estimation import consistency as parts_of_runs
 from ftlm.estimation import identify as estimation
 from ftlm.estimation.frequency_domain import identify_frequency as frequency_estimation
 from ftlm.io.load_frequency import load_frequency
-from ftlm.model.model import load_model
+from ftlm.model.serialization import load_model
 from ftlm.order_search.certificate import certify_job, check_certifiable
 from ftlm.order_search.checkpoint import Store
 from ftlm.order_search.options import check_options_used

@@ -40,7 +40,7 @@ OPTION_BY_ARGUMENT = {
     "threads": "--threads",
     "store": "--store",
     "genetic": "--seed or --evaluations",
-    "slice": "--slice",
+    "window": "--slice",
     "resample": "--resample",
     "step": "--sampling",
     "time": "--time",

@@ -147,7 +147,7 @@ class ReadingOptions:
         announce_reading(files)
         options = {name: value for name, value in given.items() if value not in (None, {}, "")}
         if self.sliced is not None:
-            options["slice"] = interval(self.sliced, "--slice", "1.1:19.5")
+            options["window"] = interval(self.sliced, "--slice", "1.1:19.5")
         if not apart and len(files) > 1 and all(f.lower().endswith(".mat") for f in files):
             try:
                 load(files[0], **options)

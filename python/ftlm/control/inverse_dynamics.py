@@ -13,7 +13,7 @@ from ftlm.control.arguments import POSITIVE_RANGE, check_limit, check_samples, p
 from ftlm.control.fractional_pid import least_certain_parameter
 from ftlm.control.stability_margins import LoopDesign, Plant
 from ftlm.errors import DataError, ModelError
-from ftlm.model.model import ModelData
+from ftlm.model.model import Model
 from ftlm.utils.validation import Complex, Floats, real_number, short_repr
 
 #: Length of the transform relative to the path, and exponent of its weight exp(-t): the weight suppresses the periodic
@@ -77,7 +77,7 @@ class Trajectory:
         return {
             "rows": len(self.path),
             "largest_command": float(np.max(np.abs(self.command))),
-            "left": self.residual_vibration,
+            "residual_vibration": self.residual_vibration,
             "plain": self.plain,
         }
 
@@ -191,7 +191,7 @@ def inverse_dynamics(
     weight = np.exp(-fall * np.arange(size) / design.rate)
     heard, acts, asks = design.controller_response(w[inside])
 
-    def closed_loop_response(model: ModelData) -> tuple[Complex, Complex]:
+    def closed_loop_response(model: Model) -> tuple[Complex, Complex]:
         """Command and outputs of the closed loop per reference."""
         held = np.array([replace(p, model=model).response(w[inside]) for p in design.plants])
         loop = np.sum([a * held[names.index(o)] for o, a in zip(heard, acts, strict=True)], axis=0)

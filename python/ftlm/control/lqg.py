@@ -17,7 +17,7 @@ from ftlm.control.realization import Realisation, catch_numerical_errors, fit_re
 from ftlm.control.stability_margins import LoopDesign, Margins, Plant, margins_of
 from ftlm.data.run import Run
 from ftlm.errors import DataError, ModelError
-from ftlm.model.model import ModelData, check_model
+from ftlm.model.model import Model, check_model
 from ftlm.utils.validation import Complex, Floats, nearest, short_repr
 
 #: Name of the input disturbance in the estimates.
@@ -118,7 +118,7 @@ class Observer:
 
 
 def observer(
-    model: ModelData,
+    model: Model,
     *,
     input: str | None = None,
     measured: Sequence[str] | None = None,
@@ -171,7 +171,7 @@ def observer(
     )
 
 
-def plants_of(model: ModelData, driver: str | None, rate: float, coupling: str, *, sensor: bool) -> list[Plant]:
+def plants_of(model: Model, driver: str | None, rate: float, coupling: str, *, sensor: bool) -> list[Plant]:
     """Return all outputs of a stable model from one input; raise for an unstable model."""
     check_model(model)
     plants = [plant_of(model, o, driver, rate, coupling, sensor=sensor) for o in model.outputs]
@@ -210,9 +210,7 @@ def kalman_filter(
     )
 
 
-def noise_deviations(
-    model: ModelData, measured: tuple[str, ...], given: Mapping[str, float] | None
-) -> tuple[float, ...]:
+def noise_deviations(model: Model, measured: tuple[str, ...], given: Mapping[str, float] | None) -> tuple[float, ...]:
     """Standard deviation of the noise of each measured output."""
     if given is not None and not isinstance(given, Mapping):
         raise ModelError(f"noise = {short_repr(given)} is no mapping from outputs to standard deviations")
@@ -419,7 +417,7 @@ class LqgDesign(LoopDesign):
 
 
 def lqg(
-    model: ModelData,
+    model: Model,
     *,
     max_deviation: Mapping[str, float],
     max_input: float,
@@ -503,7 +501,7 @@ def lqg(
     integral, grows = int(np.sum(at_one)), int(np.sum((np.abs(poles_of_it) > 1.0) & ~at_one))
     heard = [plants[names.index(o)] for o in seen.measured]
 
-    def loop_margins(which: ModelData) -> Margins:
+    def loop_margins(which: Model) -> Margins:
         parts = [replace(p, model=which) for p in heard]
         loop = np.sum(acting * np.array([p.response(w) for p in parts]), axis=0)
         order = max(p.integral_order() for p in parts)

@@ -21,7 +21,7 @@ from ftlm.errors import ConvergenceError, FtlmError, ModelError
 from ftlm.estimation.free_parameters import FreeProblem
 from ftlm.estimation.objective import Iterate, Objective, covariance, covariance_of
 from ftlm.estimation.output_error import JointFit, ProfileInterval, fit_output_error
-from ftlm.estimation.result import IdentificationRecord
+from ftlm.estimation.result import Identification
 from ftlm.order_search.options import Intervals, Loss
 from ftlm.utils.linalg import dot, projections, thin_svd
 from ftlm.utils.resources import interruptible_pool
@@ -636,7 +636,7 @@ def is_lower_on_finer_grid(grid: Objective, before: Floats, after: Floats) -> bo
     return costs[1] < costs[0]
 
 
-def likelihood_of(result: IdentificationRecord) -> ProfileLikelihood:
+def likelihood_of(result: Identification) -> ProfileLikelihood:
     """Return the profile likelihood around the optimum of an output-error result."""
     if result.fit is None or result.task is None:
         raise ModelError(f"method {result.method!r} has no likelihood to profile; identify by method='output-error'")
@@ -645,7 +645,7 @@ def likelihood_of(result: IdentificationRecord) -> ProfileLikelihood:
 
 
 def result_profiles(
-    result: IdentificationRecord,
+    result: Identification,
     names: Sequence[str],
     level: float,
     threads: int,

@@ -208,8 +208,8 @@ class Consistency(ReportMixin):
         """Return the parameters as a pandas frame by parameter and segment."""
         rows = [
             {
-                "number": name,
-                "part": self.names[part],
+                "parameter": name,
+                "segment": self.names[part],
                 "value": self._values(part)[name],
                 "standard_error": error,
                 "low": result.intervals[name][0],
@@ -218,26 +218,26 @@ class Consistency(ReportMixin):
             for part, result in enumerate(self.results)
             for name, error in result.standard_errors.items()
         ]
-        return to_frame(rows, ["number", "part"])
+        return to_frame(rows, ["parameter", "segment"])
 
     def to_dict(self) -> dict[str, Any]:
         """Return the result as a dictionary for JSON."""
         return {
-            "same": self.consistent,
+            "consistent": self.consistent,
             "reason": self.reason,
-            "parts": list(self.names),
+            "segments": list(self.names),
             "differences": [
                 {
-                    "number": d.name,
-                    "parts": [self.names[k] for k in d.parts],
-                    "standard_errors": finite(d.difference_in_errors),
-                    "apart": d.disjoint,
+                    "parameter": d.name,
+                    "segments": [self.names[k] for k in d.parts],
+                    "difference_in_errors": finite(d.difference_in_errors),
+                    "disjoint": d.disjoint,
                 }
                 for d in self.differences
             ],
             "distance": None if self.distance is None else finite(self.distance),
             "degrees": self.degrees,
-            "fits": {
+            "cross_validation": {
                 name: dict(zip(self.names, row, strict=True))
                 for name, row in zip(self.names, self.cross_validation, strict=True)
             },

@@ -23,7 +23,7 @@ from ftlm.estimation.nuisance_parameters import errors_with_orders, fit_with_ini
 from ftlm.estimation.objective import Iterate, Objective, long_run_covariance
 from ftlm.estimation.output_error import JointFit
 from ftlm.estimation.result import Task
-from ftlm.model.model import Model, ModelData
+from ftlm.model.model import Model
 from ftlm.order_search.checkpoint import Store
 from ftlm.order_search.options import Intervals, Loss, Settings
 from ftlm.order_search.result import SearchResult
@@ -200,7 +200,7 @@ def estimate_output_error(
     answers: Sequence[Run] | None = None,
     loss: Loss = "squares",
     intervals: Intervals = "auto",
-    begin: ModelData | Mapping[str, float] | None = None,
+    begin: Model | Mapping[str, float] | None = None,
     more: Mapping[str, float] | None = None,
     alone: bool = False,
 ) -> Fit:
@@ -217,7 +217,7 @@ def estimate_output_error(
     begins: list[dict[str, float]] = []
     if begin is not None:
         free = FreeProblem.of(replace(structure, initial="rest"))
-        given = values_of_model(free, begin, more or {}) if isinstance(begin, ModelData) else begin
+        given = values_of_model(free, begin, more or {}) if isinstance(begin, Model) else begin
         begins = warm_starts(free, given)
     # A fit that is made twice, with a history or without, is rare; profiles of intervals take a third, where they do.
     course = ShareTracker(progress)

@@ -35,7 +35,7 @@ from ftlm.estimation.nuisance_parameters import (
 from ftlm.estimation.output_error import parameter_set
 from ftlm.estimation.result import Identification, Task
 from ftlm.estimation.verdict import result_findings, saved_findings
-from ftlm.model.model import Estimate, ModelData
+from ftlm.model.model import Estimate, Model
 from ftlm.order_search.options import (
     INTERVAL_CHOICES,
     LOSS_CHOICES,
@@ -163,7 +163,7 @@ def identify(
     reference: str | None = None,
     loss: Loss | None = None,
     intervals: Intervals | None = None,
-    start: Identification | ModelData | Mapping[str, float] | None = None,
+    start: Identification | Model | Mapping[str, float] | None = None,
 ) -> Identification:
     """Identify a structure from measured runs.
 
@@ -300,7 +300,7 @@ def identify(
             "offset='auto' may need two searches, and a store keeps those of one; use offset='none' or "
             "offset='constant' with store="
         )
-    if not (start is None or isinstance(start, (Identification, ModelData, Mapping))):
+    if not (start is None or isinstance(start, (Identification, Model, Mapping))):
         raise ModelError(f"start is {type(start).__name__}; give an identification, a model, or values by name")
     begin = start.model if isinstance(start, Identification) else start
     more = start.parameter_values if isinstance(start, Identification) else {}

@@ -17,7 +17,7 @@ from ftlm.errors import ConvergenceError, DataError, ModelError
 from ftlm.estimation.free_parameters import FreeProblem, describe_collinear_inputs
 from ftlm.estimation.friction import run_friction_multistart
 from ftlm.estimation.objective import Iterate, Objective, RunSampler, propagated_errors
-from ftlm.model.model import FitParameters, ModelData
+from ftlm.model.model import FitParameters, Model
 from ftlm.order_search.options import Loss
 from ftlm.progress import TOTAL_PARTS, ShareTracker
 from ftlm.simulation.discretization import compared_values
@@ -397,7 +397,7 @@ def parameter_set(joint: JointFit, structure: Structure) -> FitParameters:
     )
 
 
-def parameter_set_of(model: ModelData) -> FitParameters:
+def parameter_set_of(model: Model) -> FitParameters:
     """Return the set of free parameters that a model file stores.
 
     Raises
@@ -415,7 +415,7 @@ def parameter_set_of(model: ModelData) -> FitParameters:
     return known
 
 
-def problem_of(model: ModelData) -> tuple[FreeProblem, list[float]]:
+def problem_of(model: Model) -> tuple[FreeProblem, list[float]]:
     """Return the estimation problem of a model for a run that starts at rest, and its parameter values.
 
     Raises

@@ -20,7 +20,7 @@ from ftlm.experiment_design.problem import Bounds, Criterion, Kind, per_signal_v
 from ftlm.experiment_design.result import DesignedInput, PredictedExtreme
 from ftlm.experiment_design.sensitivity import ModelFit, Sensitivities
 from ftlm.experiment_design.spectrum import Spectrum, best_spectrum, spectral_lines
-from ftlm.model.model import ModelData, check_model
+from ftlm.model.model import Model, check_model
 from ftlm.progress import Progress, ShareTracker
 from ftlm.simulation.discretization import check_linear
 from ftlm.utils.resources import duration_bounds, estimate_duration, stop_flag
@@ -141,7 +141,7 @@ class DesignTask:
 
 
 def design_input(
-    model: Identification | ModelData,
+    model: Identification | Model,
     *,
     reference_run: Run | None = None,
     duration: float | None = None,
@@ -305,7 +305,7 @@ def _design_candidates(
 
 
 def _check_arguments(
-    model: Identification | ModelData,
+    model: Identification | Model,
     reference_run: Run | None,
     duration: float | None,
     step: float | None,

@@ -12,7 +12,7 @@ from typing import TypeAlias, cast
 
 from ftlm.data.construction import RunArguments
 from ftlm.data.export import MAX_HEADER_BYTES, Header
-from ftlm.data.run import Run, build_run
+from ftlm.data.run import Run
 from ftlm.data.sampling import MissingPolicy, check_missing_policy
 from ftlm.data.units import split_time_header, time_unit_of
 from ftlm.errors import DataError
@@ -90,7 +90,7 @@ def load(
         Intersample behavior of an input; default ``"zoh"``.
     step : float, optional
         Time between rows [s], > 0, in place of `time`.
-    slice : pair of float or None, optional
+    window : pair of float or None, optional
         Use the rows with a ≤ t < b only, [s] since the first row.
     resample : float, optional
         Resample to this step [s]: interval means of held inputs, linear interpolation of all other signals.
@@ -207,7 +207,7 @@ def run_from_tables(tables: list[FileTable], wanted: ColumnSelection, options: L
     if header is not None:
         stated = header.step if clock.name == CSV_TIME else None
         asked = replace(asked, known_step=stated, notes=(*header.warnings, *facts), metadata=header.about)
-    return build_run(asked)
+    return Run._from_checked(**asked.checked_fields())
 
 
 @dataclass(frozen=True)

@@ -295,8 +295,8 @@ class OpenedFile:
         ):
             if key in told and key not in plain:
                 words += [option, str(told[key])]
-        if "slice" in told:
-            words += ["--slice", ":".join("" if end is None else repr(end) for end in told["slice"])]
+        if "window" in told:
+            words += ["--slice", ":".join("" if end is None else repr(end) for end in told["window"])]
         for key, option in (("inputs", "-u"), ("outputs", "-y"), ("units", "--unit"), ("intersample", "--intersample")):
             bare = key in ("inputs", "outputs")
             pairs = (name if bare and name == value else f"{name}={value}" for name, value in told.get(key, {}).items())
@@ -474,7 +474,7 @@ class _FilePreview:
             options["time"] = clock.name
         asked = self.asked
         more = {
-            "slice": asked.window,
+            "window": asked.window,
             "resample": asked.resample,
             "time_unit": asked.time_unit,
             "missing": asked.missing,
