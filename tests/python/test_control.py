@@ -10,6 +10,7 @@ from scipy import signal
 
 import ftlm
 from ftlm import control
+from ftlm.control import stability_margins
 
 W, Z = 17.7, 0.13
 POLE = W * complex(-Z, math.sqrt(1 - Z * Z))
@@ -232,10 +233,10 @@ def test_a_tuned_loop_has_the_margins_that_were_asked_for():
 def test_stability_and_margins_are_those_of_python_control(gain, stable):
     """A plant of whole order with two integrals in its loop; the delay as a high Pade."""
     model = ftlm.Model(ftlm.equation("D^3 y = -70 D^2 y - 600 D y + 4000 u"))
-    w = control.margins.grid(10.0, 200.0)
-    plant = control.margins.Plant(model, "y", "u", 200.0, "simulated")
+    w = stability_margins.nyquist_frequencies(10.0, 200.0)
+    plant = stability_margins.Plant(model, "y", "u", 200.0, "simulated")
     lead = control.FractionalPid(gain, 0.5 * gain, 0.05 * gain, 1.0, 1.0)
-    found = control.margins.margins_of(lead.response(w) * plant.response(w), w, plant.integrates() + 1.0)
+    found = stability_margins.margins_of(lead.response(w) * plant.response(w), w, plant.integral_order() + 1.0)
     s = python_control.tf("s")
     top, bottom = python_control.pade(1.5 / 200.0, 6)
     loop = gain * (1 + 0.5 / s + 0.05 * s) * 4000 / (s**3 + 70 * s**2 + 600 * s) * python_control.tf(top, bottom)

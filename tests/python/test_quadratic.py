@@ -9,6 +9,8 @@ from scipy import signal
 
 import ftlm
 from ftlm import control
+from ftlm.control import stability_margins
+from ftlm.control.lqg import UNKNOWN_INPUT
 from test_control import uncertain
 
 RATE = 500.0
@@ -78,7 +80,7 @@ def test_the_response_at_complex_frequencies_goes_on_from_the_real_ones(sensor):
     made = ftlm.Model(ftlm.equation(BROKEN, coupling="simulated", delay={"I": 0.003}, sensor_filter=passed))
     w = np.array([0.5, 17.0, 120.0])
     for output in ("hub", "bend"):
-        plant = control.margins.Plant(made, output, "I", RATE, "simulated", sensor)
+        plant = stability_margins.Plant(made, output, "I", RATE, "simulated", sensor)
         assert np.allclose(plant.response(w.astype(complex)), plant.response(w), rtol=1e-10)
 
 
@@ -211,7 +213,7 @@ def test_the_first_sample_kicks_nothing_and_the_limit_winds_nothing_up():
     free = design.with_limit(math.inf)
     for _ in range(1000):
         free([0.0, 0.0], 1.0)
-    told = [abs(c.estimate[control.kalman.UNKNOWN]) for c in (controller, free)]
+    told = [abs(c.estimate[UNKNOWN_INPUT]) for c in (controller, free)]
     assert told[0] < 2.0
     assert told[1] > 5.0 * told[0]
 
