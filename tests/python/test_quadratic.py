@@ -263,14 +263,14 @@ def test_a_tip_comes_to_rest_on_the_virtual_arm_without_any_shaper():
 
 
 REFUSED = [
-    ({"max_deviation": {}}, "allowed = {} is no mapping"),
+    ({"max_deviation": {}}, "max_deviation = {} is no mapping"),
     ({"max_deviation": [0.1]}, "is no mapping"),
     ({"max_deviation": {"hub + bent": 0.1}}, "did you mean 'bend'"),
-    ({"max_deviation": {"hub": 0.0}}, r"allowed\['hub'\] = 0.0 is not a finite number above 0"),
+    ({"max_deviation": {"hub": 0.0}}, r"max_deviation\['hub'\] = 0.0 is not a finite number above 0"),
     ({"max_deviation": {"bend": 0.01}}, "allow for deviations of every output that integrates"),
-    ({"max_input": -1.0}, "effort = -1.0"),
-    ({"max_input": "1"}, "effort = '1' is not a number"),
-    ({"process_noise": math.inf}, "drift = inf"),
+    ({"max_input": -1.0}, "max_input = -1.0"),
+    ({"max_input": "1"}, "max_input = '1' is not a number"),
+    ({"process_noise": math.inf}, "process_noise = inf"),
     ({"noise": {"hub": 1e-4}}, "noise of bend is not known"),
     ({"noise": {"hob": 1e-4}}, "did you mean 'hub'"),
     ({"noise": 1e-4}, "noise = 0.0001 is no mapping"),
@@ -283,8 +283,8 @@ REFUSED = [
     ({"noise": {"hub": 1e308, "bend": 1e-4}}, "noise of hub = 1e.308 is outside"),
     ({"noise": {"hub": 1e30, "bend": 1e-4}}, "no observer from hub, bend .*; measure more, or narrow the band"),
     ({"max_deviation": {"hub": 5e-324}}, "= 5e-324 is outside"),
-    ({"max_deviation": {7: 0.1}}, "allowed = 7 is not a sum"),
-    ({"max_deviation": 10**5000}, "allowed = an integer of 16610 bits is no mapping"),
+    ({"max_deviation": {7: 0.1}}, "max_deviation = 7 is not a sum"),
+    ({"max_deviation": 10**5000}, "max_deviation = an integer of 16610 bits is no mapping"),
     ({"band": (1e-320, 100.0)}, "; use a narrower band"),
     ({"band": (10**5000,)}, "band = a tuple is no pair"),
     ({"measured": ["bend"], "noise": {"bend": 1e-4}}, "no observer from bend"),
@@ -352,7 +352,7 @@ def test_an_observer_reads_a_run_that_fits_it():
         seen.over(run.select(["I", "hub"]))
     with pytest.raises(ftlm.DataError, match="make it for rate=250"):
         seen.over(run.resample(0.004))
-    with pytest.raises(ftlm.ModelError, match="drift = 0"):
+    with pytest.raises(ftlm.ModelError, match="process_noise = 0"):
         control.observer(model(WHOLE), noise=QUIET, process_noise=0)
 
 
@@ -463,8 +463,8 @@ def test_intervals_too_wide_for_a_path_are_refused_in_words():
         ({"duration": 0.0}, "duration = 0.0"),
         ({"duration": 0.01}, "fewer than ten samples"),
         ({"duration": 1e6}, "longer than 100000"),
-        ({"before": -1.0}, "before = -1.0"),
-        ({"after": math.inf}, "after = inf"),
+        ({"dwell_before": -1.0}, "dwell_before = -1.0"),
+        ({"dwell_after": math.inf}, "dwell_after = inf"),
         ({"rate": -5}, "rate = -5"),
     ],
 )

@@ -115,13 +115,13 @@ def point_to_point(
     ModelError
         Invalid numbers, or a move of fewer than ten samples.
     """
-    reach = real_number("size", distance)
+    reach = real_number("distance", distance)
     if not math.isfinite(reach):
         raise ModelError(f"size = {short_repr(distance)} is not a finite number")
     times = positive("duration", duration), positive("rate", rate)
-    rests = [real_number(n, v) for n, v in (("before", dwell_before), ("after", dwell_after))]
+    rests = [real_number(n, v) for n, v in (("dwell_before", dwell_before), ("dwell_after", dwell_after))]
     if not all(0 <= r < math.inf for r in rests):
-        raise ModelError(f"before = {dwell_before!r} and after = {dwell_after!r} are not seconds from 0")
+        raise ModelError(f"dwell_before = {dwell_before!r} and dwell_after = {dwell_after!r} are not seconds from 0")
     if times[0] * times[1] < 10:
         raise ModelError(
             f"duration = {short_repr(duration)} s has fewer than ten samples at {times[1]:g} Hz; give it more time"
@@ -182,7 +182,7 @@ def inverse_dynamics(
     count, start = check_samples(samples, seed)
     most = check_limit(limit)
     names = tuple(p.output for p in design.plants)
-    row = sum_row("of", names[0] if output is None and len(names) == 1 else output, names)
+    row = sum_row("output", names[0] if output is None and len(names) == 1 else output, names)
     size = 1 << math.ceil(math.log2(TRANSFORM_LENGTH_FACTOR * len(rows)))
     # On a line right of all poles and left of the zeros that a tip has there: s = jw, its real part above 0.
     fall = WEIGHT_DECAY * design.rate / size

@@ -167,7 +167,7 @@ def observer(
         fit_realization(plants, band, poles),
         names,
         noise_deviations(model, names, noise),
-        positive("drift", process_noise),
+        positive("process_noise", process_noise),
     )
 
 
@@ -441,7 +441,7 @@ def lqg(
     ----------
     model
         Linear model that is stable except for an integrator.
-    allowed : mapping
+    max_deviation : mapping
         Maximum acceptable deviations of outputs, or of sums such as ``"theta11 + theta12"`` (a tip); Bryson's rule.
     max_input
         Maximum acceptable input, in its unit.
@@ -477,8 +477,8 @@ def lqg(
     on the exact response decides.
     """
     count, start = check_samples(samples, seed)
-    dear = positive("effort", max_input)
-    walks = 0.2 * dear if process_noise is None else positive("drift", process_noise)
+    dear = positive("max_input", max_input)
+    walks = 0.2 * dear if process_noise is None else positive("process_noise", process_noise)
     plants = plants_of(model, input, rate, coupling, sensor=sensor)
     names = tuple(p.output for p in plants)
     read = select_outputs("measured", measured, names)
@@ -542,7 +542,7 @@ def _weights(max_deviation: Mapping[str, float], names: tuple[str, ...]) -> list
             f"{{{names[0]!r}: 0.01}}"
         )
     return [
-        (sum_row("allowed", text, names), positive(f"allowed[{short_repr(text)}]", size))
+        (sum_row("max_deviation", text, names), positive(f"max_deviation[{short_repr(text)}]", size))
         for text, size in max_deviation.items()
     ]
 

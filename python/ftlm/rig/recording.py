@@ -351,7 +351,7 @@ class Experiment:
     def record_run(self, source_on: Callable[[Board], CommandSource], told: dict[str, Any]) -> Run:
         """Run the experiment with a command source and return the recorded run."""
         # Flags that let an arm move must be bool; truthy values are rejected.
-        for name, flag in (("paced", self.real_time), ("arm", self.arm), ("force", self.force)):
+        for name, flag in (("real_time", self.real_time), ("arm", self.arm), ("force", self.force)):
             if not isinstance(flag, bool):
                 raise ModelError(f"{name} = {short_repr(flag)} is neither True nor False; use one of them")
         if self.progress is not None and not callable(self.progress):
@@ -369,7 +369,7 @@ class Experiment:
             horizon=self.limit,
             board=self.board,
         )
-        paced = self.real_time or board.hardware or bool(getattr(board, "paced", False))
+        paced = self.real_time or board.hardware or bool(getattr(board, "real_time", False))
         if board.hardware and not self.arm:
             raise ModelError(
                 f"the {board.name} moves a real arm: clear its workspace, keep the emergency stop at hand, and say so "
@@ -386,7 +386,7 @@ class Experiment:
             "seed": self.seed,
             "rate": self.rate,
             "duration": self.duration,
-            "paced": paced,
+            "real_time": paced,
             "watchdog": self.watchdog,
             "sensor_filter": self.sensor_filter,
             **told,
