@@ -511,7 +511,7 @@ def lqg(
     if not (nominal.stable and nominal.sensitivity <= MAX_SENSITIVITY):
         raise ModelError(
             f"the loop is no design on the exact response of the model ({nominal}): such loops have no guaranteed "
-            "margins; make effort smaller, drift larger or the noise smaller, or allow for larger deviations"
+            "margins; make max_input smaller, process_noise larger or the noise smaller, or allow for larger deviations"
         )
     margins = tuple(loop_margins(one.model) for one in plants[0].samples(count, start))
     broken = [m for m in margins if not (m.stable and m.sensitivity <= MAX_SENSITIVITY)]
@@ -520,7 +520,7 @@ def lqg(
             f"the intervals are too wide to design on: in {len(broken)} of {len(margins)} samples of the model's "
             f"numbers the loop is not stable or has a largest sensitivity above {MAX_SENSITIVITY:g}; "
             f"{least_certain_parameter(model)}; "
-            "identify from a longer or richer run (ftlm design-input lays it out), or make effort smaller"
+            "identify from a longer or richer run (ftlm design-input lays it out), or make max_input smaller"
         )
     return LqgDesign(controller, realisation, nominal, margins, tuple(plants))
 
