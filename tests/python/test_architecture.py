@@ -133,8 +133,8 @@ def uses(path, crate):
 @pytest.mark.parametrize(
     ("crate", "home"),
     [
-        ("faer", "dense.rs"),
-        ("nalgebra", "small.rs"),
+        ("faer", "linalg/dense.rs"),
+        ("nalgebra", "linalg/small.rs"),
         ("realfft", "fft.rs"),
         ("rustfft", "fft.rs"),
         ("num_complex", "fft.rs"),
@@ -150,7 +150,7 @@ def test_one_file_uses_a_crate_of_linear_algebra_or_transforms(crate, home):
 @pytest.mark.parametrize("crate", ["pyo3", "numpy"])
 def test_only_the_bindings_know_python(crate):
     users = {name_of(path.parent) for path in RUST if uses(path, crate)}
-    assert users == {"rust/python", "rust/python/joint", "rust/python/search"}
+    assert users == {"rust/python", "rust/python/joint_fit", "rust/python/order_search"}
 
 
 def test_bindings_are_an_optional_feature():
