@@ -17,9 +17,10 @@ if _typing.TYPE_CHECKING:
     from ftlm.estimation.consistency import Consistency, ParameterDifference, consistency
     from ftlm.estimation.frequency_domain import identify_frequency
     from ftlm.estimation.frequency_result import FrequencyIdentification, FrequencyValidation
-    from ftlm.estimation.genetic import Genetic
+    from ftlm.estimation.genetic import GeneticAlgorithm
     from ftlm.estimation.identify import BatchResult, identify, identify_many
     from ftlm.estimation.linear import MultiInnovationTrace, multi_innovation_trace
+    from ftlm.estimation.methods import InstrumentalVariables, LeastSquares, MultiInnovation, OutputError
     from ftlm.estimation.output_error import ProfileInterval
     from ftlm.estimation.physical_parameters import PhysicalParameter, physical_parameters
     from ftlm.estimation.result import Identification
@@ -77,20 +78,24 @@ __all__ = [
     "FrequencyValidation",
     "Friction",
     "FtlmError",
-    "Genetic",
+    "GeneticAlgorithm",
     "Identification",
     "InformationCriteria",
+    "InstrumentalVariables",
     "InternalError",
     "Layout",
+    "LeastSquares",
     "LinkParameters",
     "Metrics",
     "Model",
     "ModelError",
+    "MultiInnovation",
     "MultiInnovationTrace",
     "OpenedFile",
     "Order",
     "OrderCertificate",
     "OrderGrid",
+    "OutputError",
     "OutputResiduals",
     "ParameterDifference",
     "PhysicalParameter",
@@ -172,7 +177,8 @@ _MODULE_BY_NAME = {
         "io.load": "load",
         "io.preview": "FileColumn OpenedFile open_file",
         "io.load_frequency": "load_frequency",
-        "estimation.genetic": "Genetic",
+        "estimation.genetic": "GeneticAlgorithm",
+        "estimation.methods": "InstrumentalVariables LeastSquares MultiInnovation OutputError",
         "estimation.output_error": "ProfileInterval",
         "estimation.linear": "MultiInnovationTrace multi_innovation_trace",
         "estimation.consistency": "Consistency ParameterDifference consistency",
