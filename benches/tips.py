@@ -67,7 +67,7 @@ def identified(run, structure):
     """A model of a structure, on every fourth sample."""
     thin = run.resample(0.008)
     thin = thin.select([s for s in structure.signals if s in thin.signals])
-    return ftlm.identify(thin, structure, intervals="quadratic").model
+    return ftlm.identify(thin, structure, method=ftlm.OutputError(intervals="quadratic")).model
 
 
 def both(first):

@@ -29,12 +29,16 @@ if _typing.TYPE_CHECKING:
     from ftlm.estimation.frequency_domain import identify_frequency as identify_frequency
     from ftlm.estimation.frequency_result import FrequencyIdentification as FrequencyIdentification
     from ftlm.estimation.frequency_result import FrequencyValidation as FrequencyValidation
-    from ftlm.estimation.genetic import Genetic as Genetic
+    from ftlm.estimation.genetic import GeneticAlgorithm as GeneticAlgorithm
     from ftlm.estimation.identify import BatchResult as BatchResult
     from ftlm.estimation.identify import identify as identify
     from ftlm.estimation.identify import identify_many as identify_many
     from ftlm.estimation.linear import MultiInnovationTrace as MultiInnovationTrace
     from ftlm.estimation.linear import multi_innovation_trace as multi_innovation_trace
+    from ftlm.estimation.methods import InstrumentalVariables as InstrumentalVariables
+    from ftlm.estimation.methods import LeastSquares as LeastSquares
+    from ftlm.estimation.methods import MultiInnovation as MultiInnovation
+    from ftlm.estimation.methods import OutputError as OutputError
     from ftlm.estimation.output_error import ProfileInterval as ProfileInterval
     from ftlm.estimation.physical_parameters import PhysicalParameter as PhysicalParameter
     from ftlm.estimation.physical_parameters import physical_parameters as physical_parameters
@@ -110,9 +114,10 @@ _MODULE_BY_NAME = {
         "estimation.consistency": "Consistency ParameterDifference consistency",
         "estimation.frequency_domain": "identify_frequency",
         "estimation.frequency_result": "FrequencyIdentification FrequencyValidation",
-        "estimation.genetic": "Genetic",
+        "estimation.genetic": "GeneticAlgorithm",
         "estimation.identify": "BatchResult identify identify_many",
         "estimation.linear": "MultiInnovationTrace multi_innovation_trace",
+        "estimation.methods": "InstrumentalVariables LeastSquares MultiInnovation OutputError",
         "estimation.output_error": "ProfileInterval",
         "estimation.physical_parameters": "PhysicalParameter physical_parameters",
         "estimation.result": "Identification",

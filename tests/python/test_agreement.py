@@ -202,7 +202,7 @@ def test_words_where_nothing_can_be_compared():
         with pytest.raises(ftlm.DataError, match=f"motor has 300 rows, too few to be cut into {parts} parts"):
             ftlm.consistency(run, SECOND, parts=parts)
     with pytest.raises(ftlm.ModelError, match="store= is of one identification"):
-        ftlm.consistency(run, SECOND, store="a.ftlm")
+        ftlm.consistency(run, SECOND, method=ftlm.OutputError(store="a.ftlm"))
     with pytest.raises(ftlm.ModelError, match="method 'least-squares' gives no standard errors of D"):
         ftlm.consistency(run, SECOND, method="least-squares", threads=1)
     with pytest.raises(ftlm.DataError, match=r"motor 0 to 3 s: .*'z'"):

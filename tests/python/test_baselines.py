@@ -22,9 +22,9 @@ def found(small_run):
     return ftlm.identify(
         small_run,
         ftlm.equation(EQUATION),
-        method="genetic",
-        order_grid=LATTICE,
-        genetic=Genetic(seeds=(0, 1), evaluations=12000, population=100, bounds=BOUNDS),
+        method=ftlm.GeneticAlgorithm(
+            order_grid=LATTICE, seeds=(0, 1), evaluations=12000, population=100, bounds=BOUNDS
+        ),
     )
 
 
@@ -107,10 +107,10 @@ def test_all_equations_of_a_stage_under_their_order_law(clean_a):
     found = ftlm.identify(
         clean_a,
         structure,
-        method="genetic",
+        method=ftlm.GeneticAlgorithm(
+            order_grid=ftlm.order_grid(alpha=(2.0, 2.0)), seeds=(0,), evaluations=400, population=40
+        ),
         m=256,
-        order_grid=ftlm.order_grid(alpha=(2.0, 2.0)),
-        genetic=Genetic(seeds=(0,), evaluations=400, population=40),
     )
     assert set(found.orders) == set(structure.order_names)
     law = ftlm.order_law(1, form="published")["beta1"].at(found.orders)
@@ -156,14 +156,14 @@ def test_settings_that_mean_nothing_are_refused(options, message):
 def test_what_cannot_be_done_is_said(small_run, monkeypatch):
     structure = ftlm.equation(EQUATION)
     with pytest.raises(ftlm.ModelError, match="bounds of 'q': there is no such number; free are alpha, nu, a, c, b"):
-        ftlm.identify(small_run, structure, method="genetic", genetic=Genetic(bounds={"q": (0, 1)}))
+        ftlm.identify(small_run, structure, method=ftlm.GeneticAlgorithm(bounds={"q": (0, 1)}))
     with pytest.raises(ftlm.ModelError, match="genetic= is not used by method='least-squares'; leave it out, or use "):
-        ftlm.identify(small_run, structure, method="least-squares", genetic=Genetic())
+        ftlm.identify(small_run, structure, method=ftlm.LeastSquares())
     with pytest.raises(ftlm.ModelError, match="genetic is dict, not Genetic"):
         ftlm.identify(small_run, structure, method="genetic", genetic={"seeds": 1})
     late = small_run.window(2.0, None)
     with pytest.raises(ftlm.ModelError, match="knows no initial terms and needs runs that start at rest"):
-        ftlm.identify(late, structure, method="genetic", genetic=Genetic(evaluations=400))
+        ftlm.identify(late, structure, method=ftlm.GeneticAlgorithm(evaluations=400))
     monkeypatch.setitem(sys.modules, "pygad", None)
     with pytest.raises(ftlm.ModelError, match=r"pip install 'ftlm\[genetic\]'"):
-        ftlm.identify(small_run, structure, method="genetic", genetic=Genetic(evaluations=400))
+        ftlm.identify(small_run, structure, method=ftlm.GeneticAlgorithm(evaluations=400))

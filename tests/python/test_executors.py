@@ -231,13 +231,13 @@ def test_an_identification_by_the_lattice_shares_its_searches_out(stage_run, law
         "top": 5,
     }
     with ThreadPoolExecutor(2) as pool:
-        found = ftlm.identify(stage_run, structure, executor=pool, **options)
+        found = ftlm.identify(stage_run, structure, method=ftlm.OutputError(executor=pool), **options)
     assert json.dumps(found.to_dict()) == json.dumps(ftlm.identify(stage_run, structure, **options).to_dict())
     with (
         ThreadPoolExecutor(1) as pool,
         pytest.raises(ModelError, match="executor= is not used by method='output-error'"),
     ):
-        ftlm.identify(stage_run, structure, executor=pool)
+        ftlm.identify(stage_run, structure, method=ftlm.OutputError(executor=pool))
 
 
 def test_of_a_stage_the_record_is_sent_once_and_tasks_are_ranges(stage_run, stage_expected):

@@ -351,13 +351,13 @@ def test_the_whole_arm_is_searched_stage_by_stage():
         **{f"{n}{d}": v for d in (2, 4) for n, v in (("beta", (0.1, 0.2)), ("mu", (0.8, 0.9)))},
     )
     whole = ftlm.identify(
-        run, ftlm.flexible_link(form="published", stage="both"), method="least-squares", order_grid=coarse
+        run, ftlm.flexible_link(form="published", stage="both"), method=ftlm.LeastSquares(order_grid=coarse)
     )
     for stage in (1, 2):
         kept = ("alpha", f"gamma{2 * stage - 1}", f"beta{2 * stage}", f"mu{2 * stage}")
         own = replace(coarse, orders={n: v for n, v in coarse.orders.items() if n in kept})
         alone = ftlm.identify(
-            run, ftlm.flexible_link(form="published", stage=stage), method="least-squares", order_grid=own
+            run, ftlm.flexible_link(form="published", stage=stage), method=ftlm.LeastSquares(order_grid=own)
         )
         assert alone.orders.items() <= whole.orders.items()
         assert alone.coefficients.items() <= whole.coefficients.items()

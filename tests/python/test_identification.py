@@ -64,7 +64,7 @@ def test_least_squares_is_the_oracles(small_run, structure, with_noise):
 @pytest.mark.parametrize(("p", "k0"), [(1, 1.0), (7, 1.0), (3, 1e-4), (50, 1e6)])
 def test_multi_innovation_is_the_oracles(small_run, structure, p, k0):
     found = ftlm.identify(
-        small_run, structure, method="multi-innovation", innovation_length=p, prior_covariance=k0, m=256
+        small_run, structure, method=ftlm.MultiInnovation(innovation_length=p, prior_covariance=k0), m=256
     )
     ((q, y),) = regression([small_run], 256)
     expected = oracles.multi_innovation_closed_form(q, y, p, k0)
@@ -74,7 +74,7 @@ def test_multi_innovation_is_the_oracles(small_run, structure, p, k0):
 
 
 def test_multi_innovation_in_the_order_of_time_takes_any_number_of_pulses(small_run, structure):
-    found = ftlm.identify(small_run, structure, method="multi-innovation", row_basis="time", m=300)
+    found = ftlm.identify(small_run, structure, method=ftlm.MultiInnovation(row_basis="time"), m=300)
     y, u = (oracles.pulse_means(small_run[n], 300, how) for n, how in (("y", "foh"), ("u", "zoh")))
     q = oracles.regressors([y, y, u], [0.6, 0.0, 0.0], 1.6, small_run.duration, haar=False)
     expected = oracles.multi_innovation_closed_form(q, y, 7, 1.0)
@@ -156,7 +156,7 @@ def test_known_coefficients_stay_what_they_are(small_run):
 def test_orders_of_one_equation_are_searched(small_run):
     words = ftlm.equation("D^alpha y = a D^nu y + c y + b u")
     order_grid = ftlm.order_grid(increment=0.2, alpha=(1.2, 2.0))
-    found = ftlm.identify(small_run, words, method="least-squares", order_grid=order_grid, m=512)
+    found = ftlm.identify(small_run, words, method=ftlm.LeastSquares(order_grid=order_grid), m=512)
     assert found.orders == {"alpha": 1.6, "nu": 0.6}
     assert found.coefficients == {n: pytest.approx(v, rel=2e-3) for n, v in TRUTH.items()}
     (search,) = found.searches.values()
@@ -178,10 +178,7 @@ def test_search_settings_are_handed_on(small_run, criterion, norm):
     found = ftlm.identify(
         small_run,
         words,
-        method="multi-innovation",
-        innovation_length=3,
-        prior_covariance=50.0,
-        order_grid=order_grid,
+        method=ftlm.MultiInnovation(innovation_length=3, prior_covariance=50.0, order_grid=order_grid),
         progress=lambda done, total: told.append((done, total)),
         **options,
     )
@@ -213,7 +210,7 @@ def test_equations_without_a_law_are_searched_one_by_one(clean_a):
             "mu2": [0.1],
         }
     )
-    found = ftlm.identify(clean_a, structure, method="least-squares", order_grid=order_grid)
+    found = ftlm.identify(clean_a, structure, method=ftlm.LeastSquares(order_grid=order_grid))
     assert list(found.searches) == ["theta11", "theta12"]
     assert [s.candidates for s in found.searches.values()] == [4, 4]
     assert found.orders == {
@@ -232,8 +229,9 @@ def test_equations_without_a_law_are_searched_one_by_one(clean_a):
         ftlm.identify(
             clean_a,
             half,
-            method="least-squares",
-            order_grid=replace(order_grid, orders={n: v for n, v in order_grid.orders.items() if n.endswith("2")}),
+            method=ftlm.LeastSquares(
+                order_grid=replace(order_grid, orders={n: v for n, v in order_grid.orders.items() if n.endswith("2")})
+            ),
         ).searches
     ) == ["theta12"]
 
@@ -249,7 +247,9 @@ def test_law_search_recovers_the_five_free_orders_of_plant_a(clean_a, plants):
             "mu2": (0.75, 0.95),
         },
     )
-    found = ftlm.identify(clean_a, ftlm.flexible_link(form="published"), method="least-squares", order_grid=order_grid)
+    found = ftlm.identify(
+        clean_a, ftlm.flexible_link(form="published"), method=ftlm.LeastSquares(order_grid=order_grid)
+    )
     assert found.orders == plants["A"]["free_orders"]
     assert list(found.searches) == ["stage"]
     assert found.searches["stage"].candidates > 300
@@ -291,7 +291,7 @@ def test_printed_figures_are_those_of_compare(small_run, second, with_noise, met
 
 def test_results_print_and_are_json(clean_a, plants):
     structure = ftlm.flexible_link(form="published").with_orders(plants["A"]["free_orders"])
-    found = ftlm.identify(clean_a, structure, method="multi-innovation", prior_covariance=100.0, m=256)
+    found = ftlm.identify(clean_a, structure, method=ftlm.MultiInnovation(prior_covariance=100.0), m=256)
     text = found.details()
     assert text.startswith(
         "flexible link, stage 1: multi-innovation, M = 256, p = 7, K0 = 100, haar rows, initial terms: rest"
@@ -314,15 +314,15 @@ def test_results_print_and_are_json(clean_a, plants):
 
 
 def test_a_prior_that_pulls_is_named(small_run, structure):
-    found = ftlm.identify(small_run, structure, method="multi-innovation", prior_covariance=0.01)
+    found = ftlm.identify(small_run, structure, method=ftlm.MultiInnovation(prior_covariance=0.01))
     (warning,) = (w for w in found.warnings if "the prior" in w)
     assert "y: the prior (K0 = 0.01, coefficients near 0) moves a coefficient by" in warning
     assert "Raise prior_covariance or use method='least-squares'" in warning
     assert "p = 7 only weighs the data against it" in warning
-    weak = ftlm.identify(small_run, structure, method="multi-innovation", prior_covariance=1e6)
+    weak = ftlm.identify(small_run, structure, method=ftlm.MultiInnovation(prior_covariance=1e6))
     assert not any("the prior" in w for w in weak.warnings)
     # As weak as numbers go.
-    weakest = ftlm.identify(small_run, structure, method="multi-innovation", prior_covariance=1e299)
+    weakest = ftlm.identify(small_run, structure, method=ftlm.MultiInnovation(prior_covariance=1e299))
     assert weakest.coefficients == {n: pytest.approx(v, rel=2e-3) for n, v in TRUTH.items()}
 
 
@@ -352,10 +352,9 @@ def test_near_identities_are_named(clean_a, with_noise):
     found = ftlm.identify(
         with_noise(clean_a, 1e-4, 1),
         structure,
-        method="least-squares",
-        criterion="equation-error",
-        norm="l2",
-        order_grid=ftlm.order_grid(alpha=(2.0, 2.0), gamma2=0.65),
+        method=ftlm.LeastSquares(
+            criterion="equation-error", norm="l2", order_grid=ftlm.order_grid(alpha=(2.0, 2.0), gamma2=0.65)
+        ),
         m=1024,
     )
     assert any("so the equation nearly says that theta12 equals itself" in w for w in found.warnings)
@@ -365,7 +364,7 @@ def test_orders_on_the_edge_and_facts_about_the_run_are_repeated(small_run):
     words = ftlm.equation("D^alpha y = a D^0.6 y + c y + b u")
     resampled = small_run.resample(0.04)
     found = ftlm.identify(
-        resampled, words, method="least-squares", order_grid=ftlm.order_grid(increment=0.1, alpha=(1.2, 1.5)), m=256
+        resampled, words, method=ftlm.LeastSquares(order_grid=ftlm.order_grid(increment=0.1, alpha=(1.2, 1.5))), m=256
     )
     assert "order alpha = 1.5 is on the edge of its interval; widen it" in found.warnings
     assert any(w.startswith(f"run {resampled.name}: resampled from 0.02 s to 0.04 s") for w in found.warnings)
@@ -541,7 +540,7 @@ def test_arguments_are_never_changed(small_run, structure):
     words = str(structure)
     order_grid = ftlm.order_grid(increment=0.4, alpha=(1.2, 2.0))
     ftlm.identify(
-        small_run, ftlm.equation("D^alpha y = a y + b u"), method="least-squares", order_grid=order_grid, m=64
+        small_run, ftlm.equation("D^alpha y = a y + b u"), method=ftlm.LeastSquares(order_grid=order_grid), m=64
     )
     assert all(np.array_equal(small_run[n], before[n]) for n in before)
     assert str(structure) == words

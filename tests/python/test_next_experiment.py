@@ -62,7 +62,9 @@ TRUTH = {"alpha": 1.6, "a1": -0.8, "a0": -4.0, "b0": 3.0}
 @pytest.fixture(scope="module")
 def found() -> ftlm.Identification:
     structure = replace(ftlm.equation(FREE), initial="rest")
-    return ftlm.identify(first_run(PLANT), structure, threads=1, intervals="quadratic", start=TRUTH)
+    return ftlm.identify(
+        first_run(PLANT), structure, threads=1, method=ftlm.OutputError(intervals="quadratic", start=TRUTH)
+    )
 
 
 @pytest.fixture(scope="module")
@@ -530,7 +532,7 @@ def test_a_rig_takes_what_is_written(tmp_path: Path) -> None:
     noise = 1e-4 * np.random.default_rng(0).standard_normal(t.size)
     run = clean.with_outputs({"theta11": clean["theta11"] + noise})
     start = {"alpha": 1.9, "a": -12.0, "b": 30.0}
-    known = ftlm.identify(run, structure, threads=1, intervals="quadratic", start=start)
+    known = ftlm.identify(run, structure, threads=1, method=ftlm.OutputError(intervals="quadratic", start=start))
     made = ftlm.design_input(known, duration=3.0, limits={"theta11": 0.3})
     made.save(tmp_path / "next.csv")
     recorded = ftlm.rig.record(input="csv", file=tmp_path / "next.csv", rate=50.0, duration=made.run.duration)
@@ -580,7 +582,9 @@ def test_the_command_says_writes_and_refuses(found: ftlm.Identification, tmp_pat
 
 @pytest.mark.slow
 def test_plant_a_is_told_three_times_better_than_by_the_papers_square() -> None:
-    first = ftlm.identify(plants.noisy_run("A", 40, 0), plants.structure("A"), intervals="quadratic")
+    first = ftlm.identify(
+        plants.noisy_run("A", 40, 0), plants.structure("A"), method=ftlm.OutputError(intervals="quadratic")
+    )
     made = ftlm.design_input(first)
     assert made.gain > 10
     square = plants.noisy_run("A", 40, 0)

@@ -78,7 +78,7 @@ def test_the_true_structure_is_chosen_from_a_richer_one(chosen):
 def test_what_is_judged_was_not_fitted(runs, chosen):
     """The figure of the left-out run is that of an identification of the other run alone."""
     for left, seen in ((runs[0], runs[1]), (runs[1], runs[0])):
-        alone = ftlm.identify(seen, chosen.winner.structure, threads=1, intervals="quadratic")
+        alone = ftlm.identify(seen, chosen.winner.structure, threads=1, method=ftlm.OutputError(intervals="quadratic"))
         own = chosen.winner.validation[left.name]["y"]
         assert own == pytest.approx(alone.model.compare(left).fit_percent["y"], abs=2e-3)
 

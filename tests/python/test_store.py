@@ -628,9 +628,9 @@ def test_an_identification_keeps_its_searches(stage_run, small_pieces, tmp_path,
             raise KeyboardInterrupt
 
     with pytest.raises(KeyboardInterrupt):
-        ftlm.identify(stage_run, structure, store=path, progress=stop, **options)
+        ftlm.identify(stage_run, structure, method=ftlm.OutputError(store=path), progress=stop, **options)
     assert list(ftlm.search_status(path)) == names
-    found = ftlm.identify(stage_run, structure, store=path, **options)
+    found = ftlm.identify(stage_run, structure, method=ftlm.OutputError(store=path), **options)
     assert json.dumps(found.to_dict()) == json.dumps(plain.to_dict())
     assert all(status.complete for status in ftlm.search_status(path).values())
     resumed = ftlm.resume_search(path)
@@ -652,7 +652,7 @@ def test_a_store_where_nothing_is_searched_is_refused(stage_run, tmp_path):
         with pytest.raises(ModelError, match=why):
             ftlm.identify(stage_run, structure, method=method, store=path)
     with pytest.raises(ModelError, match="a store keeps one identification"):
-        ftlm.identify_many([stage_run], ftlm.flexible_link(form="published"), method="least-squares", store=path)
+        ftlm.identify_many([stage_run], ftlm.flexible_link(form="published"), method=ftlm.LeastSquares(store=path))
     assert not path.exists()
 
 

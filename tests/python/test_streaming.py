@@ -27,7 +27,7 @@ def samples(stream, run):
 def batch(run, structure, **options):
     """The closed form on the run's own grid, rows in the order of time."""
     return ftlm.identify(
-        run, structure, method="multi-innovation", row_basis="time", m=run.length - 1, **options
+        run, structure, method=ftlm.MultiInnovation(row_basis="time"), m=run.length - 1, **options
     ).coefficients
 
 

@@ -118,7 +118,7 @@ def test_the_default_value_given_in_so_many_words_is_refused_too(small_run, save
 
 def test_options_of_a_search_need_a_free_order(small_run):
     with pytest.raises(ftlm.ModelError, match=r"^norm= is not used: it is for order searches, and every order here is"):
-        ftlm.identify(small_run, ftlm.equation(WORDS), method="least-squares", norm="l2")
+        ftlm.identify(small_run, ftlm.equation(WORDS), method=ftlm.LeastSquares(norm="l2"))
     with pytest.raises(
         ftlm.ModelError, match=r"^prior_covariance= is not used by coefficients='least-squares', nor 1 other given"
     ):

@@ -43,11 +43,12 @@ from ftlm.errors import ModelError
 from ftlm.estimation import consistency as parts_of_runs
 from ftlm.estimation import identify as estimation
 from ftlm.estimation.frequency_domain import identify_frequency as frequency_estimation
+from ftlm.estimation.methods import OutputError, method_with_options
 from ftlm.io.load_frequency import load_frequency
 from ftlm.model.serialization import load_model
 from ftlm.order_search.certificate import certify_job, check_certifiable
 from ftlm.order_search.checkpoint import Store
-from ftlm.order_search.options import check_options_used
+from ftlm.order_search.options import SearchSettings
 from ftlm.order_search.result import SearchResult
 from ftlm.order_search.search import announce_time, job_of, make_job, resume_job, run_job, search_status
 from ftlm.progress import Progress
@@ -109,7 +110,18 @@ def identify(
     """Identify a model: verdict, equations, parameters, gain and modes, fit, warnings."""
     check_free(out, report, force=force, words=COMMAND_MESSAGES)
     shape.structure(structure)
-    begin = None if start is None else load_model(start)
+    given = {
+        "order_grid": search.lattice(),
+        "store": store,
+        "loss": loss,
+        "intervals": intervals,
+        "reference": reference,
+        "start": None if start is None else load_model(start),
+        **search.settings(),
+        **genetic.settings(),
+    }
+    options = {name: value for name, value in given.items() if value is not None}
+    chosen = method_with_options(method, options)
     runs = reading.runs(files)
     wanted = shape.structure_for_runs(structure, runs)
     # The slice is of the runs that are identified from.
@@ -121,17 +133,10 @@ def identify(
         result = estimation.identify(
             runs,
             wanted,
-            method=method,
-            order_grid=search.lattice(),
-            **search.settings(),
-            genetic=genetic.settings(method),
+            method=chosen,
+            m=search.m,
             threads=threads,
             progress=progress,
-            store=store,
-            loss=loss,
-            intervals=intervals,
-            reference=reference,
-            start=begin,
         )
     if out is not None:
         result.model.save(out, force=force)
@@ -182,7 +187,7 @@ def search(
     parts = wanted.independent_groups() or {e.output: wanted.equation(e.output) for e in wanted.equations}
     lattice = options.lattice() or OrderGrid()
     check_order_names(lattice, wanted)
-    check_options_used(coefficients, options.settings(), argument="coefficients")
+    settings = SearchSettings(coefficients=coefficients, **options.settings())
     results = {}
     with resumable(store), contextlib.ExitStack() as stack:
         jobs = {
@@ -190,9 +195,9 @@ def search(
                 runs,
                 part,
                 restrict_grid(lattice, part),
-                coefficients=coefficients,
+                settings,
+                m=options.m,
                 threads=threads,
-                **options.settings(),
             )
             for name, part in parts.items()
         }
@@ -476,10 +481,11 @@ def agreement(
     shape.structure(structure)
     runs = reading.runs(files)
     wanted = shape.structure_for_runs(structure, runs)
+    method = OutputError() if loss is None else OutputError(loss=loss)
     with Progress("fitting parts", quiet=as_json) as progress:
         count = max(parts or 0, 2) if len(runs) == 1 else len(runs)
         progress.expect("fitting all parts", *duration_bounds(fit_seconds(runs, wanted, threads, count)))
-        found = parts_of_runs.consistency(runs, wanted, parts=parts, loss=loss, threads=threads, progress=progress)
+        found = parts_of_runs.consistency(runs, wanted, parts=parts, method=method, threads=threads, progress=progress)
     if report is not None:
         found.report(report, force=force)
     show(found, as_json=as_json)

@@ -14,7 +14,6 @@ from ftlm.arm.flexible_link import Law, flexible_link
 from ftlm.cli.framework import announce_reading, interval, numbers, pairs, ranges
 from ftlm.data.run import Run
 from ftlm.errors import DataError, ModelError
-from ftlm.estimation.genetic import Genetic
 from ftlm.io.dialect import Layout
 from ftlm.io.load import load
 from ftlm.io.preview import OpenedFile, open_file
@@ -426,15 +425,14 @@ class SearchOptions:
         return made if alpha is None else replace(made, orders={**made.orders, "alpha": alpha})
 
     def settings(self) -> dict[str, Any]:
-        """Search options other than the order grid."""
+        """Given settings of an order search, by their names in Python."""
         given = {
             "criterion": self.criterion,
             "norm": self.norm,
             "innovation_length": self.p,
             "prior_covariance": self.k0,
-            "rows": self.rows,
-            "m": self.m,
-            "keep": self.keep,
+            "row_basis": self.rows,
+            "top": self.keep,
         }
         return {name: value for name, value in given.items() if value is not None}
 
@@ -448,10 +446,7 @@ class GeneticOptions:
     ] = None
     evaluations: Annotated[int | None, Option(help="Evaluations a seed of the genetic algorithm.")] = None
 
-    def settings(self, method: str = "genetic") -> Genetic | None:
-        """Settings for a method, or None without options."""
-        if self.seeds is None and self.evaluations is None:
-            return None
-        if method != "genetic":
-            raise ModelError(f"--seed and --evaluations are of the genetic algorithm, not of --method {method}")
-        return Genetic(seeds=tuple(self.seeds or Genetic().seeds), evaluations=self.evaluations)
+    def settings(self) -> dict[str, Any]:
+        """Given options of the genetic algorithm, by their names in Python."""
+        given = {"seeds": tuple(self.seeds) if self.seeds else None, "evaluations": self.evaluations}
+        return {name: value for name, value in given.items() if value is not None}

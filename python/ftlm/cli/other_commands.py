@@ -23,6 +23,7 @@ from ftlm.cli.options import (
     Verbose,
 )
 from ftlm.errors import ModelError
+from ftlm.estimation.genetic import GeneticAlgorithm
 from ftlm.progress import Progress
 from ftlm.reproduction import reproduction
 from ftlm.reproduction.cross_validation import orders_on_unseen_runs
@@ -105,14 +106,14 @@ def reproduce(
         check_folder(Path(save), ALWAYS_SAVED, force=force)
     if sine is not None and square is None:
         raise ModelError("--sine is given without --square; give both, or neither for the virtual rig")
-    measured = reading.runs([f for f in (square, sine) if f is not None], apart=True)
+    measured, rival = reading.runs([f for f in (square, sine) if f is not None], apart=True), genetic.settings()
     with Progress("", quiet=as_json) as progress:
         result = reproduction.reproduce(
             *measured,
             increment=step,
             noise=noise,
             seed=seed,
-            genetic=genetic.settings(),
+            genetic=GeneticAlgorithm(**rival) if rival else None,
             rivals_increment=rivals_step,
             arms=arms,
             records=records,

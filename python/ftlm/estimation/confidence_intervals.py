@@ -12,7 +12,7 @@ import threading
 from collections.abc import Callable, Generator, Sequence
 from dataclasses import dataclass, replace
 from statistics import NormalDist
-from typing import Any
+from typing import Any, Literal
 
 import numpy as np
 
@@ -20,13 +20,13 @@ from ftlm.data.run import Run
 from ftlm.errors import ConvergenceError, FtlmError, ModelError
 from ftlm.estimation.free_parameters import FreeProblem
 from ftlm.estimation.objective import Iterate, Objective, covariance, covariance_of
-from ftlm.estimation.output_error import JointFit, ProfileInterval, fit_output_error
+from ftlm.estimation.output_error import JointFit, Loss, ProfileInterval, fit_output_error
 from ftlm.estimation.result import Identification
-from ftlm.order_search.options import Intervals, Loss
 from ftlm.utils.linalg import dot, projections, thin_svd
 from ftlm.utils.resources import interruptible_pool
 from ftlm.utils.validation import Floats, real_number
 
+Intervals = Literal["auto", "quadratic", "profile"]
 #: Largest relative error of a bound of the Wald interval, from one linear step of all other parameters. Above it the
 #: parameter is profiled.
 MAX_QUADRATIC_ERROR = 0.1

@@ -14,8 +14,9 @@ from ftlm.data.run import Run, as_runs
 from ftlm.data.sampling import MIN_RUN_SAMPLES
 from ftlm.errors import DataError, FtlmError, ModelError
 from ftlm.estimation.identify import identify
+from ftlm.estimation.methods import EstimationMethod, resolve_method
 from ftlm.estimation.result import Identification
-from ftlm.structure.structure import Structure
+from ftlm.structure.structure import Offset, Structure
 from ftlm.svg.html_page import Page, ReportMixin, Section, Table
 from ftlm.utils.files import to_frame
 from ftlm.utils.formatting import Cell, format_bound
@@ -269,8 +270,11 @@ def consistency(
     structure: Structure,
     *,
     parts: int | None = None,
+    method: str | EstimationMethod = "output-error",
+    offset: Offset | None = None,
+    m: int | None = None,
+    threads: int | None = None,
     progress: Callable[[int, int], None] | None = None,
-    **options: Any,
 ) -> Consistency:
     """Identify segments of a run separately and test whether they share one model.
 
@@ -286,10 +290,10 @@ def consistency(
         Structure to identify. Each segment with a nonzero start has its own initial terms or history.
     segments
         Number of segments of one run, by default 2; not used with several runs.
+    method, offset, m, threads
+        See :func:`ftlm.identify`; a method that gives standard errors, without a store and a start.
     progress
         Callback with (segments done, total segments).
-    **options
-        Options of :func:`ftlm.identify` except `store` and `start`, with a method that gives standard errors.
 
     Returns
     -------
@@ -312,7 +316,8 @@ def consistency(
         raise ModelError(f"parts = {parts!r}; use a whole number, at least {DEFAULT_SEGMENTS}")
     if len(every) > 1 and given is not None:
         raise ModelError(f"{len(every)} runs are parts by themselves; leave parts= out, or give one run")
-    kept = [n for n in ("store", "start") if options.get(n) is not None]
+    chosen = resolve_method(method)
+    kept = [n for n in ("store", "start") if getattr(chosen, n, None) is not None]
     if kept:
         raise ModelError(f"{kept[0]}= is of one identification, and each part has its own; leave it out")
     pieces = split_run(every[0], given or DEFAULT_SEGMENTS) if len(every) == 1 else list(every)
@@ -320,7 +325,7 @@ def consistency(
     results: list[Identification] = []
     for name, piece in zip(names, pieces, strict=True):
         try:
-            results.append(identify(piece, structure, **options))
+            results.append(identify(piece, structure, method=chosen, offset=offset, m=m, threads=threads))
         except FtlmError as error:
             raise type(error)(f"{name}: {error}") from error
         if not results[0].standard_errors:

@@ -6,6 +6,7 @@ import math
 from collections.abc import Callable, Mapping, Sequence
 from dataclasses import dataclass, field, replace
 from functools import cached_property
+from typing import Literal
 
 import numpy as np
 from msgspec import UnsetType
@@ -18,7 +19,6 @@ from ftlm.estimation.free_parameters import FreeProblem, describe_collinear_inpu
 from ftlm.estimation.friction import run_friction_multistart
 from ftlm.estimation.objective import Iterate, Objective, RunSampler, propagated_errors
 from ftlm.model.model import FitParameters, Model
-from ftlm.order_search.options import Loss
 from ftlm.progress import TOTAL_PARTS, ShareTracker
 from ftlm.simulation.discretization import compared_values
 from ftlm.structure.input_nonlinearity import input_name
@@ -28,6 +28,8 @@ from ftlm.utils.formatting import format_bound
 from ftlm.utils.resources import memory_limit, stop_flag
 from ftlm.utils.statistics import NORMAL_95, estimate_noise
 from ftlm.utils.validation import Floats
+
+Loss = Literal["squares", "huber"]
 
 
 @dataclass(frozen=True)

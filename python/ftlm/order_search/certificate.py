@@ -8,7 +8,7 @@ from typing import Any
 from ftlm import _core
 from ftlm.data.run import Run
 from ftlm.errors import ModelError
-from ftlm.order_search.options import Settings
+from ftlm.order_search.options import SearchSettings
 from ftlm.order_search.result import OrderCertificate
 from ftlm.order_search.search import Job, make_job
 from ftlm.simulation.discretization import named_signals
@@ -16,7 +16,7 @@ from ftlm.structure.equation import Equation
 from ftlm.structure.order_grid import DEFAULT_INCREMENT, OrderGrid
 from ftlm.structure.structure import Structure
 from ftlm.utils.resources import memory_limit
-from ftlm.utils.validation import check_threads, real_number, whole_number
+from ftlm.utils.validation import real_number, whole_number
 
 #: Default tolerance of the certificate relative to the best equation error found, and maximum number of boxes.
 DEFAULT_TOLERANCE = 0.05
@@ -108,9 +108,7 @@ def certify_orders(
         raise ModelError(
             f"max_term_ratio = {max_term_ratio!r} is outside [1, 1e9]; the default is {DEFAULT_MAX_TERM_RATIO:g}"
         )
-    job = make_job(
-        runs, equation, order_grid, Settings.check(**CERTIFIED_SETTINGS, threads=check_threads(threads)), m=m
-    )
+    job = make_job(runs, equation, order_grid, SearchSettings(**CERTIFIED_SETTINGS), m=m, threads=threads)
     return certify_job(job, tolerance=share, min_separation=gap, max_term_ratio=size, max_cells=most, progress=progress)
 
 
@@ -163,7 +161,7 @@ def certify_job(
         found = _core.certify(
             [r.core() for r in job.records],
             (*region, min_separation),
-            (tolerance, max_term_ratio, max_cells, job.settings.threads, memory_limit()),
+            (tolerance, max_term_ratio, max_cells, job.threads, memory_limit()),
             None if progress is None else lambda done, total, _pruned: progress(done, total),
         )
     except ModelError as error:

@@ -398,7 +398,7 @@ def _traces(result: Identification) -> list[Figure]:
         return []
     run, used = result.task.runs[0], result.settings
     every = max(1, int(used["m"]) // TRACE_POINTS)
-    options = {n: used[n] for n in ("prior_covariance", "rows", "m")}
+    options = {n: used[n] for n in ("prior_covariance", "row_basis", "m")}
     figures = []
     for solved in result.model.equations:
         single = result.task.structure.equation(solved.output)

@@ -200,7 +200,7 @@ def settings_text(settings: Mapping[str, Any]) -> str:
         words += f", seeds {seeds}, {sum(settings['evaluations'].values())} evaluations in all"
     if "innovation_length" in settings:
         words += f", p = {settings['innovation_length']}, K0 = {settings['prior_covariance']:g}"
-        words += f", {settings['rows']} rows"
+        words += f", {settings['row_basis']} rows"
     if "loss" in settings:
         words += f", loss: {settings['loss']} ({robust_loss_text(settings)})"
     words += f", initial terms: {settings['initial']}"
@@ -226,7 +226,7 @@ def settings_rows(settings: Mapping[str, Any], *, searched: bool) -> list[list[C
         rows += [
             ["innovation length, p", int(settings["innovation_length"])],
             [Markup("prior covariance, K<sub>0</sub>"), Exact(settings["prior_covariance"])],
-            ["rows of the recursion", ROW_BASIS_TEXTS.get(settings["rows"], settings["rows"])],
+            ["rows of the recursion", ROW_BASIS_TEXTS.get(settings["row_basis"], settings["row_basis"])],
         ]
     if "refinement" in settings:
         rows += [
