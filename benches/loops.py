@@ -41,10 +41,8 @@ def covered(found: ftlm.Identification, truth: dict[str, float]) -> list[bool]:
 def one_loop(task: tuple[str, int, str]) -> tuple[list[bool], bool, bool, float]:
     """Coverage, whether the result says that there is a loop, whether it warns of one or of its instrument, alpha."""
     kind, seed, how = task
-    options: dict[str, object] = {"threads": 1}
-    if how == "reference":
-        options["reference"] = "r"
-    found = ftlm.identify(loops.loop(kind, seed), STRUCTURE, **options)
+    method = ftlm.OutputError(reference="r" if how == "reference" else None)
+    found = ftlm.identify(loops.loop(kind, seed), STRUCTURE, method=method, threads=1)
     said = bool(found.residuals and found.residuals.outputs["y"].feedback)
     warned = any("closed loop" in w or "weak instrument" in w for w in found.warnings)
     return covered(found, loops.TRUTH), said, warned, found.orders["alpha"]

@@ -115,8 +115,8 @@ def test_the_walk_of_a_run_is_the_one_it_takes(tmp_path, small_run):
     try:
         run = ftlm.load(tmp_path / "run.csv")
         structure = ftlm.equation("D^alpha y = a D^beta y + b u", initial="rest")
-        options = {"method": "multi-innovation", "order_grid": ftlm.order_grid(increment=0.25), "m": 64, "threads": 1}
-        ftlm.identify(run, structure, **options).report(tmp_path / "run.html")
+        method = ftlm.MultiInnovation(order_grid=ftlm.order_grid(increment=0.25))
+        ftlm.identify(run, structure, method=method, m=64, threads=1).report(tmp_path / "run.html")
     finally:
         sys.setprofile(before)
     assert passed == [name for name, _ in walk]

@@ -26,6 +26,7 @@ from ftlm.estimation.confidence_intervals import (
 )
 from ftlm.estimation.model_checks import identifiability_warnings
 from ftlm.estimation.objective import Iterate
+from ftlm.estimation.output_error import Loss
 from ftlm.report.html_report import model_page
 from measured import DATA, needs_data
 
@@ -45,10 +46,9 @@ def switched(rows: int, every: int, seed: int = 100) -> np.ndarray:
     return np.repeat(np.where(rng.random(rows // every + 1) < 0.5, -1.0, 1.0), every)[:rows]
 
 
-def quadratic(run: ftlm.Run, words: str, **options: object) -> ftlm.Identification:
-    return ftlm.identify(
-        run, ftlm.equation(words, initial="rest"), method=ftlm.OutputError(intervals="quadratic"), threads=1, **options
-    )
+def quadratic(run: ftlm.Run, words: str, loss: Loss = "squares") -> ftlm.Identification:
+    method = ftlm.OutputError(intervals="quadratic", loss=loss)
+    return ftlm.identify(run, ftlm.equation(words, initial="rest"), method=method, threads=1)
 
 
 # ------------------------------------------------------------------------------------------------ closed forms

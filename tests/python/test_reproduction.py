@@ -112,7 +112,7 @@ def test_table_7_follows_from_the_saved_run(saved):
     written = json.loads((saved / "tables.json").read_text())["as it should be"]["1"]["genetic"]["theta12"]
     run = ftlm.load(saved / "square.csv").select(["I1", "theta11", "theta12"])
     single = ftlm.flexible_link(form="published", stage=1, coupling="measured", laws=()).equation("theta12")
-    settings = ftlm.Genetic(seeds=(0, 1), evaluations=800)
+    settings = ftlm.GeneticAlgorithm(seeds=(0, 1), evaluations=800)
     found = compare_optimizers(run, single, ftlm.OrderGrid(increment=0.25, alpha=(1.95, 2.0)), settings)
     both = {"genetic": found.genetic, "differential evolution": found.evolution}
     for label, rival in both.items():
@@ -555,7 +555,7 @@ def test_a_stage_that_fails_ends_the_other(reproduction):
 
 @pytest.mark.slow
 def test_threads_do_not_change_a_number(reproduction):
-    settings = ftlm.Genetic(seeds=(0, 1), evaluations=800)
+    settings = ftlm.GeneticAlgorithm(seeds=(0, 1), evaluations=800)
     one = ftlm.reproduce(increment=0.25, genetic=settings, arms=["whole orders"], records=1, threads=1)
     assert one.to_dict() == reproduction.to_dict()
 

@@ -26,9 +26,8 @@ def samples(stream, run):
 
 def batch(run, structure, **options):
     """The closed form on the run's own grid, rows in the order of time."""
-    return ftlm.identify(
-        run, structure, method=ftlm.MultiInnovation(row_basis="time"), m=run.length - 1, **options
-    ).coefficients
+    method = ftlm.MultiInnovation(row_basis="time", **options)
+    return ftlm.identify(run, structure, method=method, m=run.length - 1).coefficients
 
 
 @pytest.mark.parametrize(("p", "k0", "allowed"), [(1, 1.0, 1e-9), (3, 1.0, 1e-9), (7, 1.0, 1e-9), (7, 100.0, 1e-9)])

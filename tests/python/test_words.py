@@ -3,7 +3,6 @@
 from __future__ import annotations
 
 import ast
-import inspect
 import json
 import re
 from pathlib import Path
@@ -17,7 +16,6 @@ import ftlm
 from ftlm.cli.framework import OPTION_BY_ARGUMENT, in_options
 from ftlm.cli.main import app
 from ftlm.data.units import TIME_UNITS
-from ftlm.order_search.options import METHOD_CHOICES, METHODS_BY_OPTION
 from ftlm.report.typesetting import equation_html
 from ftlm.structure.equation import format_equation
 
@@ -37,94 +35,7 @@ def saved(small_run, tmp_path_factory):
     return path
 
 
-# ------------------------------------------------------------------------------------------------ options and methods
-
-#: A value that each option takes where it is used, in Python and as words of the command line.
-GIVEN = {
-    "lattice": (ftlm.order_grid(increment=0.2, alpha=(1.4, 1.8)), ["--lattice", "alpha=1.4:1.8:0.2"]),
-    "criterion": ("equation-error", ["--criterion", "equation-error"]),
-    "norm": ("l2", ["--norm", "l2"]),
-    "keep": (3, ["--keep", "3"]),
-    "innovation_length": (3, ["--p", "3"]),
-    "prior_covariance": (10.0, ["--k0", "10"]),
-    "rows": ("time", ["--rows", "time"]),
-    "genetic": (ftlm.Genetic(seeds=(0,), evaluations=400), ["--seed", "0", "--evaluations", "400"]),
-    "store": ("store.ftlm", ["--store", "store.ftlm"]),
-    "executor": (object(), None),
-    "loss": ("huber", ["--loss", "huber"]),
-    "intervals": ("quadratic", ["--intervals", "quadratic"]),
-    "reference": ("r", ["--reference", "r"]),
-    # By command in test_known_starts.py: it names a file that must be there.
-    "start": ({"alpha": 1.5}, None),
-}
-#: What belongs to every method: what is identified, on which grid, with how much of the machine.
-EVERYONE = {"runs", "structure", "method", "offset", "m", "threads", "progress"}
-
-
-def test_the_table_knows_every_option_of_identify():
-    assert set(inspect.signature(ftlm.identify).parameters) == EVERYONE | set(METHODS_BY_OPTION)
-    assert set(GIVEN) == set(METHODS_BY_OPTION)
-    for name, users in METHODS_BY_OPTION.items():
-        assert set(users) <= set(METHOD_CHOICES), name
-
-
-@pytest.mark.parametrize("method", METHOD_CHOICES)
-@pytest.mark.parametrize("option", GIVEN)
-def test_an_option_that_a_method_does_not_use_is_refused_by_name(
-    option, method, small_run, saved, tmp_path, monkeypatch
-):
-    monkeypatch.chdir(tmp_path)
-    value, words = GIVEN[option]
-    used = method in METHODS_BY_OPTION[option]
-    if used:
-        # What is used must change nothing into a refusal; that it acts is tested where it is made.
-        if option in ("executor", "store", "genetic", "reference") or method == "genetic":
-            return
-        beside = {"lattice": GIVEN["lattice"][0]} if method in METHODS_BY_OPTION["lattice"] else {}
-        assert (
-            ftlm.identify(small_run, ftlm.equation(FREE), method=method, m=64, **{**beside, option: value}).method
-            == method
-        )
-        return
-    with pytest.raises(ftlm.ModelError, match=rf"^{option}= is not used by method='{method}'; leave it out, or use "):
-        ftlm.identify(small_run, ftlm.equation(FREE), method=method, **{option: value})
-    if words is None:
-        return
-    done = run_command("identify", saved, "--structure", FREE, "--method", method, *words)
-    assert done.exit_code == 2, done.output
-    assert words[0] in done.stderr
-    assert "=" not in re.sub(r"alpha=\S+", "", done.stderr)
-    assert list(tmp_path.iterdir()) == []
-
-
-def test_the_default_value_given_in_so_many_words_is_refused_too(small_run, saved):
-    structure = ftlm.equation(WORDS)
-    defaults = {
-        "criterion": "output-error",
-        "norm": "l1",
-        "innovation_length": 7,
-        "prior_covariance": 1.0,
-        "rows": "haar",
-        "keep": 20,
-        "lattice": ftlm.OrderGrid(),
-    }
-    for name, value in defaults.items():
-        with pytest.raises(ftlm.ModelError, match=f"^{name}= is not used by method='output-error'"):
-            ftlm.identify(small_run, structure, **{name: value})
-    done = run_command("identify", saved, "--structure", WORDS, "--step", "0.05", "--p", "7", "--norm", "l1")
-    assert done.exit_code == 2
-    assert "--lattice or --step is not used by --method output-error, nor 2 others given here" in done.stderr
-
-
-def test_options_of_a_search_need_a_free_order(small_run):
-    with pytest.raises(ftlm.ModelError, match=r"^norm= is not used: it is for order searches, and every order here is"):
-        ftlm.identify(small_run, ftlm.equation(WORDS), method=ftlm.LeastSquares(norm="l2"))
-    with pytest.raises(
-        ftlm.ModelError, match=r"^prior_covariance= is not used by coefficients='least-squares', nor 1 other given"
-    ):
-        ftlm.search_orders(
-            small_run, ftlm.equation(FREE), coefficients="least-squares", row_basis="time", prior_covariance=2.0
-        )
+# ------------------------------------------------------------------------------------------------ options of commands
 
 
 @pytest.mark.parametrize(
