@@ -47,7 +47,7 @@ def test_a_richer_structure_from_a_simpler_one_is_never_worse(run, simple):
         method=ftlm.OutputError(start=simple, intervals="quadratic"),
         threads=1,
     )
-    assert rich.fit.noise["y"] <= simple.joint.noise["y"] * (1 + 1e-6)
+    assert rich.fit.noise["y"] <= simple.fit.noise["y"] * (1 + 1e-6)
     from_model = ftlm.identify(
         run,
         ftlm.equation(RICH, initial="rest"),
