@@ -155,8 +155,7 @@ impl Body {
     ///
     /// ```
     /// use ftlm::equation::{Equation, Structure, Term};
-    /// use ftlm::friction::dynamics::Body;
-    /// use ftlm::friction::law::Law;
+    /// use ftlm::friction::{Body, Law};
     /// use ftlm::regressors::Record;
     /// # fn main() -> ftlm::error::Result<()> {
     /// // A block slides at 1 m/s on friction of 2 m/s²: it stops after half a second, 0.25 m on, and stays.

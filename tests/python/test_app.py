@@ -460,7 +460,7 @@ def test_a_file_is_told_as_ftlm_open_tells_it(used, content, tmp_path):
     path = tmp_path / "lag.csv"
     path.write_bytes(content)
     opened = ftlm.open_file(path).to_dict()
-    assert json.loads(json.dumps(opened["columns"])) == file.told["columns"]
+    assert json.loads(json.dumps(opened["columns"])) == file.preview["columns"]
     assert json.loads(json.dumps(opened["options"])) == file.told["options"]
     assert file.told["assumed"] == [a.words for a in ftlm.open_file(path).assumed]
     shown = view.file(file)
@@ -502,7 +502,7 @@ def test_a_choice_is_that_of_the_same_lines_and_knows_runs_in_motion(page, conte
     page.loop(settled(page.desk))
     (model,) = page.desk.models.values()
     assert model.state == "made", model.error
-    assert page.desk.files[key].told["length"] == 300
+    assert page.desk.files[key].preview["length"] == 300
     assert model.told["fits"][0]["validation"] > 95
     assert "Candidates" in model.told["choice"]["table"]
     printed = scripted(page, model.key, content, tmp_path)
@@ -607,7 +607,7 @@ def test_names_with_scripts_in_them_are_text(used, loop):
         f"{HOSTILE}.csv",
         1,
         preview={
-            **next(iter(used.desk.files.values())).told,
+            **next(iter(used.desk.files.values())).preview,
             "kind": HOSTILE,
             "problem": HOSTILE,
             "assumed": [HOSTILE],
@@ -644,7 +644,7 @@ def test_names_with_scripts_in_them_are_text(used, loop):
     text=st.sampled_from(["D y = a y + b u", '"); import os #', "x\n'''", *NAMED_STRUCTURES]) | st.text(min_size=1),
 )
 def test_a_script_is_python_whatever_names_are_in_it(name, text):
-    options = {"time": name, "inputs": {name: text}, "units": {name: "V"}, "slice": [0.5, None], "step": 0.1}
+    options = {"time": name, "inputs": {name: text}, "units": {name: "V"}, "window": [0.5, None], "step": 0.1}
     recipe = FitRequest(RunSource(name, options), RunSource(name), structure=(text,), method="least-squares")
     script = recipe._script(None)
     tree = ast.parse(script.encode())
@@ -665,7 +665,7 @@ def test_fields_become_arguments():
     ]
     said = {"columns": columns, "step": "", "from": "1.5", "to": "", "header": "1", "decimal": "comma", "missing": ""}
     assert parse_fields(said) == {
-        "slice": [1.5, None],
+        "window": [1.5, None],
         "layout": {"decimal": "comma", "header": 1},
         "time": "t",
         "inputs": {"u": "u [V]"},
@@ -709,7 +709,7 @@ def test_roles_are_changed_and_what_is_missing_is_said(page, content):
     status, _, text = page.own("POST", f"files/{key}", {"columns": columns, "from": "1", "to": "9"})
     assert status == 200
     assert "To do" not in text
-    assert page.desk.files[key].told["options"]["slice"] == [1.0, 9.0]
+    assert page.desk.files[key].told["options"]["window"] == [1.0, 9.0]
     assert page.desk.files[key].told["length"] == 160
     assert page.own("DELETE", f"files/{key}")[0] == 200
     assert list(page.desk.folder.iterdir()) == []

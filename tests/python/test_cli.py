@@ -107,7 +107,7 @@ def test_search_prints_a_ranked_table_and_counts(folder: Path) -> None:
     assert found.returncode == 0, found.stderr
     table = json.loads(found.stdout)["y"]
     assert [row["rank"] for row in table["table"]] == [1, 2, 3]
-    assert len(table["table"]) + sum(table["pruned"].values()) == table["candidates"] == 25
+    assert len(table["table"]) + sum(table["exclusion_counts"].values()) == table["candidates"] == 25
 
 
 def test_simulate_writes_a_run_that_loads_without_columns(folder: Path) -> None:

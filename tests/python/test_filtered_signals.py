@@ -165,7 +165,9 @@ def above_run(filtered: tuple[str, ...], begin: float, every: int) -> ftlm.Run:
 def test_a_derivative_above_its_equations_order_takes_none_of_the_beginning(filtered):
     # Signals begin at a level, and what came through a filter with the motion of what that held: neither is a jump.
     run = above_run(filtered, 1.7, 4)
-    found = ftlm.identify(run, ftlm.equation(ABOVE, sensor_filter=sensor(filtered)), intervals="quadratic")
+    found = ftlm.identify(
+        run, ftlm.equation(ABOVE, sensor_filter=sensor(filtered)), method=ftlm.OutputError(intervals="quadratic")
+    )
     for name, value in ABOVE_TRUTH.items():
         assert found.coefficients[name] == pytest.approx(value, rel=0.01), name
     compared = found.model.compare(run)

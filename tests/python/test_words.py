@@ -16,7 +16,7 @@ from typer.testing import CliRunner
 import ftlm
 from ftlm.cli.main import app
 from ftlm.data.units import TIME_UNITS
-from ftlm.order_search.options import METHOD_CHOICES, METHODS_BY_OPTION
+from ftlm.estimation.methods import METHODS
 from ftlm.report.typesetting import equation_html
 from ftlm.structure.equation import format_equation
 from ftlm.utils.parameters import (
@@ -46,96 +46,7 @@ def saved(small_run, tmp_path_factory):
     return path
 
 
-# ------------------------------------------------------------------------------------------------ options and methods
-
-#: A value that each option takes where it is used, in Python and as words of the command line.
-GIVEN = {
-    "order_grid": (ftlm.order_grid(increment=0.2, alpha=(1.4, 1.8)), ["--order-grid", "alpha=1.4:1.8:0.2"]),
-    "criterion": ("equation-error", ["--criterion", "equation-error"]),
-    "norm": ("l2", ["--norm", "l2"]),
-    "top": (3, ["--top", "3"]),
-    "innovation_length": (3, ["--innovation-length", "3"]),
-    "prior_covariance": (10.0, ["--prior-covariance", "10"]),
-    "row_basis": ("time", ["--row-basis", "time"]),
-    "genetic": (ftlm.Genetic(seeds=(0,), evaluations=400), ["--seeds", "0", "--evaluations", "400"]),
-    "store": ("store.ftlm", ["--store", "store.ftlm"]),
-    "executor": (object(), None),
-    "loss": ("huber", ["--loss", "huber"]),
-    "intervals": ("quadratic", ["--intervals", "quadratic"]),
-    "reference": ("r", ["--reference", "r"]),
-    # By command in test_known_starts.py: it names a file that must be there.
-    "start": ({"alpha": 1.5}, None),
-}
-#: What belongs to every method: what is identified, on which grid, with how much of the machine.
-EVERYONE = {"runs", "structure", "method", "offset", "m", "threads", "progress"}
-
-
-def test_the_table_knows_every_option_of_identify():
-    assert set(inspect.signature(ftlm.identify).parameters) == EVERYONE | set(METHODS_BY_OPTION)
-    assert set(GIVEN) == set(METHODS_BY_OPTION)
-    for name, users in METHODS_BY_OPTION.items():
-        assert set(users) <= set(METHOD_CHOICES), name
-
-
-@pytest.mark.parametrize("method", METHOD_CHOICES)
-@pytest.mark.parametrize("option", GIVEN)
-def test_an_option_that_a_method_does_not_use_is_refused_by_name(
-    option, method, small_run, saved, tmp_path, monkeypatch
-):
-    monkeypatch.chdir(tmp_path)
-    value, words = GIVEN[option]
-    used = method in METHODS_BY_OPTION[option]
-    if used:
-        # What is used must change nothing into a refusal; that it acts is tested where it is made.
-        if option in ("executor", "store", "genetic", "reference") or method == "genetic":
-            return
-        beside = {"order_grid": GIVEN["order_grid"][0]} if method in METHODS_BY_OPTION["order_grid"] else {}
-        assert (
-            ftlm.identify(small_run, ftlm.equation(FREE), method=method, m=64, **{**beside, option: value}).method
-            == method
-        )
-        return
-    with pytest.raises(ftlm.ModelError, match=rf"^{option}= is not used by method='{method}'; leave it out, or use "):
-        ftlm.identify(small_run, ftlm.equation(FREE), method=method, **{option: value})
-    if words is None:
-        return
-    done = run_command("identify", saved, "--structure", FREE, "--method", method, *words)
-    assert done.exit_code == 2, done.output
-    assert words[0] in done.stderr
-    assert "=" not in re.sub(r"alpha=\S+", "", done.stderr)
-    assert list(tmp_path.iterdir()) == []
-
-
-def test_the_default_value_given_in_so_many_words_is_refused_too(small_run, saved):
-    structure = ftlm.equation(WORDS)
-    defaults = {
-        "criterion": "output-error",
-        "norm": "l1",
-        "innovation_length": 7,
-        "prior_covariance": 1.0,
-        "row_basis": "haar",
-        "top": 20,
-        "order_grid": ftlm.OrderGrid(),
-    }
-    for name, value in defaults.items():
-        with pytest.raises(ftlm.ModelError, match=f"^{name}= is not used by method='output-error'"):
-            ftlm.identify(small_run, structure, **{name: value})
-    done = run_command(
-        "identify", saved, "--structure", WORDS, "--increment", "0.05", "--innovation-length", "7", "--norm", "l1"
-    )
-    assert done.exit_code == 2
-    assert "--order-grid or --increment is not used by --method output-error, nor 2 others given here" in done.stderr
-
-
-def test_options_of_a_search_need_a_free_order(small_run):
-    with pytest.raises(ftlm.ModelError, match=r"^norm= is not used: it is for order searches, and every order here is"):
-        ftlm.identify(small_run, ftlm.equation(WORDS), method="least-squares", norm="l2")
-    with pytest.raises(
-        ftlm.ModelError, match=r"^prior_covariance= is not used by coefficients='least-squares', nor 1 other given"
-    ):
-        ftlm.search_orders(
-            small_run, ftlm.equation(FREE), coefficients="least-squares", row_basis="time", prior_covariance=2.0
-        )
+# ------------------------------------------------------------------------------------------------ options of commands
 
 
 @pytest.mark.parametrize(
@@ -255,7 +166,7 @@ def test_the_command_line_takes_a_unit_of_time(tmp_path):
     )
     assert done.exit_code == 3
     assert "--time-unit s is asked for; leave --time-unit out" in done.stderr
-    readers = {n for n, c in get_command(app).commands.items() if any("--step" in p.opts for p in c.params)}
+    readers = {n for n, c in get_command(app).commands.items() if any("--time" in p.opts for p in c.params)}
     takers = {n for n, c in get_command(app).commands.items() if any("--time-unit" in p.opts for p in c.params)}
     assert readers == takers
     assert len(readers) >= 8
@@ -275,13 +186,15 @@ def test_every_bracket_of_a_help_text_shows(name):
 #: What is no message: code that is written for other programs, an argument of another library, a call in Python.
 OTHER_TEXTS = (
     "control.ss(",
+    ", outputs=",
+    ", name=",
     "laws=(",
     "np.asarray",
-    "Genetic(",
+    "GeneticAlgorithm(",
+    "pass an object, method=",
     "flexible_link(",
     "identify(",
     "dict(decimal=",
-    "rate=",
 )
 
 
@@ -374,13 +287,13 @@ def test_a_parameter_is_shown_as_who_reads_it_gives_it(message, python, command)
     assert current_interface() == "python"
 
 
-def test_a_command_leaves_the_interface_as_it_was(saved, small_run, tmp_path):
+def test_a_command_leaves_the_interface_as_it_was(saved, tmp_path):
     """Also where it fails, and whatever thread makes the message."""
     for words in (["inspect", saved], ["inspect", tmp_path / "none.csv"], ["identify", saved, "--structure", "arm:7"]):
         run_command(*words)
         assert current_interface() == "python"
     with pytest.raises(ftlm.ModelError, match=r"^top = 0 is outside"):
-        ftlm.identify(small_run, ftlm.equation(FREE), method="least-squares", top=0)
+        ftlm.LeastSquares(top=0)
     done = run_command("identify", saved, "--structure", FREE, "--method", "least-squares", "--top", 0)
     assert done.stderr.startswith("ftlm: --top 0 is outside")
 
@@ -395,7 +308,7 @@ def test_names_of_files_and_signals_are_shown_as_typed(tmp_path):
     done = run_command("inspect", path, "-u", "force=method=", "-y", "y")
     assert "'method='" in done.stderr
     done = run_command("inspect", path, "-u", "u", "-y", "y")
-    assert done.stdout.startswith("window=3")
+    assert done.stdout.startswith("run window=3:")
 
 
 #: A call with bad input each: command, its words, what its message says, and what no message of a command says.
@@ -416,7 +329,7 @@ BAD_CALLS = [
     (["identify", "RUN", "--structure", FREE, "--method", "least-squares", "--m", "0"], "--m 0"),
     (["identify", "RUN", "--structure", FREE, "--threads", "0"], "--threads 0"),
     (["identify", "RUN", "--structure", FREE, "--reference", "u", "--intervals", "profile"], "--intervals quadratic"),
-    (["identify", "RUN", "--structure", FREE + " + c", "--offset", "none"], "--offset none"),
+    (["identify", "RUN", "--structure", "D^1.5 y = a y + b u + c", "--offset", "none"], "--offset none"),
     (
         ["search", "RUN", "--structure", FREE, "--coefficients", "least-squares", "--row-basis", "time"],
         "--row-basis is not",
@@ -459,11 +372,10 @@ def test_commands_speak_of_their_options(saved, tmp_path):
 # ------------------------------------------------------------------------------------------------ flags and arguments
 
 #: Flags that belong to the command line alone: where results go, how they are shown, what is done around a call.
-COMMAND_LINE_FLAGS = frozenset(
-    (
-    "json verbose force out report help validation min-fit only detrend design plot trajectory save live "
-    "filtered-signals no-filtered not-negated no-browser kind square sine"
-)
+COMMAND_LINE_FLAGS = {
+    *("json", "verbose", "force", "out", "report", "help", "validation", "min-fit", "only", "detrend"),
+    *("plot", "trajectory", "save", "filtered-signals", "no-filtered", "not-negated", "no-browser", "kind"),
+}
 
 
 def functions_behind():
@@ -482,18 +394,18 @@ def functions_behind():
     return {
         "open": reading, "inspect": reading, "doctor": (),
         "record": (run, Streaming, ftlm.equation),
-        "identify": (*estimation, ftlm.identify, ftlm.order_grid, ftlm.Genetic),
-        "search": (*estimation, ftlm.search_orders, ftlm.order_grid),
-        "certify": (*estimation, ftlm.certify_orders, ftlm.order_grid),
+        "identify": (*estimation, ftlm.identify, ftlm.order_grid, *METHODS.values()),
+        "search": (*estimation, ftlm.identify, ftlm.search_orders, ftlm.order_grid),
+        "certify": (*estimation, ftlm.identify, ftlm.certify_orders, ftlm.order_grid),
         "resume": (ftlm.resume_search,), "status": (),
         "identify-frequency": (ftlm.load_frequency, ftlm.Layout, ftlm.identify_frequency),
         "select": (*estimation, ftlm.select, ftlm.identify),
-        "consistency": (*estimation, ftlm.consistency, ftlm.identify),
+        "consistency": (*estimation, ftlm.consistency, ftlm.identify, ftlm.OutputError),
         "compare": (*reading, ftlm.compare), "resid": (*reading, ftlm.resid), "simulate": (*reading, ftlm.simulate),
         "report": reading, "plot": reading, "export": (export_text,),
         "control": design, "input-shaper": (ftlm.control.input_shaper, ftlm.control.fractional_pid),
         "design-input": (*reading, ftlm.design_input),
-        "demo": (run_demo,), "reproduce": (*reading, ftlm.reproduce, ftlm.Genetic),
+        "demo": (run_demo,), "reproduce": (*reading, ftlm.reproduce, ftlm.GeneticAlgorithm),
         "orders": (*reading, orders_on_unseen_runs), "app": (serve,),
     }  # fmt: skip
 

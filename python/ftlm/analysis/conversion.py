@@ -13,7 +13,7 @@ from ftlm._core import __version__
 from ftlm.analysis.frequency_response import check_no_input_nonlinearity, transfer_functions
 from ftlm.analysis.rational_approximation import approximate, identifier
 from ftlm.errors import ModelError
-from ftlm.model.model import ModelData
+from ftlm.model.model import Model
 from ftlm.structure.equation import format_equation
 from ftlm.structure.order import MAX_ORDER
 from ftlm.structure.parser import equation
@@ -28,7 +28,7 @@ def _comment(text: str, mark: str) -> str:
     return "\n".join(f"{mark} {''.join(c if c.isprintable() else '?' for c in line)}" for line in lines)
 
 
-def json_text(model: ModelData) -> str:
+def json_text(model: Model) -> str:
     """Return the transfer functions of a model as JSON, exact in powers and coefficients.
 
     Parameters
@@ -62,7 +62,7 @@ def json_text(model: ModelData) -> str:
     return json.dumps(document, indent=1, ensure_ascii=False, allow_nan=False) + "\n"
 
 
-def matlab_text(model: ModelData) -> str:
+def matlab_text(model: Model) -> str:
     """Return a MATLAB script with the transfer functions as vectors, and as FOMCON ``fotf`` objects if available.
 
     Parameters
@@ -113,7 +113,7 @@ def matlab_text(model: ModelData) -> str:
     return "\n".join(lines) + "\n"
 
 
-def control_text(model: ModelData, *, band: tuple[float, float], order: int = 5) -> str:
+def control_text(model: Model, *, band: tuple[float, float], order: int = 5) -> str:
     """Return a Python script that builds the python-control system without ftlm.
 
     Parameters
@@ -154,7 +154,7 @@ def control_text(model: ModelData, *, band: tuple[float, float], order: int = 5)
 
 
 def export_text(
-    model: ModelData,
+    model: Model,
     to: Literal["control", "matlab", "json"],
     *,
     band: tuple[float, float] | None = None,

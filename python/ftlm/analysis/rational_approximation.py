@@ -16,7 +16,7 @@ from numpy.typing import NDArray
 from ftlm.analysis.frequency_response import check_no_input_nonlinearity, frequency_response, response_inputs
 from ftlm.analysis.poles import stability
 from ftlm.errors import ModelError
-from ftlm.model.model import ModelData
+from ftlm.model.model import Model
 from ftlm.simulation.discretization import check_linear
 from ftlm.utils.parameters import setting
 from ftlm.utils.validation import Floats, real_number, short_repr, whole_number
@@ -193,7 +193,7 @@ def _delay_input(builder: _Builder, source: int, delay: float) -> _Signal:
     return {last: 1.0}, {source: direct}, {}
 
 
-def approximate(model: ModelData, *, band: tuple[float, float], order: int = 5) -> Approximation:
+def approximate(model: Model, *, band: tuple[float, float], order: int = 5) -> Approximation:
     """Approximate a model by a rational state-space system.
 
     Parameters
@@ -276,7 +276,7 @@ def approximate(model: ModelData, *, band: tuple[float, float], order: int = 5) 
     return _with_errors(model, unjudged)
 
 
-def _with_errors(model: ModelData, system: Approximation) -> Approximation:
+def _with_errors(model: Model, system: Approximation) -> Approximation:
     """Return the approximation with its errors and warnings on its stability."""
     low, high = system.band
     omega = np.geomspace(low, high, COMPARISON_FREQUENCIES)
@@ -309,7 +309,7 @@ def _with_errors(model: ModelData, system: Approximation) -> Approximation:
     return replace(system, gain_error=gain, phase_error=phase, stable=stable, warnings=tuple(words))
 
 
-def to_control(model: ModelData, *, band: tuple[float, float], order: int = 5) -> Any:
+def to_control(model: Model, *, band: tuple[float, float], order: int = 5) -> Any:
     """Return a python-control system that approximates a model within a band.
 
     Parameters

@@ -26,7 +26,7 @@ from ftlm.cli.framework import (
 from ftlm.cli.options import Force, Json, Noise, Number, ReadingOptions, SavedModel, Text, Texts
 from ftlm.errors import ModelError
 from ftlm.experiment_design import design_input as experiment
-from ftlm.model.model import load_model
+from ftlm.model.serialization import load_model
 from ftlm.plot import matplotlib_figures as design_plots
 from ftlm.progress import Progress
 from ftlm.utils.files import COMMAND_MESSAGES, check_free, write_atomically

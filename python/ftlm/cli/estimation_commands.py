@@ -57,11 +57,12 @@ from ftlm.errors import ModelError
 from ftlm.estimation import consistency as parts_of_runs
 from ftlm.estimation import identify as estimation
 from ftlm.estimation.frequency_domain import identify_frequency as frequency_estimation
+from ftlm.estimation.methods import OutputError, method_with_options
 from ftlm.io.load_frequency import load_frequency
-from ftlm.model.model import load_model
+from ftlm.model.serialization import load_model
 from ftlm.order_search.certificate import DEFAULT_MAX_CELLS, DEFAULT_MAX_TERM_RATIO, DEFAULT_TOLERANCE, certify_orders
 from ftlm.order_search.checkpoint import Store
-from ftlm.order_search.options import check_options_used
+from ftlm.order_search.options import SearchSettings
 from ftlm.order_search.result import SearchResult
 from ftlm.order_search.search import announce_time, job_of, make_job, resume_job, run_job, search_status
 from ftlm.progress import Progress
@@ -112,7 +113,10 @@ def identify(
     """Identify a model: verdict, equations, parameters, gain and modes, fit, warnings."""
     check_free(out, report, force=force, words=COMMAND_MESSAGES)
     shape.structure(structure)
-    begin = None if fit.start is None else load_model(fit.start)
+    given = given_fields(replace(grid, increment=None), ranking, weighting, fit, genetic)
+    given |= {} if grid.grid() is None else {"order_grid": grid.grid()}
+    given |= {} if fit.start is None else {"start": load_model(fit.start)}
+    chosen = method_with_options(method, given)
     runs = reading.runs(files)
     wanted = shape.structure_for_runs(structure, runs)
     # The window is of the runs that are identified from.
@@ -124,12 +128,8 @@ def identify(
         result = estimation.identify(
             runs,
             wanted,
-            method=method,
-            order_grid=grid.grid(),
-            norm=grid.norm,
+            method=chosen,
             m=m,
-            **given_fields(fit, ranking, weighting) | {"start": begin},
-            genetic=genetic.settings(method),
             threads=threads,
             progress=progress,
         )
@@ -177,9 +177,8 @@ def search(
     parts = wanted.independent_groups() or {e.output: wanted.equation(e.output) for e in wanted.equations}
     every = grid.grid() or OrderGrid()
     check_order_names(every, wanted)
-    settings = given_fields(replace(ranking, store=None), weighting)
-    settings |= {} if grid.norm is None else {"norm": grid.norm}
-    check_options_used(coefficients, settings, argument="coefficients")
+    given = given_fields(replace(grid, order_grid=None, increment=None), replace(ranking, store=None), weighting)
+    settings = SearchSettings(coefficients=coefficients, **given)
     results = {}
     with resumable(ranking.store), contextlib.ExitStack() as stack:
         jobs = {
@@ -187,10 +186,9 @@ def search(
                 runs,
                 part,
                 restrict_grid(every, part),
-                coefficients=coefficients,
+                settings,
                 m=m,
                 threads=threads,
-                **settings,
             )
             for name, part in parts.items()
         }
@@ -342,7 +340,7 @@ class ResponseOptions:
     panel: ClassVar[str] = FILE
 
     columns: Annotated[
-        Texts, Option(metavar="PART=COLUMN", help="Column of frequency, real, imag, magnitude, phase or deviation.")
+        Texts, Option(metavar="PART=COLUMN", help="Column of frequency, real, imag, magnitude, phase, deviation.")
     ] = None
     frequency_unit: Annotated[Text, Option(metavar="UNIT", help="Hz, kHz, MHz, mHz or rad/s; default the file's.")] = (
         None
@@ -394,7 +392,7 @@ def identify_frequency(
     ],
     weights: Annotated[
         Literal["auto", "relative", "uniform", "deviation"],
-        Option(rich_help_panel=METHOD, help="Weights of the response; auto: deviations if the file has them."),
+        Option(rich_help_panel=METHOD, help="Weights; auto: deviations if the file has them."),
     ] = "auto",
     reading: ResponseOptions,
     orders: Annotated[
@@ -528,11 +526,12 @@ def consistency(
     shape.structure(structure)
     runs = reading.runs(files)
     wanted = shape.structure_for_runs(structure, runs)
+    method = OutputError() if loss is None else OutputError(loss=loss)
     with Progress("fitting segments", quiet=as_json) as progress:
         count = max(segments or 0, 2) if len(runs) == 1 else len(runs)
         progress.expect("fitting all segments", *duration_bounds(fit_seconds(runs, wanted, threads, count)))
         found = parts_of_runs.consistency(
-            runs, wanted, segments=segments, loss=loss, threads=threads, progress=progress
+            runs, wanted, segments=segments, method=method, threads=threads, progress=progress
         )
     if report is not None:
         found.report(report, force=force)

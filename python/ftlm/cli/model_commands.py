@@ -23,7 +23,8 @@ from ftlm.cli.framework import (
 from ftlm.cli.options import BlockPulses, Files, Force, Json, Number, Page, ReadingOptions, SavedModel, Text, Texts
 from ftlm.data.run import Run
 from ftlm.errors import ModelError
-from ftlm.model.model import Model, load_model
+from ftlm.model.model import Model
+from ftlm.model.serialization import load_model
 from ftlm.plot import matplotlib_figures as plots
 from ftlm.report.html_report import model_page
 from ftlm.utils.files import COMMAND_MESSAGES, check_free, write_atomically

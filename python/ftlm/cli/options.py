@@ -14,7 +14,7 @@ from ftlm.arm.flexible_link import Law, flexible_link
 from ftlm.cli.framework import announce_reading, interval, numbers, pairs, ranges
 from ftlm.data.run import Run
 from ftlm.errors import DataError, ModelError
-from ftlm.estimation.genetic import Genetic
+from ftlm.estimation.methods import METHODS
 from ftlm.io.dialect import Layout
 from ftlm.io.load import load
 from ftlm.io.preview import OpenedFile, open_file
@@ -25,8 +25,6 @@ from ftlm.structure.sensor_filter import SensorFilter
 from ftlm.structure.structure import INITIAL_CHOICES, Structure, check_initial
 from ftlm.utils.parameters import parameter
 
-#: Methods that search an order grid.
-GRID_METHODS = ("multi-innovation", "least-squares", "instrumental-variables")
 #: Panels of options in a command's help.
 FILE, STRUCTURE, METHOD, OUTPUT = "File", "Structure", "Method", "Output"
 #: Types of optional options.
@@ -39,7 +37,7 @@ SavedModel = Annotated[str, Argument(metavar="MODEL", help="Saved model.")]
 StructureText = Annotated[
     str,
     Option(
-        "--structure", rich_help_panel=STRUCTURE, help="flexible-link:1|2|both, arm:1|2|both, or an equation in words."
+        "--structure", rich_help_panel=STRUCTURE, help="flexible-link:1|2|both, arm:1|2|both or an equation in words."
     ),
 ]
 CandidateTexts = Annotated[
@@ -101,6 +99,11 @@ def layout_options(record: object) -> dict[str, Any]:
     """Layout options that a dataclass has and the user has set."""
     said = {f.name: getattr(record, f.name, None) for f in fields(Layout)}
     return {name: value for name, value in said.items() if value is not None}
+
+
+def methods_with(*options: str) -> tuple[str, ...]:
+    """Return the names of the methods of estimation that have these options."""
+    return tuple(name for name, method in METHODS.items() if set(options) <= {f.name for f in fields(method)})
 
 
 @dataclass(frozen=True)
@@ -419,7 +422,7 @@ class OrderGridOptions:
     """Order grid of a search and its norm; None for an option that is not given."""
 
     panel: ClassVar[str] = METHOD
-    methods: ClassVar[tuple[str, ...]] = (*GRID_METHODS, "genetic")
+    methods: ClassVar[tuple[str, ...]] = methods_with("order_grid", "norm")
 
     order_grid: Annotated[
         Texts, Option(metavar="NAME=LOW:HIGH:STEP", help="Values of an order; alpha stands for every alpha.")
@@ -442,7 +445,7 @@ class RankingOptions:
     """Options of the ranking of candidates; None for an option that is not given."""
 
     panel: ClassVar[str] = METHOD
-    methods: ClassVar[tuple[str, ...]] = GRID_METHODS
+    methods: ClassVar[tuple[str, ...]] = methods_with("criterion", "top", "store")
 
     criterion: Annotated[Criterion | None, Option(help="Error that ranks candidates; default output-error.")] = None
     top: Annotated[int | None, Option(help="Rows of the ranked table; default 20.")] = None
@@ -454,7 +457,7 @@ class MultiInnovationOptions:
     """Options of the multi-innovation method; None for an option that is not given."""
 
     panel: ClassVar[str] = METHOD
-    methods: ClassVar[tuple[str, ...]] = ("multi-innovation",)
+    methods: ClassVar[tuple[str, ...]] = methods_with("innovation_length", "prior_covariance", "row_basis")
 
     innovation_length: Annotated[int | None, Option(help="Innovation length p; default 7.")] = None
     prior_covariance: Annotated[Number, Option(help="Prior covariance K0 of the coefficients; default 1.")] = None
@@ -466,7 +469,7 @@ class OutputErrorOptions:
     """Options of the output-error method; None for an option that is not given."""
 
     panel: ClassVar[str] = METHOD
-    methods: ClassVar[tuple[str, ...]] = ("output-error",)
+    methods: ClassVar[tuple[str, ...]] = methods_with("loss", "intervals", "start", "reference")
 
     loss: Loss = None
     intervals: Annotated[
@@ -481,23 +484,15 @@ class OutputErrorOptions:
 
 @dataclass(frozen=True)
 class GeneticOptions:
-    """Options of the genetic algorithm."""
+    """Options of the genetic algorithm; None for an option that is not given."""
 
     panel: ClassVar[str] = METHOD
-    methods: ClassVar[tuple[str, ...]] = ("genetic",)
+    methods: ClassVar[tuple[str, ...]] = methods_with("seeds", "evaluations")
 
     seeds: Annotated[
         list[int] | None, Option("--seeds", min=0, help="Seed of the genetic algorithm; several are several runs.")
     ] = None
     evaluations: Annotated[int | None, Option(help="Evaluations per seed of the genetic algorithm.")] = None
-
-    def settings(self, method: str = "genetic") -> Genetic | None:
-        """Settings for a method, or None without options."""
-        if self.seeds is None and self.evaluations is None:
-            return None
-        if method != "genetic":
-            raise ModelError(f"--seeds and --evaluations are of the genetic algorithm, not of --method {method}")
-        return Genetic(seeds=tuple(self.seeds or Genetic().seeds), evaluations=self.evaluations)
 
 
 def given_fields(*records: Any) -> dict[str, Any]:

@@ -21,8 +21,10 @@ from ftlm.cli.options import (
     Texts,
     Threads,
     Verbose,
+    given_fields,
 )
 from ftlm.errors import ModelError
+from ftlm.estimation.genetic import GeneticAlgorithm
 from ftlm.progress import Progress
 from ftlm.reproduction import reproduction
 from ftlm.reproduction.cross_validation import orders_on_unseen_runs
@@ -104,13 +106,14 @@ def reproduce(
     if sine is not None and square is None:
         raise ModelError("--sine is given without --square; give both, or neither for the virtual rig")
     measured = reading.runs([f for f in (square, sine) if f is not None], apart=True)
+    rival = given_fields(genetic)
     with Progress("", quiet=as_json) as progress:
         result = reproduction.reproduce(
             *measured,
             increment=increment,
             noise=noise,
             seed=seed,
-            genetic=genetic.settings(),
+            genetic=GeneticAlgorithm(**rival) if rival else None,
             rivals_increment=rivals_increment,
             arms=arms,
             records=records,

@@ -13,7 +13,7 @@ from ftlm.analysis.rational_approximation import LARGEST_ORDER, oustaloup
 from ftlm.control.arguments import check_limit, check_samples, checked_rate
 from ftlm.control.stability_margins import LoopDesign, Margins, Plant, margins_of, nyquist_frequencies
 from ftlm.errors import ModelError
-from ftlm.model.model import ModelData, check_model
+from ftlm.model.model import Model, check_model
 from ftlm.simulation.discretization import check_linear
 from ftlm.utils.parameters import parameter, setting
 from ftlm.utils.validation import Complex, Floats, nearest, real_number, short_repr, whole_number
@@ -340,7 +340,7 @@ class PidDesign(LoopDesign):
 
 
 def fractional_pid(
-    model: ModelData,
+    model: Model,
     *,
     output: str | None = None,
     input: str | None = None,
@@ -450,7 +450,7 @@ def fractional_pid(
 
 
 def plant_of(
-    model: ModelData, output: str | None, driver: str | None, rate: float, coupling: str, *, sensor: bool
+    model: Model, output: str | None, driver: str | None, rate: float, coupling: str, *, sensor: bool
 ) -> Plant:
     """Return the plant of an output and an input; raise if they are unknown or ambiguous."""
     check_model(model)
@@ -513,7 +513,7 @@ def _solve_gains(target: complex, slope: float, wc: float, lam: float, mu: float
     return FractionalPid(kp, ki, kd, lam, mu)
 
 
-def least_certain_parameter(model: ModelData) -> str:
+def least_certain_parameter(model: Model) -> str:
     """Name of the coefficient or order with the largest relative uncertainty."""
     covariance = None if model.estimate is None else model.estimate.covariance
     if covariance is None:

@@ -13,7 +13,7 @@ from ftlm.analysis.poles import Mode
 from ftlm.analysis.poles import modes as model_modes
 from ftlm.control.arguments import checked_rate
 from ftlm.errors import DataError, ModelError
-from ftlm.model.model import ModelData
+from ftlm.model.model import Model
 from ftlm.utils.formatting import with_error
 from ftlm.utils.parameters import parameter, setting
 from ftlm.utils.statistics import NORMAL_95
@@ -152,7 +152,7 @@ class Shaper:
 
 
 def input_shaper(
-    model: ModelData | complex,
+    model: Model | complex,
     kind: Literal["zv", "zvd"] = "zv",
     *,
     modes: int = 1,

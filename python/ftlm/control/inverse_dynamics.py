@@ -13,7 +13,7 @@ from ftlm.control.arguments import POSITIVE_RANGE, check_limit, check_samples, p
 from ftlm.control.fractional_pid import least_certain_parameter
 from ftlm.control.stability_margins import LoopDesign, Plant
 from ftlm.errors import DataError, ModelError
-from ftlm.model.model import ModelData
+from ftlm.model.model import Model
 from ftlm.utils.parameters import setting
 from ftlm.utils.validation import Complex, Floats, real_number, short_repr
 
@@ -78,7 +78,7 @@ class Trajectory:
         return {
             "rows": len(self.path),
             "largest_command": float(np.max(np.abs(self.command))),
-            "left": self.residual_vibration,
+            "residual_vibration": self.residual_vibration,
             "plain": self.plain,
         }
 
@@ -116,13 +116,13 @@ def point_to_point(
     ModelError
         Invalid numbers, or a move of fewer than ten samples.
     """
-    reach = real_number("size", distance)
+    reach = real_number("distance", distance)
     if not math.isfinite(reach):
         raise ModelError(f"size = {short_repr(distance)} is not a finite number")
     times = positive("duration", duration), positive("rate", rate)
-    rests = [real_number(n, v) for n, v in (("before", dwell_before), ("after", dwell_after))]
+    rests = [real_number(n, v) for n, v in (("dwell_before", dwell_before), ("dwell_after", dwell_after))]
     if not all(0 <= r < math.inf for r in rests):
-        raise ModelError(f"before = {dwell_before!r} and after = {dwell_after!r} are not seconds from 0")
+        raise ModelError(f"dwell_before = {dwell_before!r} and dwell_after = {dwell_after!r} are not seconds from 0")
     if times[0] * times[1] < 10:
         raise ModelError(
             f"{setting('duration')} {short_repr(duration)} s has fewer than ten samples at {times[1]:g} Hz; give it "
@@ -153,7 +153,7 @@ def inverse_dynamics(
     path : array_like
         Desired path, one row per sample at the loop's rate. It is at rest at both ends, with a dwell before the move as
         long as the reference must lead.
-    of : str, optional
+    output : str, optional
         Output of the model or a sum such as ``"theta11 + theta12"``, as measured by the loop; may be omitted for a
         model with one output.
     limit
@@ -193,7 +193,7 @@ def inverse_dynamics(
     weight = np.exp(-fall * np.arange(size) / design.rate)
     heard, acts, asks = design.controller_response(w[inside])
 
-    def closed_loop_response(model: ModelData) -> tuple[Complex, Complex]:
+    def closed_loop_response(model: Model) -> tuple[Complex, Complex]:
         """Command and outputs of the closed loop per reference."""
         held = np.array([replace(p, model=model).response(w[inside]) for p in design.plants])
         loop = np.sum([a * held[names.index(o)] for o, a in zip(heard, acts, strict=True)], axis=0)

@@ -17,7 +17,7 @@ from ftlm.control.realization import Realisation, catch_numerical_errors, fit_re
 from ftlm.control.stability_margins import LoopDesign, Margins, Plant, margins_of
 from ftlm.data.run import Run
 from ftlm.errors import DataError, ModelError
-from ftlm.model.model import ModelData, check_model
+from ftlm.model.model import Model, check_model
 from ftlm.utils.parameters import parameter, setting
 from ftlm.utils.validation import Complex, Floats, nearest, short_repr
 
@@ -119,7 +119,7 @@ class Observer:
 
 
 def observer(
-    model: ModelData,
+    model: Model,
     *,
     input: str | None = None,
     measured: Sequence[str] | None = None,
@@ -172,7 +172,7 @@ def observer(
     )
 
 
-def plants_of(model: ModelData, driver: str | None, rate: float, coupling: str, *, sensor: bool) -> list[Plant]:
+def plants_of(model: Model, driver: str | None, rate: float, coupling: str, *, sensor: bool) -> list[Plant]:
     """Return all outputs of a stable model from one input; raise for an unstable model."""
     check_model(model)
     plants = [plant_of(model, o, driver, rate, coupling, sensor=sensor) for o in model.outputs]
@@ -211,9 +211,7 @@ def kalman_filter(
     )
 
 
-def noise_deviations(
-    model: ModelData, measured: tuple[str, ...], given: Mapping[str, float] | None
-) -> tuple[float, ...]:
+def noise_deviations(model: Model, measured: tuple[str, ...], given: Mapping[str, float] | None) -> tuple[float, ...]:
     """Standard deviation of the noise of each measured output."""
     if given is not None and not isinstance(given, Mapping):
         raise ModelError(f"{setting('noise')} {short_repr(given)} is no mapping from outputs to standard deviations")
@@ -420,7 +418,7 @@ class LqgDesign(LoopDesign):
 
 
 def lqg(
-    model: ModelData,
+    model: Model,
     *,
     max_deviation: Mapping[str, float],
     max_input: float,
@@ -444,7 +442,7 @@ def lqg(
     ----------
     model
         Linear model that is stable except for an integrator.
-    allowed : mapping
+    max_deviation : mapping
         Maximum acceptable deviations of outputs, or of sums such as ``"theta11 + theta12"`` (a tip); Bryson's rule.
     max_input
         Maximum acceptable input, in its unit.
@@ -504,7 +502,7 @@ def lqg(
     integral, grows = int(np.sum(at_one)), int(np.sum((np.abs(poles_of_it) > 1.0) & ~at_one))
     heard = [plants[names.index(o)] for o in seen.measured]
 
-    def loop_margins(which: ModelData) -> Margins:
+    def loop_margins(which: Model) -> Margins:
         parts = [replace(p, model=which) for p in heard]
         loop = np.sum(acting * np.array([p.response(w) for p in parts]), axis=0)
         order = max(p.integral_order() for p in parts)
@@ -514,7 +512,7 @@ def lqg(
     if not (nominal.stable and nominal.sensitivity <= MAX_SENSITIVITY):
         raise ModelError(
             f"the loop is no design on the exact response of the model ({nominal}): such loops have no guaranteed "
-            "margins; make effort smaller, drift larger or the noise smaller, or allow for larger deviations"
+            "margins; make max_input smaller, process_noise larger or the noise smaller, or allow for larger deviations"
         )
     margins = tuple(loop_margins(one.model) for one in plants[0].samples(count, start))
     broken = [m for m in margins if not (m.stable and m.sensitivity <= MAX_SENSITIVITY)]
@@ -522,8 +520,8 @@ def lqg(
         raise ModelError(
             f"the intervals are too wide to design on: in {len(broken)} of {len(margins)} samples of the model's "
             f"numbers the loop is not stable or has a largest sensitivity above {MAX_SENSITIVITY:g}; "
-            f"{least_certain_parameter(model)}; identify from a longer or richer run (ftlm design-input lays it "
-            f"out), or lower {parameter('max_input')}"
+            f"{least_certain_parameter(model)}; "
+            "identify from a longer or richer run (ftlm design-input lays it out), or make max_input smaller"
         )
     return LqgDesign(controller, realisation, nominal, margins, tuple(plants))
 

@@ -4,7 +4,7 @@ from __future__ import annotations
 
 from collections.abc import Mapping, Sequence
 from dataclasses import dataclass, field
-from typing import TYPE_CHECKING, Any
+from typing import Any
 
 import numpy as np
 
@@ -39,9 +39,6 @@ from ftlm.data.units import TIME_UNITS, check_units
 from ftlm.errors import DataError
 from ftlm.utils.parameters import parameter
 from ftlm.utils.validation import Floats, bad_rows, check_run_name, check_signal_name, join_names
-
-if TYPE_CHECKING:
-    from ftlm.data.run import RunData
 
 
 @dataclass(frozen=True)
@@ -83,16 +80,14 @@ class RunArguments:
         """Return the name of a signal in error messages."""
         return self.labels.get(signal, f"signal {signal!r}")
 
-    def build_run_data(self) -> RunData:
-        """Validate the arguments and build the run: names, numbers, time, window, values, spacing, in this order.
+    def checked_fields(self) -> dict[str, Any]:
+        """Return the fields of the run, checked in this order: names, numbers, time, window, values, spacing.
 
         Raises
         ------
         DataError
             An argument or a sample that cannot be used as given.
         """
-        from ftlm.data.run import RunData  # noqa: PLC0415 — the class that it makes
-
         self._check_names()
         units = check_units(self.units, (*self.inputs, *self.outputs))
         behaviour: dict[str, Intersample] = {
@@ -137,7 +132,7 @@ class RunArguments:
                 readings = NonuniformSamples(since, data)
                 data = readings.resample(behaviour, new_step)
                 facts += (describe_resampling(since, new_step, first, describe_nonuniform_resampling(behaviour)),)
-        return RunData(
+        return dict(
             name=self.name,
             step=step,
             start=start,
@@ -263,7 +258,7 @@ class RunArguments:
         if last - first < MIN_RUN_SAMPLES:
             thing = self.label_of((*self.inputs, *self.outputs)[0]) if self.time is None else self.time_label
             raise DataError(
-                f"{thing}: {last - first} rows{' in the slice' if self.window is not None else ''}, "
+                f"{thing}: {last - first} rows{' in the window' if self.window is not None else ''}, "
                 f"{MIN_RUN_SAMPLES} are needed; use a longer record"
             )
         return first, last

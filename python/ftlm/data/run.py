@@ -6,7 +6,7 @@ import copy
 import html
 import os
 from collections.abc import Callable, Hashable, Iterable, Mapping, Sequence
-from dataclasses import dataclass, field, fields
+from dataclasses import dataclass
 from typing import TYPE_CHECKING, Any, NoReturn
 
 import numpy as np
@@ -45,131 +45,8 @@ if TYPE_CHECKING:
     from ftlm.validation.data_advice import Advice
 
 
-@dataclass(frozen=True, eq=False, repr=False)
-class RunData:
-    """Regular samples of named inputs and outputs in SI units; base class of :class:`ftlm.Run`.
-
-    Parameters
-    ----------
-    name
-        Name of the run in reports.
-    step, start
-        Sampling interval and source time of the first sample [s].
-    inputs, outputs
-        Names of the signals.
-    notes
-        Notes on processing and, for a rig, on the recording.
-    sample_times
-        Nonuniform samples at their own times; None if the samples lie on the grid. The grid then holds interval means
-        of held inputs and linear interpolation of all other signals.
-    """
-
-    name: str
-    step: float
-    start: float
-    inputs: tuple[str, ...]
-    outputs: tuple[str, ...]
-    _data: dict[str, Floats]
-    _units: dict[str, str]
-    _intersample: dict[str, Intersample]
-    notes: tuple[str, ...] = ()
-    _metadata: dict[str, Any] = field(default_factory=dict)
-    sample_times: NonuniformSamples | None = None
-
-    def __post_init__(self) -> None:
-        for name, value in (
-            ("_data", {s: make_read_only(self._data[s]) for s in self.signals}),
-            ("_units", {s: self._units[s] for s in self.signals}),
-            ("_intersample", {s: self._intersample[s] for s in self.inputs}),
-            ("_metadata", copy.deepcopy(self._metadata)),
-        ):
-            object.__setattr__(self, name, value)
-        if self.sample_times is not None:
-            own = NonuniformSamples(
-                make_read_only(self.sample_times.times),
-                {s: make_read_only(self.sample_times.data[s]) for s in self.signals},
-            )
-            object.__setattr__(self, "sample_times", own)
-
-    @property
-    def signals(self) -> tuple[str, ...]:
-        """Names of the inputs, then of the outputs."""
-        return self.inputs + self.outputs
-
-    @property
-    def units(self) -> dict[str, str]:
-        """SI unit of every signal; "" where none was given. A copy."""
-        return dict(self._units)
-
-    @property
-    def intersample(self) -> dict[str, Intersample]:
-        """Intersample behavior of every input, "zoh" or "foh". A copy."""
-        return dict(self._intersample)
-
-    @property
-    def length(self) -> int:
-        """Number of samples N."""
-        return int(self._data[self.outputs[0]].size)
-
-    @property
-    def duration(self) -> float:
-        """Time from the first sample to the last, (N − 1)·step [s]."""
-        return (self.length - 1) * self.step
-
-    @property
-    def time(self) -> Floats:
-        """Sample times [s] from 0, shape (N,), read-only."""
-        return make_read_only(uniform_times(self.length, self.step))
-
-    @property
-    def warnings(self) -> tuple[str, ...]:
-        """Notes on processing and warnings about the data, as sentences."""
-        there = {name: drop_missing(self._data[name]) for name in self.outputs}
-        constant = tuple(
-            f"output {name!r} is constant ({float(values[0])!r} in all {values.size} rows): nothing can be identified "
-            "from it"
-            for name, values in there.items()
-            if values.size and is_constant(values)
-        )
-        return self.notes + constant
-
-    @property
-    def missing_samples(self) -> dict[str, NDArray[np.bool_]]:
-        """Mask of missing samples (of the run or of its `sample_times`) for every output with gaps."""
-        data = self._data if self.sample_times is None else self.sample_times.data
-        gone = {name: missing_mask(data[name]) for name in self.outputs}
-        return {name: rows for name, rows in gone.items() if rows.any()}
-
-    def with_interpolated_gaps(self) -> RunData:
-        """Return a copy with linearly interpolated gaps, for plots and data checks; never used for estimation."""
-        if not any(missing_mask(self._data[name]).any() for name in self.outputs):
-            return self
-        told = {f.name: getattr(self, f.name) for f in fields(RunData)}
-        return RunData(**{**told, "_data": {name: interpolate_gaps(values) for name, values in self._data.items()}})
-
-    @property
-    def metadata(self) -> dict[str, Any]:
-        """Metadata for JSON, such as name, seed, input, parameters and faults of a rig. A copy."""
-        return copy.deepcopy(self._metadata)
-
-    def __getitem__(self, name: str) -> Floats:
-        """Return a signal in SI units, shape (N,), read-only; `DataError` for an unknown name."""
-        try:
-            return self._data[name]
-        except (KeyError, TypeError):
-            raise self._unknown_signal_error(name) from None
-
-    def __contains__(self, name: object) -> bool:
-        return name in self.signals
-
-    def _unknown_signal_error(self, name: object) -> DataError:
-        return DataError(
-            f"signal {name!r} is not in run {self.name!r}{nearest(name, self.signals)}; "
-            f"its signals are {join_names(self.signals)}"
-        )
-
-
-class Run(RunData):
+@dataclass(eq=False, repr=False, init=False)
+class Run:
     """One measured experiment: regular samples of named inputs and outputs in SI units.
 
     A run is immutable. `Run.from_arrays`, `Run.from_frame` and `ftlm.load` create it and check the data once. Data
@@ -179,7 +56,33 @@ class Run(RunData):
 
     Sample j holds the outputs and inputs at t = j·step. Between samples `intersample` defines an input: ``"zoh"`` (a
     command, held until the next sample) or ``"foh"`` (a measured signal, linear).
+
+    Attributes
+    ----------
+    name : str
+        Name of the run in reports.
+    step, start : float
+        Sampling interval and source time of the first sample [s].
+    inputs, outputs : tuple of str
+        Names of the signals.
+    notes : tuple of str
+        Notes on processing and, for a rig, on the recording.
+    sample_times : NonuniformSamples or None
+        Nonuniform samples at their own times; None if the samples lie on the grid. The grid then holds interval means
+        of held inputs and linear interpolation of all other signals.
     """
+
+    name: str
+    step: float
+    start: float
+    inputs: tuple[str, ...]
+    outputs: tuple[str, ...]
+    notes: tuple[str, ...]
+    sample_times: NonuniformSamples | None
+    _data: dict[str, Floats]
+    _units: dict[str, str]
+    _intersample: dict[str, Intersample]
+    _metadata: dict[str, Any]
 
     def __init__(self) -> None:
         raise TypeError("a Run is made by Run.from_arrays, Run.from_frame or ftlm.load")
@@ -191,7 +94,25 @@ class Run(RunData):
         raise AttributeError(f"a Run never changes; {name!r} cannot be deleted")
 
     def __reduce__(self) -> tuple[object, ...]:
-        return run_of, (RunData(**self._fields()),)
+        return _restore_run, (vars(self),)
+
+    @classmethod
+    def _from_checked(cls, **values: Any) -> Run:
+        """Make a run from checked fields; arrays become read-only, data of signals that are not listed are left out."""
+        run = object.__new__(cls)
+        vars(run).update(values)
+        samples = run.sample_times
+        if samples is not None:
+            data = {s: make_read_only(samples.data[s]) for s in run.signals}
+            samples = NonuniformSamples(make_read_only(samples.times), data)
+        vars(run).update(
+            sample_times=samples,
+            _data={s: make_read_only(run._data[s]) for s in run.signals},
+            _units={s: run._units[s] for s in run.signals},
+            _intersample={s: run._intersample[s] for s in run.inputs},
+            _metadata=copy.deepcopy(run._metadata),
+        )
+        return run
 
     @classmethod
     def from_arrays(
@@ -256,7 +177,7 @@ class Run(RunData):
             large; if lengths differ; if a name, unit or behaviour is unknown or used twice; if time is not finite,
             repeated, decreasing, jittered or has a gap; if `step` is not positive.
         """
-        asked = RunArguments(
+        arguments = RunArguments(
             as_mapping("inputs", {} if inputs is None else inputs),
             as_mapping("outputs", outputs),
             step=step,
@@ -269,7 +190,7 @@ class Run(RunData):
             time_unit=time_unit,
             missing=missing,
         )
-        return build_run(asked)
+        return cls._from_checked(**arguments.checked_fields())
 
     @classmethod
     def from_frame(
@@ -318,7 +239,7 @@ class Run(RunData):
         """
         from ftlm.data.export import arguments_from_frame
 
-        asked = arguments_from_frame(
+        arguments = arguments_from_frame(
             frame,
             time=time,
             step=step,
@@ -332,7 +253,77 @@ class Run(RunData):
             time_unit=time_unit,
             missing=missing,
         )
-        return build_run(asked)
+        return cls._from_checked(**arguments.checked_fields())
+
+    @property
+    def signals(self) -> tuple[str, ...]:
+        """Names of the inputs, then of the outputs."""
+        return self.inputs + self.outputs
+
+    @property
+    def units(self) -> dict[str, str]:
+        """SI unit of every signal; "" where none was given. A copy."""
+        return dict(self._units)
+
+    @property
+    def intersample(self) -> dict[str, Intersample]:
+        """Intersample behavior of every input, "zoh" or "foh". A copy."""
+        return dict(self._intersample)
+
+    @property
+    def length(self) -> int:
+        """Number of samples N."""
+        return int(self._data[self.outputs[0]].size)
+
+    @property
+    def duration(self) -> float:
+        """Time from the first sample to the last, (N − 1)·step [s]."""
+        return (self.length - 1) * self.step
+
+    @property
+    def time(self) -> Floats:
+        """Sample times [s] from 0, shape (N,), read-only."""
+        return make_read_only(uniform_times(self.length, self.step))
+
+    @property
+    def warnings(self) -> tuple[str, ...]:
+        """Notes on processing and warnings about the data, as sentences."""
+        there = {name: drop_missing(self._data[name]) for name in self.outputs}
+        constant = tuple(
+            f"output {name!r} is constant ({float(values[0])!r} in all {values.size} rows): nothing can be identified "
+            "from it"
+            for name, values in there.items()
+            if values.size and is_constant(values)
+        )
+        return self.notes + constant
+
+    @property
+    def missing_samples(self) -> dict[str, NDArray[np.bool_]]:
+        """Mask of missing samples (of the run or of its `sample_times`) for every output with gaps."""
+        data = self._data if self.sample_times is None else self.sample_times.data
+        gone = {name: missing_mask(data[name]) for name in self.outputs}
+        return {name: rows for name, rows in gone.items() if rows.any()}
+
+    def with_interpolated_gaps(self) -> Run:
+        """Return a copy with linearly interpolated gaps, for plots and data checks; never used for estimation."""
+        if not any(missing_mask(self._data[name]).any() for name in self.outputs):
+            return self
+        return self._with(_data={name: interpolate_gaps(values) for name, values in self._data.items()})
+
+    @property
+    def metadata(self) -> dict[str, Any]:
+        """Metadata for JSON, such as name, seed, input, parameters and faults of a rig. A copy."""
+        return copy.deepcopy(self._metadata)
+
+    def __getitem__(self, name: str) -> Floats:
+        """Return a signal in SI units, shape (N,), read-only; `DataError` for an unknown name."""
+        try:
+            return self._data[name]
+        except (KeyError, TypeError):
+            raise self._unknown_signal_error(name) from None
+
+    def __contains__(self, name: object) -> bool:
+        return name in self.signals
 
     def __repr__(self) -> str:
         lines = [self._headline()]
@@ -606,7 +597,6 @@ class Run(RunData):
         if not outputs:
             raise DataError(f"select: no output is left; keep at least one of {join_names(self.outputs)}")
         inputs = tuple(name for name in kept if name in self.inputs)
-        # RunData keeps units and intersample behavior of its own signals only.
         return self._with(inputs=inputs, outputs=outputs)
 
     def require_outputs(self, names: Iterable[str]) -> None:
@@ -755,11 +745,14 @@ class Run(RunData):
 
         return dataset_of(self)
 
-    def _fields(self) -> dict[str, Any]:
-        return {f.name: getattr(self, f.name) for f in fields(RunData)}
+    def _unknown_signal_error(self, name: object) -> DataError:
+        return DataError(
+            f"signal {name!r} is not in run {self.name!r}{nearest(name, self.signals)}; "
+            f"its signals are {join_names(self.signals)}"
+        )
 
     def _with(self, **changes: Any) -> Run:
-        return run_of(RunData(**{**self._fields(), **changes}))
+        return Run._from_checked(**{**vars(self), **changes})
 
     def _headline(self) -> str:
         return (
@@ -772,16 +765,8 @@ class Run(RunData):
         return name + unit + (f" {self._intersample[name]}" if name in self._intersample else "")
 
 
-def build_run(asked: RunArguments) -> Run:
-    """Validate the arguments of a run and build it."""
-    return run_of(asked.build_run_data())
-
-
-def run_of(record: RunData) -> Run:
-    """Return validated run data as a :class:`Run`."""
-    run = object.__new__(Run)
-    RunData.__init__(run, **{f.name: getattr(record, f.name) for f in fields(RunData)})
-    return run
+def _restore_run(values: Mapping[str, Any]) -> Run:
+    return Run._from_checked(**values)
 
 
 #: Cached results per set of runs: those of the single equations and of the whole structure.

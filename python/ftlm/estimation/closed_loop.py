@@ -10,7 +10,7 @@ import numpy as np
 
 from ftlm.data.run import Run
 from ftlm.errors import DataError, ModelError
-from ftlm.estimation.estimators import Fit
+from ftlm.estimation.fit import Fit
 from ftlm.structure.structure import Structure
 from ftlm.utils.linalg import minimum_norm_solution
 from ftlm.utils.parameters import parameter
@@ -36,12 +36,10 @@ def instrument_runs(runs: Sequence[Run], structure: Structure, reference: str) -
     Raises
     ------
     ModelError
-        The reference is not a signal name, or is a signal of the model.
+        The reference is a signal of the model.
     DataError
         A run lacks the reference, the reference is constant, or the model has no input.
     """
-    if not isinstance(reference, str):
-        raise ModelError(f"reference is {type(reference).__name__}, not the name of a signal of the runs")
     if reference in structure.signals:
         raise ModelError(
             f"{parameter('reference', reference)} is a signal of the model; a reference drives the loop from "

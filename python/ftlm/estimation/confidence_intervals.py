@@ -12,7 +12,7 @@ import threading
 from collections.abc import Callable, Generator, Sequence
 from dataclasses import dataclass, replace
 from statistics import NormalDist
-from typing import Any
+from typing import Any, Literal
 
 import numpy as np
 
@@ -20,14 +20,14 @@ from ftlm.data.run import Run
 from ftlm.errors import ConvergenceError, FtlmError, ModelError
 from ftlm.estimation.free_parameters import FreeProblem
 from ftlm.estimation.objective import Iterate, Objective, covariance, covariance_of
-from ftlm.estimation.output_error import JointFit, ProfileInterval, fit_output_error
-from ftlm.estimation.result import IdentificationRecord
-from ftlm.order_search.options import Intervals, Loss
+from ftlm.estimation.output_error import JointFit, Loss, ProfileInterval, fit_output_error
+from ftlm.estimation.result import Identification
 from ftlm.utils.linalg import dot, projections, thin_svd
 from ftlm.utils.parameters import parameter
 from ftlm.utils.resources import interruptible_pool
 from ftlm.utils.validation import Floats, real_number
 
+Intervals = Literal["auto", "quadratic", "profile"]
 #: Largest relative error of a bound of the Wald interval, from one linear step of all other parameters. Above it the
 #: parameter is profiled.
 MAX_QUADRATIC_ERROR = 0.1
@@ -636,7 +636,7 @@ def is_lower_on_finer_grid(grid: Objective, before: Floats, after: Floats) -> bo
     return costs[1] < costs[0]
 
 
-def likelihood_of(result: IdentificationRecord) -> ProfileLikelihood:
+def likelihood_of(result: Identification) -> ProfileLikelihood:
     """Return the profile likelihood around the optimum of an output-error result."""
     if result.fit is None or result.task is None:
         raise ModelError(
@@ -647,7 +647,7 @@ def likelihood_of(result: IdentificationRecord) -> ProfileLikelihood:
 
 
 def result_profiles(
-    result: IdentificationRecord,
+    result: Identification,
     names: Sequence[str],
     level: float,
     threads: int,

@@ -14,8 +14,9 @@ from ftlm.data.run import Run, as_runs
 from ftlm.data.sampling import MIN_RUN_SAMPLES
 from ftlm.errors import DataError, FtlmError, ModelError
 from ftlm.estimation.identify import identify
+from ftlm.estimation.methods import EstimationMethod, resolve_method
 from ftlm.estimation.result import Identification
-from ftlm.structure.structure import Structure
+from ftlm.structure.structure import Offset, Structure
 from ftlm.svg.html_page import Page, ReportMixin, Section, Table
 from ftlm.utils.files import to_frame
 from ftlm.utils.formatting import Cell, format_bound
@@ -209,8 +210,8 @@ class Consistency(ReportMixin):
         """Return the parameters as a pandas frame by parameter and segment."""
         rows = [
             {
-                "number": name,
-                "part": self.names[part],
+                "parameter": name,
+                "segment": self.names[part],
                 "value": self._values(part)[name],
                 "standard_error": error,
                 "low": result.intervals[name][0],
@@ -219,26 +220,26 @@ class Consistency(ReportMixin):
             for part, result in enumerate(self.results)
             for name, error in result.standard_errors.items()
         ]
-        return to_frame(rows, ["number", "part"])
+        return to_frame(rows, ["parameter", "segment"])
 
     def to_dict(self) -> dict[str, Any]:
         """Return the result as a dictionary for JSON."""
         return {
-            "same": self.consistent,
+            "consistent": self.consistent,
             "reason": self.reason,
-            "parts": list(self.names),
+            "segments": list(self.names),
             "differences": [
                 {
-                    "number": d.name,
-                    "parts": [self.names[k] for k in d.parts],
-                    "standard_errors": finite(d.difference_in_errors),
-                    "apart": d.disjoint,
+                    "parameter": d.name,
+                    "segments": [self.names[k] for k in d.parts],
+                    "difference_in_errors": finite(d.difference_in_errors),
+                    "disjoint": d.disjoint,
                 }
                 for d in self.differences
             ],
             "distance": None if self.distance is None else finite(self.distance),
             "degrees": self.degrees,
-            "fits": {
+            "cross_validation": {
                 name: dict(zip(self.names, row, strict=True))
                 for name, row in zip(self.names, self.cross_validation, strict=True)
             },
@@ -270,8 +271,11 @@ def consistency(
     structure: Structure,
     *,
     segments: int | None = None,
+    method: str | EstimationMethod = "output-error",
+    offset: Offset | None = None,
+    m: int | None = None,
+    threads: int | None = None,
     progress: Callable[[int, int], None] | None = None,
-    **options: Any,
 ) -> Consistency:
     """Identify segments of a run separately and test whether they share one model.
 
@@ -287,10 +291,10 @@ def consistency(
         Structure to identify. Each segment with a nonzero start has its own initial terms or history.
     segments
         Number of segments of one run, by default 2; not used with several runs.
+    method, offset, m, threads
+        See :func:`ftlm.identify`; a method that gives standard errors, without a store and a start.
     progress
         Callback with (segments done, total segments).
-    **options
-        Options of :func:`ftlm.identify` except `store` and `start`, with a method that gives standard errors.
 
     Returns
     -------
@@ -315,15 +319,16 @@ def consistency(
         raise ModelError(
             f"{len(every)} runs are segments by themselves; leave {parameter('segments')} out, or give one run"
         )
-    kept = [n for n in ("store", "start") if options.get(n) is not None]
+    chosen = resolve_method(method)
+    kept = [n for n in ("store", "start") if getattr(chosen, n, None) is not None]
     if kept:
-        raise ModelError(f"{parameter(kept[0])} is of one identification, and each part has its own; leave it out")
+        raise ModelError(f"{kept[0]}= is of one identification, and each part has its own; leave it out")
     pieces = split_run(every[0], given or DEFAULT_SEGMENTS) if len(every) == 1 else list(every)
     names = _segment_names(pieces)
     results: list[Identification] = []
     for name, piece in zip(names, pieces, strict=True):
         try:
-            results.append(identify(piece, structure, **options))
+            results.append(identify(piece, structure, method=chosen, offset=offset, m=m, threads=threads))
         except FtlmError as error:
             raise type(error)(f"{name}: {error}") from error
         if not results[0].standard_errors:

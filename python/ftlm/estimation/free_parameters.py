@@ -15,7 +15,7 @@ from ftlm import _core
 from ftlm.data.run import Run
 from ftlm.data.sampling import interpolate_gaps
 from ftlm.errors import ModelError
-from ftlm.model.model import ModelData
+from ftlm.model.model import Model
 from ftlm.simulation.discretization import affine, initial_tuple
 from ftlm.structure.equation import Friction, Stribeck
 from ftlm.structure.input_nonlinearity import FreeInputParameter
@@ -221,7 +221,7 @@ def warm_starts(problem: FreeProblem, known: Mapping[str, float]) -> list[dict[s
     return [dict(zip(places, point, strict=True)) for point in points]
 
 
-def values_of_model(problem: FreeProblem, model: ModelData, more: Mapping[str, float]) -> dict[str, float]:
+def values_of_model(problem: FreeProblem, model: Model, more: Mapping[str, float]) -> dict[str, float]:
     """Return the values that a model of the same outputs gives to the free parameters of a problem.
 
     `more` are values that the model has under a coefficient law. A fixed order of the model is used for the free order

@@ -4,7 +4,7 @@ from __future__ import annotations
 
 from collections.abc import Sequence
 from dataclasses import dataclass, field, replace
-from typing import Any, Literal
+from typing import Any
 
 import numpy as np
 from numpy.typing import NDArray
@@ -12,7 +12,7 @@ from numpy.typing import NDArray
 from ftlm import _core
 from ftlm.data.run import Run
 from ftlm.errors import DataError, FtlmError, InternalError, ModelError
-from ftlm.order_search.options import Settings
+from ftlm.order_search.options import RowBasis, SearchSettings
 from ftlm.simulation.discretization import InitialTuple, Record, named_coefficients, prepare, structure_tuple
 from ftlm.structure.equation import Equation
 from ftlm.structure.structure import Initial, Structure
@@ -45,7 +45,7 @@ class CoefficientFit:
 
 
 def estimate_coefficients(
-    runs: Sequence[Run], structure: Structure, settings: Settings, m: int | None
+    runs: Sequence[Run], structure: Structure, settings: SearchSettings, m: int | None
 ) -> CoefficientFit:
     """Estimate the coefficients at given orders by the method that the settings name."""
     records = prepare(runs, structure, m, power_of_two=settings.needs_haar)
@@ -74,7 +74,7 @@ def _linear(
     return [r.core() for r in records], structure, list(first.inputs), fixed, first.start
 
 
-def _multi_innovation(item: Equation, records: list[Record], settings: Settings, prior: float) -> list[float]:
+def _multi_innovation(item: Equation, records: list[Record], settings: SearchSettings, prior: float) -> list[float]:
     """Return the coefficients by the closed form of equation (44)."""
     haar = settings.row_basis == "haar"
     (raw, *_), _ = _core.multi_innovation(*_linear(item, records), settings.innovation_length, prior, haar, False)
@@ -116,7 +116,9 @@ def _instrumental(fit: CoefficientFit, structure: Structure, records: list[Recor
             fit.errors.update({str(t.coefficient): s / abs(t.factor) for t, s in pairs})
 
 
-def step_bias_warnings(runs: Sequence[Run], structure: Structure, settings: Settings, fit: CoefficientFit) -> list[str]:
+def step_bias_warnings(
+    runs: Sequence[Run], structure: Structure, settings: SearchSettings, fit: CoefficientFit
+) -> list[str]:
     """Return a warning if the step changes a coefficient by more than its standard error allows.
 
     The scheme has order 2. One third of the change from twice the step therefore remains (Richardson).
@@ -142,7 +144,7 @@ def step_bias_warnings(runs: Sequence[Run], structure: Structure, settings: Sett
     ]
 
 
-def _prior_warnings(output: str, raw: list[float], weak: list[float], settings: Settings) -> list[str]:
+def _prior_warnings(output: str, raw: list[float], weak: list[float], settings: SearchSettings) -> list[str]:
     """Return a warning if the prior covariance, not the data, determines the size of a coefficient."""
     shares = [abs(a - b) / abs(b) for a, b in zip(raw, weak, strict=True) if b]
     worst = max(shares, default=0.0)
@@ -151,7 +153,7 @@ def _prior_warnings(output: str, raw: list[float], weak: list[float], settings: 
     return [
         f"{output}: the prior (K0 = {settings.prior_covariance:g}, coefficients near 0) moves a coefficient by "
         f"{100 * min(worst, 9.99):.0f} % from what the data alone say; p = {settings.innovation_length} only weighs "
-        f"the data against it. Raise {parameter('prior_covariance')} or use {parameter('method', 'least-squares')}"
+        f"the data against it. Raise prior_covariance or use {parameter('method', 'least-squares')}"
     ]
 
 
@@ -183,7 +185,7 @@ def multi_innovation_trace(
     *,
     innovation_length: int = 7,
     prior_covariance: float = 1.0,
-    row_basis: Literal["haar", "time"] = "haar",
+    row_basis: RowBasis = "haar",
     m: int | None = None,
     every: int = 1,
 ) -> MultiInnovationTrace:
@@ -196,7 +198,7 @@ def multi_innovation_trace(
     equation
         One equation whose orders are numbers.
     innovation_length, prior_covariance, row_basis, m
-        See :func:`identify`.
+        See :class:`ftlm.MultiInnovation` and :func:`ftlm.identify`.
     every
         Give every n-th step (and the last).
 
@@ -214,7 +216,7 @@ def multi_innovation_trace(
     -----
     O(m k^3) for the recursion and one division of series for each step given.
     """
-    settings = Settings.check(
+    settings = SearchSettings(
         innovation_length=innovation_length, prior_covariance=prior_covariance, row_basis=row_basis
     )
     if len(equation.equations) != 1 or equation.order_names:
@@ -291,8 +293,8 @@ class Streaming:
     """Online estimator of the coefficients of a structure for a run that starts at rest.
 
     Each sample costs the same, whatever the length of the run: the past is held by about a hundred numbers a signal.
-    After the last sample the coefficients are those of ``identify(method="multi-innovation", row_basis="time")`` at the
-    same orders on the run's own grid, to rounding.
+    After the last sample the coefficients are those of ``identify(method=MultiInnovation(row_basis="time"))`` at
+    the same orders on the run's own grid, to rounding.
 
     Parameters
     ----------

@@ -13,7 +13,7 @@ from ftlm.data.run import Run
 from ftlm.data.sampling import drop_missing
 from ftlm.estimation.free_parameters import FreeProblem
 from ftlm.estimation.output_error import OUTLIER_DEVIATIONS, JointFit
-from ftlm.estimation.result import IdentificationRecord
+from ftlm.estimation.result import Identification
 from ftlm.model.model import Model
 from ftlm.simulation.discretization import compared_values, has_nonuniform_samples
 from ftlm.simulation.output_samples import OutputSamples
@@ -375,7 +375,7 @@ def stability_warnings(model: Model) -> list[str]:
     return [f"the model is {verdict}: its free run grows without bound, however well it fits a run of this length"]
 
 
-def validate(result: IdentificationRecord, runs: Run | Sequence[Run]) -> Comparison:
+def validate(result: Identification, runs: Run | Sequence[Run]) -> Comparison:
     """Compare a result with other runs and add warnings; see :meth:`ftlm.Identification.validate`."""
     there = compare(result.model, runs)
     words = [

@@ -19,9 +19,9 @@ from ftlm.estimation.output_error import (
     SWEEP_FRACTION,
     Initialization,
     JointFit,
+    Loss,
     fit_output_error,
 )
-from ftlm.order_search.options import Loss
 from ftlm.progress import ShareTracker
 from ftlm.simulation.initial_conditions import (
     common_initial_conditions,

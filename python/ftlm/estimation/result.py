@@ -54,8 +54,35 @@ class Task:
 
 
 @dataclass(frozen=True)
-class IdentificationRecord:
-    """Data of an identification; the fields are those of :class:`ftlm.Identification`."""
+class Identification:
+    """Result of an identification: model, fit, residuals, settings and verdict.
+
+    Parameters
+    ----------
+    model
+        Identified model.
+    method
+        Estimator of the coefficients.
+    comparison
+        Simulation error and equation error on the estimation runs.
+    searches
+        Order searches that gave the orders: by output, or under ``"stage"`` for a search under the order law; empty if
+        all orders were given.
+    settings
+        Settings of the estimator.
+    warnings
+        Warnings about the model.
+    fit
+        Optimum of the joint output error with its covariance; None for the equation-error methods.
+    residuals
+        Residual tests on the estimation runs; None if these are too short.
+    information
+        Information criteria, with orders counted as parameters; None without residuals.
+    task
+        Runs and structure as given.
+    coefficient_errors
+        Standard errors of coefficients, and of searched orders, for methods without a joint covariance.
+    """
 
     model: Model
     method: str
@@ -137,37 +164,6 @@ class IdentificationRecord:
     def fit_percent(self) -> dict[str, float]:
         """Fit of the simulation in percent, by output."""
         return self.comparison.fit_percent
-
-
-class Identification(IdentificationRecord):
-    """Result of an identification: model, fit, residuals, settings and verdict.
-
-    Parameters
-    ----------
-    model
-        Identified model.
-    method
-        Estimator of the coefficients.
-    comparison
-        Simulation error and equation error on the estimation runs.
-    searches
-        Order searches that gave the orders: by output, or under ``"stage"`` for a search under the order law; empty if
-        all orders were given.
-    settings
-        Settings of the estimator.
-    warnings
-        Warnings about the model.
-    fit
-        Optimum of the joint output error with its covariance; None for the equation-error methods.
-    residuals
-        Residual tests on the estimation runs; None if these are too short.
-    information
-        Information criteria, with orders counted as parameters; None without residuals.
-    task
-        Runs and structure as given.
-    coefficient_errors
-        Standard errors of coefficients, and of searched orders, for methods without a joint covariance.
-    """
 
     def physical(self, **known: float) -> dict[str, PhysicalParameter]:
         """Return the physical parameters of a flexible link; see :func:`ftlm.physical_parameters`.

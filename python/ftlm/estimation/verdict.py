@@ -14,7 +14,7 @@ from msgspec import UNSET
 
 from ftlm.analysis.poles import modes
 from ftlm.errors import FtlmError
-from ftlm.estimation.result import IdentificationRecord
+from ftlm.estimation.result import Identification
 from ftlm.model.model import Estimate, Model, ModelFinding
 from ftlm.utils.formatting import format_bound
 from ftlm.utils.parameters import choose_text, parameter
@@ -109,7 +109,7 @@ def verdict_html(judged: Verdict) -> Markup:
     return Markup("<p><strong>{}</strong>: {}.</p>").format(judged.level.capitalize(), judged.sentence)
 
 
-def validation_with_verdict(result: IdentificationRecord, comparison: Comparison) -> Validation:
+def validation_with_verdict(result: Identification, comparison: Comparison) -> Validation:
     """Return a comparison on other runs with the verdict of estimation and validation."""
     own = {f.name: getattr(comparison, f.name) for f in fields(Comparison)}
     return Validation(**own, verdict=verdict(result, comparison))
@@ -119,7 +119,7 @@ def _make_finding(level: str, reason: str, remedy: str) -> ModelFinding:
     return ModelFinding(cast(Literal["do not use", "with care"], level), reason, remedy)
 
 
-def verdict(result: IdentificationRecord, validation: Comparison | None = None) -> Verdict:
+def verdict(result: Identification, validation: Comparison | None = None) -> Verdict:
     """Return the verdict on a result, by the rules of :meth:`ftlm.Identification.verdict`.
 
     Warnings of weight that no rule names count in the order of :data:`ftlm.validation.findings.KINDS`.
@@ -205,12 +205,12 @@ def saved_findings(known: Estimate) -> list[ModelFinding]:
     return found
 
 
-def result_findings(result: IdentificationRecord) -> list[ModelFinding]:
+def result_findings(result: Identification) -> list[ModelFinding]:
     """Return the findings about a result by itself, most serious first within a level."""
     return [*_rules(result)]
 
 
-def _rules(result: IdentificationRecord) -> Iterator[ModelFinding]:
+def _rules(result: Identification) -> Iterator[ModelFinding]:
     kinds = {c.kind.name: c for c in group_warnings(result.warnings)}
 
     def of(kind: WarningKind, reason: str = "", remedy: str = "") -> ModelFinding:
@@ -250,7 +250,7 @@ def _rules(result: IdentificationRecord) -> Iterator[ModelFinding]:
         )
 
 
-def _free_runs(result: IdentificationRecord) -> Iterator[ModelFinding]:
+def _free_runs(result: Identification) -> Iterator[ModelFinding]:
     """Yield findings about simulations: overflow, instability and poor fit."""
     if not all(math.isfinite(f.nr) for f in result.output_error.values()):
         yield _make_finding(LEVEL_DO_NOT_USE, _KINDS_BY_NAME["range"].what, _KINDS_BY_NAME["range"].remedy)
@@ -339,7 +339,7 @@ def _of_noise(warning: str, fits: Mapping[str, float]) -> bool:
     return bool(named) and all(100.0 - fits[o] <= 100.0 * NEGLIGIBLE_RESIDUAL_RATIO for o in named)
 
 
-def _residuals(result: IdentificationRecord) -> Iterator[ModelFinding]:
+def _residuals(result: Identification) -> Iterator[ModelFinding]:
     """Yield findings of residual tests: feedback, dependence on an input, color."""
     if result.residuals is None:
         yield _make_finding(LEVEL_WITH_CARE, "the runs are too short for residual tests", "record a longer run")
@@ -366,7 +366,7 @@ def _residuals(result: IdentificationRecord) -> Iterator[ModelFinding]:
         yield _make_finding(LEVEL_WITH_CARE, words, _KINDS_BY_NAME["residuals"].remedy)
 
 
-def _is_uncertain(result: IdentificationRecord, name: str) -> bool:
+def _is_uncertain(result: Identification, name: str) -> bool:
     """Whether a parameter is poorly determined, by its profile if available."""
     error = result.standard_errors[name]
     numbers = {**result.coefficients, **({} if result.fit is None else result.fit.coefficients)}
@@ -381,13 +381,13 @@ def _is_uncertain(result: IdentificationRecord, name: str) -> bool:
     return error > MAX_COEFFICIENT_ERROR_RATIO * abs(numbers[name])
 
 
-def _is_of_input(result: IdentificationRecord, name: str) -> bool:
+def _is_of_input(result: Identification, name: str) -> bool:
     """Whether a parameter is a delay, a saturation or a dead zone, which may be 0 but must be bounded."""
     structure = result.model.structure
     return name in {f"delay_{s}" for s in structure.delay} | {limit.name for limit in structure.limits}
 
 
-def _format_uncertain(result: IdentificationRecord, name: str) -> str:
+def _format_uncertain(result: Identification, name: str) -> str:
     values = {**result.orders, **result.coefficients, **result.parameter_values}
     return f"{name} = {values[name]:.3g} ± {format_bound(result.standard_errors[name], '.2g')}"
 

@@ -20,7 +20,7 @@ from ftlm.experiment_design.problem import Bounds, Criterion, Kind, per_signal_v
 from ftlm.experiment_design.result import DesignedInput, PredictedExtreme
 from ftlm.experiment_design.sensitivity import ModelFit, Sensitivities
 from ftlm.experiment_design.spectrum import Spectrum, best_spectrum, spectral_lines
-from ftlm.model.model import ModelData, check_model
+from ftlm.model.model import Model, check_model
 from ftlm.progress import Progress, ShareTracker
 from ftlm.simulation.discretization import check_linear
 from ftlm.utils.parameters import parameter, setting
@@ -142,7 +142,7 @@ class DesignTask:
 
 
 def design_input(
-    model: Identification | ModelData,
+    model: Identification | Model,
     *,
     reference_run: Run | None = None,
     duration: float | None = None,
@@ -306,7 +306,7 @@ def _design_candidates(
 
 
 def _check_arguments(
-    model: Identification | ModelData,
+    model: Identification | Model,
     reference_run: Run | None,
     duration: float | None,
     step: float | None,

@@ -13,7 +13,7 @@ from ftlm.errors import ModelError
 from ftlm.estimation.free_parameters import FreeProblem
 from ftlm.estimation.objective import Iterate, Objective
 from ftlm.estimation.output_error import parameter_set_of, problem_of
-from ftlm.model.model import ModelData
+from ftlm.model.model import Model
 from ftlm.simulation.simulate import simulate
 from ftlm.structure.equation import Term
 from ftlm.structure.order import Order
@@ -43,14 +43,14 @@ class ModelFit:
         Block pulses per sampling interval.
     """
 
-    model: ModelData
+    model: Model
     problem: FreeProblem
     values: tuple[float, ...]
     noise: Mapping[str, float]
     refinement: int
 
     @classmethod
-    def of(cls, model: ModelData, noise: Mapping[str, float]) -> ModelFit:
+    def of(cls, model: Model, noise: Mapping[str, float]) -> ModelFit:
         """Build from a model that records which of its parameters were free."""
         problem, values = problem_of(model)
         whole = replace(model, structure=replace(model.structure, coupling="simulated", initial="rest"))

@@ -12,7 +12,7 @@ from typing import TypeAlias, cast
 
 from ftlm.data.construction import RunArguments
 from ftlm.data.export import MAX_HEADER_BYTES, Header
-from ftlm.data.run import Run, build_run
+from ftlm.data.run import Run
 from ftlm.data.sampling import MissingPolicy, check_missing_policy
 from ftlm.data.units import split_time_header, time_unit_of
 from ftlm.errors import DataError
@@ -208,7 +208,7 @@ def run_from_tables(tables: list[FileTable], wanted: ColumnSelection, options: L
     if header is not None:
         stated = header.step if clock.name == CSV_TIME else None
         asked = replace(asked, known_step=stated, notes=(*header.warnings, *facts), metadata=header.about)
-    return build_run(asked)
+    return Run._from_checked(**asked.checked_fields())
 
 
 @dataclass(frozen=True)

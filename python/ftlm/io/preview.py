@@ -405,7 +405,7 @@ class _FilePreview:
             words = f"the time is the first column of the matrix, {clock.name!r}"
             return (
                 clock,
-                (Assumption("time", clock.name, words, parameter("time", Placeholder("COLUMN")), False),),
+                (Assumption("time", clock.name, words, f"{parameter('time', Placeholder('COLUMN'))}", False),),
                 "",
             )
         return clock, (), ""
@@ -471,7 +471,7 @@ class _FilePreview:
         if self.asked.time_unit is not None or known or clock.problem is not None:
             return ()
         words = f"the numbers of {clock.name!r} are seconds, as no unit is stated"
-        return (Assumption("time_unit", "s", words, parameter("time_unit", Placeholder("UNIT")), False),)
+        return (Assumption("time_unit", "s", words, f"{parameter('time_unit', Placeholder('UNIT'))}", False),)
 
     def _options(self, clock: Column | None, of_clock: tuple[Assumption, ...]) -> dict[str, Any]:
         """Return the arguments of `load` that give the same run."""

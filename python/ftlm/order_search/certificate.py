@@ -8,7 +8,7 @@ from typing import Any
 from ftlm import _core
 from ftlm.data.run import Run
 from ftlm.errors import ModelError
-from ftlm.order_search.options import Settings
+from ftlm.order_search.options import SearchSettings
 from ftlm.order_search.result import OrderCertificate
 from ftlm.order_search.search import Job, make_job
 from ftlm.simulation.discretization import named_signals
@@ -17,7 +17,7 @@ from ftlm.structure.order_grid import DEFAULT_INCREMENT, OrderGrid
 from ftlm.structure.structure import Structure
 from ftlm.utils.parameters import parameter, setting
 from ftlm.utils.resources import memory_limit
-from ftlm.utils.validation import check_threads, real_number, whole_number
+from ftlm.utils.validation import real_number, whole_number
 
 #: Default tolerance of the certificate relative to the best equation error found, and maximum number of boxes.
 DEFAULT_TOLERANCE = 0.05
@@ -95,7 +95,7 @@ def certify_orders(
             f"{setting('max_cells')} {max_cells!r} is no whole number from 1; the default is {DEFAULT_MAX_CELLS}"
         )
     gap = real_number(
-        "apart",
+        "min_separation",
         (order_grid.increment if isinstance(order_grid, OrderGrid) else DEFAULT_INCREMENT)
         if min_separation is None
         else min_separation,
@@ -111,21 +111,12 @@ def certify_orders(
             f"{setting('max_term_ratio')} {max_term_ratio!r} is outside [1, 1e9]; the default is "
             f"{DEFAULT_MAX_TERM_RATIO:g}"
         )
-    job = make_job(
-        runs, equation, order_grid, Settings.check(**CERTIFIED_SETTINGS, threads=check_threads(threads)), m=m
-    )
+    job = make_job(runs, equation, order_grid, SearchSettings(**CERTIFIED_SETTINGS), m=m, threads=threads)
     return certify_job(job, tolerance=share, min_separation=gap, max_term_ratio=size, max_cells=most, progress=progress)
 
 
-def check_certifiable(job: Job, tolerance: float) -> None:
-    """Raise ModelError if no certificate exists for a search, or the tolerance is out of range."""
-    _check_tolerance(tolerance)
-    wanted = ", ".join(parameter(name, value) for name, value in CERTIFIED_SETTINGS.items())
-    remedy = f"rank by squared equation errors with least-squares coefficients ({wanted}), or ask for none"
-    for name, value in CERTIFIED_SETTINGS.items():
-        given = getattr(job.settings, name)
-        if given != value:
-            raise ModelError(f"there is no certificate over all orders for {name} = {given!r}; {remedy}")
+def _check_certifiable(job: Job) -> None:
+    """Raise ModelError if no certificate exists for a search."""
     if job.structure.has_order_law:
         raise ModelError(
             "there is no certificate over all orders of a stage under its law; take its equations one by one"
@@ -163,7 +154,7 @@ def certify_job(
     progress: Callable[[int, int], None] | None = None,
 ) -> OrderCertificate:
     """Certify a prepared search; see :func:`certify_orders`."""
-    check_certifiable(job, tolerance)
+    _check_certifiable(job)
     record, item = job.records[0], job.structure.equations[0]
     intervals = {name: (min(values), max(values)) for name, values in job.values.items()}
     region = _search_region(item, intervals, record.signals)
@@ -171,7 +162,7 @@ def certify_job(
         found = _core.certify(
             [r.core() for r in job.records],
             (*region, min_separation),
-            (tolerance, max_term_ratio, max_cells, job.settings.threads, memory_limit()),
+            (tolerance, max_term_ratio, max_cells, job.threads, memory_limit()),
             None if progress is None else lambda done, total, _pruned: progress(done, total),
         )
     except ModelError as error:

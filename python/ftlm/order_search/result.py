@@ -62,16 +62,16 @@ class OrderCertificate:
     def to_dict(self) -> dict[str, Any]:
         """For JSON."""
         return {
-            "at_least": self.lower_bound,
+            "lower_bound": self.lower_bound,
             "best": self.best if self.orders else None,
-            "within": self.proved_tolerance,
-            "asked": self.requested_tolerance,
+            "proved_tolerance": self.proved_tolerance,
+            "requested_tolerance": self.requested_tolerance,
             "orders": self.orders,
             "intervals": {name: list(interval) for name, interval in self.intervals.items()},
-            "apart": self.min_separation,
-            "largest": self.max_term_ratio,
+            "min_separation": self.min_separation,
+            "max_term_ratio": self.max_term_ratio,
             "cells": self.cells,
-            "open": self.open_cells,
+            "open_cells": self.open_cells,
             "m": self.m,
         }
 
@@ -202,13 +202,13 @@ class SearchResult:
         """For JSON."""
         return {
             "candidates": self.candidates,
-            "pruned": self.exclusion_counts,
-            "boxed": self.excluded_by_box,
+            "exclusion_counts": self.exclusion_counts,
+            "excluded_by_box": self.excluded_by_box,
             "m": self.m,
             "settings": self.settings,
             "table": [dict(vars(row)) for row in self.table],
             "failures": [{"orders": o, "reason": reason} for o, reason in self.failures],
-            "edges": self.at_grid_edge,
+            "at_grid_edge": self.at_grid_edge,
         }
 
     def __str__(self) -> str:

@@ -12,7 +12,7 @@ from markupsafe import Markup
 
 from ftlm.analysis.poles import Mode, SteadyState, modes, steady_states
 from ftlm.errors import FtlmError
-from ftlm.estimation.result import IdentificationRecord
+from ftlm.estimation.result import Identification
 from ftlm.estimation.verdict import verdict
 from ftlm.model.model import Model
 from ftlm.report.typesetting import ORDER_DECIMALS, units_of
@@ -28,7 +28,7 @@ from ftlm.validation.findings import MAX_SUMMARY_WARNINGS, group_warnings, hidde
 MOST_MODES = 6
 
 
-def summary(result: IdentificationRecord, validation: Comparison | None = None) -> str:
+def summary(result: Identification, validation: Comparison | None = None) -> str:
     """Return the summary of a result as text."""
     judged = verdict(result, validation)
     lines = [*wrap_text(str(judged)), ""]
@@ -67,7 +67,7 @@ def _offset(output: str, comparison: Comparison | None) -> str | None:
     return "".join(f" {'-' if v < 0 else '+'} {abs(v):.4g}{what}" for v, what in written)
 
 
-def parameter_lines(result: IdentificationRecord) -> list[str]:
+def parameter_lines(result: Identification) -> list[str]:
     """Return orders and coefficients with standard errors, units and nominal values, one line each."""
     errors, units, stated = result.standard_errors, units_of(result.model), result.model.structure.reference
     values = {**result.orders, **result.parameter_values, **result.coefficients}
@@ -137,7 +137,7 @@ def describe_order(state: SteadyState) -> str:
     return f"; order {with_error(state.order, error)}" + ("" if told else f", which may be {whole:g}: {meaning}")
 
 
-def fit_lines(result: IdentificationRecord, validation: Comparison | None) -> list[str]:
+def fit_lines(result: Identification, validation: Comparison | None) -> list[str]:
     """Return lines on the simulation fit on estimation and validation data, and on the equation error."""
     width = max(len(o) for o in result.output_error) + 2
     lines = [f"{'fit of the free run, %':<24}{'estimation':>12}{'validation':>12}{'RMSE':>12}"]
@@ -150,7 +150,7 @@ def fit_lines(result: IdentificationRecord, validation: Comparison | None) -> li
     return lines
 
 
-def _residuals(result: IdentificationRecord) -> list[str]:
+def _residuals(result: Identification) -> list[str]:
     if result.residuals is None:
         return ["residuals: the runs are too short for tests"]
     white = ", ".join(f"{o} {'yes' if w else 'no'}" for o, w in result.residuals.white.items())
@@ -158,7 +158,7 @@ def _residuals(result: IdentificationRecord) -> list[str]:
     return [f"residuals white: {white}; independent of the inputs: {free} (99 %)"]
 
 
-def _starts(result: IdentificationRecord) -> list[str]:
+def _starts(result: Identification) -> list[str]:
     """Return lines on offsets outside the equations, and on runs with nonzero initial conditions."""
     comparison = result.comparison
     shown = {o for o in result.output_error if _offset(o, comparison) is not None}

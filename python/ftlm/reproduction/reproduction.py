@@ -14,7 +14,7 @@ from typing import Any
 from ftlm.arm.flexible_link import flexible_link
 from ftlm.data.run import Run
 from ftlm.errors import DataError, ModelError
-from ftlm.estimation.genetic import Genetic
+from ftlm.estimation.genetic import GeneticAlgorithm
 from ftlm.model.model import Model
 from ftlm.progress import format_time_left
 from ftlm.reproduction.claims import Claim, ReproductionData, claims
@@ -150,7 +150,7 @@ def reproduce(
     increment: float = 0.05,
     noise: float = 1e-4,
     seed: int = 1,
-    genetic: Genetic | None = None,
+    genetic: GeneticAlgorithm | None = None,
     rivals_increment: float = CONTEST_STEP,
     arms: Sequence[str] | None = None,
     records: int = 3,
@@ -174,6 +174,7 @@ def reproduce(
     genetic
         Seeds and evaluations of the genetic algorithm and of differential evolution; by default ten seeds, or as many
         as 20 000 evaluations an angle allow, each with as many evaluations as the compared order grid has candidates.
+        Its order grid and its norm are those of the comparison and must not be given.
     rivals_increment
         Smallest increment of that grid, on every arm; the paper's 0.05 takes sixteen times as long.
     arms
@@ -198,8 +199,13 @@ def reproduce(
     DataError
         Runs without the signals of any stage, or a sine run without some of them.
     ModelError
-        A sine run without a square run, unknown arms, an invalid step or number of records.
+        A sine run without a square run, unknown arms, an invalid step or number of records, a genetic algorithm with an
+        order grid or another norm.
     """
+    if genetic is not None and (genetic.order_grid is not None or genetic.norm != "l1"):
+        raise ModelError(
+            "genetic: the order grid and the norm are those of the comparison; leave order_grid and norm out"
+        )
     simulated = square is None
     others, lattice = _other_arms(arms, records), OrderGrid(increment=increment)
     for each in (increment, real_number("rivals_increment", rivals_increment)):

@@ -16,7 +16,7 @@ import numpy as np
 
 from ftlm.data.construction import RunArguments
 from ftlm.data.export import Header
-from ftlm.data.run import Run, build_run
+from ftlm.data.run import Run
 from ftlm.errors import DataError, FtlmError, ModelError, RigFault
 from ftlm.estimation.linear import Streaming
 from ftlm.rig.arm_parameters import ArmParameters
@@ -372,7 +372,7 @@ class Experiment:
             horizon=self.limit,
             board=self.board,
         )
-        paced = self.real_time or board.hardware or bool(getattr(board, "paced", False))
+        paced = self.real_time or board.hardware or bool(getattr(board, "real_time", False))
         if board.hardware and not self.arm:
             raise ModelError(
                 f"the {board.name} moves a real arm: clear its workspace, keep the emergency stop at hand, and say so "
@@ -389,7 +389,7 @@ class Experiment:
             "seed": self.seed,
             "rate": self.rate,
             "duration": self.duration,
-            "paced": paced,
+            "real_time": paced,
             "watchdog": self.watchdog,
             "sensor_filter": self.sensor_filter,
             **told,
@@ -542,9 +542,8 @@ class _Recorder:
         data = {column: rows[:, k] for k, column in enumerate((*RIG_COLUMNS, *told))}
         facts = tuple(f"the rig stopped the run after {(len(rows) - 1) * step:.6g} s: {f}" for f in faults)
         signals = {n: data[n] for n in (*CURRENT_SIGNALS, *told)}, {n: data[n] for n in RIG_COLUMNS[2:]}
-        return build_run(
-            RunArguments(*signals, step=step, units=units_of(told), name=name, notes=facts, metadata=about)
-        )
+        arguments = RunArguments(*signals, step=step, units=units_of(told), name=name, notes=facts, metadata=about)
+        return Run._from_checked(**arguments.checked_fields())
 
 
 def _board(

@@ -10,7 +10,7 @@ import numpy as np
 from ftlm import _core
 from ftlm.data.run import Run
 from ftlm.errors import ConvergenceError, DataError, ModelError
-from ftlm.model.model import ModelData, check_model
+from ftlm.model.model import Model, check_model
 from ftlm.simulation.discretization import (
     MAX_M,
     Record,
@@ -25,7 +25,7 @@ from ftlm.utils.parameters import parameter, setting
 from ftlm.utils.validation import Floats, real_number
 
 
-def comparison_records(runs: Sequence[Run], model: ModelData, m: int) -> list[Record]:
+def comparison_records(runs: Sequence[Run], model: Model, m: int) -> list[Record]:
     """Return the records with which simulations are compared: measured outputs, filtered like the simulated ones.
 
     Simulated outputs pass the sensor filter if they were measured through it. If a filtered signal is an input of a
@@ -34,7 +34,7 @@ def comparison_records(runs: Sequence[Run], model: ModelData, m: int) -> list[Re
     return records(runs, model.structure, m, filtered=model.structure.all_filtered)
 
 
-def respond(model: ModelData, rec: Record) -> tuple[dict[str, Floats], dict[str, dict[float, float]]]:
+def respond(model: Model, rec: Record) -> tuple[dict[str, Floats], dict[str, dict[float, float]]]:
     """Return pulse means of the outputs on one of the :func:`comparison_records`, and initial terms by exponent.
 
     The initial terms minimize the distance to the measured outputs.
@@ -69,7 +69,7 @@ def respond(model: ModelData, rec: Record) -> tuple[dict[str, Floats], dict[str,
 
 
 def simulate(
-    model: ModelData,
+    model: Model,
     run: Run,
     *,
     tolerance: float = 1e-6,
@@ -153,13 +153,13 @@ def simulate(
     )
 
 
-def _units(model: ModelData, run: Run) -> dict[str, str]:
+def _units(model: Model, run: Run) -> dict[str, str]:
     """Units of inputs and simulated outputs, from the run or the model."""
     inputs = {n: run.units[n] or model.units.get(n, "") for n in run.inputs}
     return inputs | {n: model.units.get(n, "") or run.units.get(n, "") for n in model.outputs}
 
 
-def _with_missing_outputs(run: Run, model: ModelData) -> Run:
+def _with_missing_outputs(run: Run, model: Model) -> Run:
     """Return the run with zeros for missing outputs; simulated outputs are never read."""
     missing = [o for o in model.outputs if o not in run]
     if not missing:
@@ -174,7 +174,7 @@ def _with_missing_outputs(run: Run, model: ModelData) -> Run:
     return run.with_outputs({n: np.zeros(run.length) for n in missing})
 
 
-def explicit_euler(model: ModelData, run: Run, *, step: Literal["record"] = "record") -> dict[str, Floats]:
+def explicit_euler(model: Model, run: Run, *, step: Literal["record"] = "record") -> dict[str, Floats]:
     """Simulate an integer-order model by explicit Euler at the step of the run, as in the paper's baseline.
 
     Parameters

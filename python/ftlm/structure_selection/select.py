@@ -13,7 +13,6 @@ from ftlm.data.run import Run
 from ftlm.errors import ConvergenceError, ModelError
 from ftlm.estimation.free_parameters import FreeProblem
 from ftlm.estimation.identify import identify
-from ftlm.order_search.options import Settings
 from ftlm.simulation.discretization import prepare
 from ftlm.structure.parser import equation
 from ftlm.structure.structure import Structure
@@ -29,6 +28,7 @@ from ftlm.structure_selection.stepwise import (
     select_stepwise,
 )
 from ftlm.utils.parameters import parameter
+from ftlm.utils.validation import check_threads
 
 #: Integer values of the highest order of the candidates.
 AUTOMATIC_ORDERS = (1, 2, 3, 4)
@@ -156,8 +156,7 @@ def select(
     of the own coefficients, and selection starts from the best. For a list of more than 200 candidates a
     ``UserWarning`` estimates the remaining time after the first ones.
     """
-    # Checked here as identify checks it: threads is a whole number, at least 1.
-    workers = Settings.check(coefficients="least-squares", threads=threads).threads
+    workers = check_threads(threads)
     several = [runs] if isinstance(runs, Run) else list(runs)
     folds = Folds.of(runs, validation if validation is not None else "runs" if len(several) > 1 else "blocks")
     if not isinstance(candidates, (str, Structure, Sequence, Mapping)):

@@ -28,7 +28,7 @@ impl Settings {
     /// [`Error::OutOfRange`] for more than a thousand steps, and for a tolerance that is negative or no number.
     ///
     /// ```
-    /// # use ftlm::estimation::instrumental_variables::solution::Settings;
+    /// # use ftlm::estimation::instrumental_variables::Settings;
     /// assert!(Settings::default().check().is_ok());
     /// assert!(Settings { iterations: 1 << 20, ..Settings::default() }.check().is_err());
     /// ```

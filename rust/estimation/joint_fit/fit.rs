@@ -178,10 +178,7 @@ impl<'a> Sought<'a> {
 /// use ftlm::estimation::joint_fit::structure::{Coefficient, Equation, Order, Structure, Term};
 /// use ftlm::estimation::joint_fit::parameter_set::Free;
 /// use ftlm::estimation::joint_fit::initial_guesses::Lattices;
-/// use ftlm::estimation::joint_fit::fit;
-/// use ftlm::estimation::joint_fit::reweighting::Loss;
-/// use ftlm::estimation::joint_fit::fit::{Outset, Settings, Size, Sought};
-/// use ftlm::estimation::joint_fit::source::{Sampled, Signal};
+/// use ftlm::estimation::joint_fit::{fit, Loss, Outset, Sampled, Settings, Signal, Size, Sought};
 /// use ftlm::signal::block_pulse::Intersample;
 /// use ftlm::parallel::Stop;
 /// // y of D y = −2 y + 3 u in exact steps, and D^alpha y = a y + b u sought.

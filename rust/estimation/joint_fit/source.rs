@@ -83,7 +83,7 @@ pub struct Signal {
 ///
 /// ```
 /// # fn main() -> ftlm::error::Result<()> {
-/// use ftlm::estimation::joint_fit::source::{Sampled, Sampling, Signal, Source};
+/// use ftlm::estimation::joint_fit::{Sampled, Sampling, Signal, Source};
 /// use ftlm::signal::block_pulse::Intersample;
 /// let y = Signal { samples: vec![0.0, 1.0, 4.0, 9.0], between: Intersample::Linear };
 /// let u = Signal { samples: vec![1.0, 2.0, 2.0, 2.0], between: Intersample::Hold };

@@ -304,7 +304,7 @@ impl InputLaw {
     /// [`Error::OutOfRange`] for a number that is negative or none.
     ///
     /// ```
-    /// use ftlm::estimation::output_error::parameterization::InputLaw;
+    /// use ftlm::estimation::output_error::InputLaw;
     /// # fn main() -> ftlm::error::Result<()> {
     /// let (means, slope) = InputLaw::Saturation.acted(&[0.5, 2.0, -3.0], 1.5, 0.1, 0.0)?;
     /// assert_eq!((means, slope), (vec![0.5, 1.5, -1.5], vec![0.0, 1.0, -1.0]));

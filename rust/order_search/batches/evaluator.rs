@@ -40,7 +40,7 @@ use crate::regressors::Record;
 /// # use ftlm::order_search::control::Control;
 /// # use ftlm::order_search::grid::{Lattice, TermAxis};
 /// # use ftlm::order_search::options::Options;
-/// # use ftlm::order_search::batches::evaluator::search;
+/// # use ftlm::order_search::batches::search;
 /// # use ftlm::regressors::Record;
 /// # let input: Vec<f64> = (0..64).map(|k| if k % 16 < 8 { 1.0 } else { -1.0 }).collect();
 /// # let output = Record::new(0.1, vec![input.clone()], None)?.integral(0, 0.8);
@@ -166,7 +166,7 @@ impl<'a> Search<'a> {
     /// # use ftlm::order_search::grid::{Lattice, TermAxis};
     /// # use ftlm::order_search::options::Options;
     /// # use ftlm::order_search::result::Part;
-    /// # use ftlm::order_search::batches::evaluator::{rounds, waves, Search};
+    /// # use ftlm::order_search::batches::{rounds, waves, Search};
     /// # use ftlm::parallel::pool;
     /// # use ftlm::regressors::Record;
     /// # let input: Vec<f64> = (0..64).map(|k| if k % 16 < 8 { 1.0 } else { -1.0 }).collect();
@@ -334,7 +334,7 @@ pub fn rounds_by(algorithm: u64, candidates: u64, options: &Options) -> u64 {
 ///
 /// ```
 /// # use ftlm::order_search::options::Options;
-/// # use ftlm::order_search::batches::evaluator::{rounds, waves};
+/// # use ftlm::order_search::batches::{rounds, waves};
 /// let rounds = rounds(400_000, &Options::default());
 /// assert_eq!((rounds, waves(rounds)), (7, vec![1, 3, 7]));
 /// ```

@@ -203,7 +203,7 @@ fn dominating(a: &[Row; MOST], gamma: &Row, tau: &Row, k: usize) -> Option<Row> 
 /// No records or terms, too many of these, a signal that is not there or is zero, middles below their half widths.
 ///
 /// ```
-/// # use ftlm::order_search::certificate::cell_bound::cell_bounds;
+/// # use ftlm::order_search::certificate::cell_bounds;
 /// # use ftlm::regressors::Record;
 /// # let input: Vec<f64> = (0..64).map(|k| if k % 16 < 8 { 1.0 } else { -1.0 }).collect();
 /// # let output = Record::new(0.1, vec![input.clone()], None)?.integral(0, 0.8);

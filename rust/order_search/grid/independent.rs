@@ -55,7 +55,7 @@ impl Lattice {
     /// signal.
     ///
     /// ```
-    /// # use ftlm::order_search::grid::independent::{Lattice, TermAxis};
+    /// # use ftlm::order_search::grid::{Lattice, TermAxis};
     /// // Two own terms that may be swapped, and the input at order 0.
     /// let own = TermAxis { signal: 0, values: vec![0.0, 0.5, 1.0], interchangeable: true };
     /// let input = TermAxis { signal: 1, values: vec![0.0], interchangeable: false };

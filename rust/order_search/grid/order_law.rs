@@ -39,7 +39,7 @@ impl LawLattice {
     ///
     /// ```
     /// # use ftlm::equation::AffineOrder;
-    /// # use ftlm::order_search::grid::order_law::{LawEquation, LawLattice};
+    /// # use ftlm::order_search::grid::{LawEquation, LawLattice};
     /// // D^α y = c D^{α−1} u for a free α.
     /// let law = |constant: f64| AffineOrder { constant, weights: vec![1.0] };
     /// let equation = LawEquation { output: 0, order: law(0.0), terms: vec![(1, law(-1.0))] };

@@ -11,7 +11,7 @@ impl Lattice {
     /// Orders of a candidate: its structure; an index beyond the last is the last.
     ///
     /// ```
-    /// # use ftlm::order_search::grid::independent::{Lattice, TermAxis};
+    /// # use ftlm::order_search::grid::{Lattice, TermAxis};
     /// let own = TermAxis { signal: 0, values: vec![0.0, 0.5], interchangeable: false };
     /// let lattice = Lattice::new(0, &[0.8], &[own], |_| false)?;
     /// let orders: Vec<f64> = (0..lattice.count()).map(|index| lattice.structure(index).terms[0].order).collect();

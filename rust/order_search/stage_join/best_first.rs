@@ -368,7 +368,7 @@ impl Course {
 /// ```
 /// # use ftlm::order_search::control::Control;
 /// # use ftlm::order_search::options::Options;
-/// # use ftlm::order_search::stage_join::best_first::search;
+/// # use ftlm::order_search::stage_join::search;
 /// # use ftlm::equation::AffineOrder;
 /// # use ftlm::order_search::grid::{LawEquation, LawLattice};
 /// let law = |constant: f64| AffineOrder { constant, weights: vec![1.0] };
