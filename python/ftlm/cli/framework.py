@@ -161,7 +161,7 @@ class Command(TyperCommand):
         if option is None:
             return None
         chosen = option.default
-        for word, following in zip(args, [*args[1:], ""], strict=True):
+        for word, following in zip(args, [*args, ""][1:], strict=True):
             flag, equals, value = word.partition("=")
             if flag in option.opts:
                 chosen = value if equals else following
