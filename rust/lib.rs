@@ -37,10 +37,11 @@
 //!
 //! # Features
 //!
-//! None is on by default. `rig`: [`rig`], the simulated arm and the guard between commands and motors. `oracles`: the slow
-//! computations by definition that tests compare the fast ones with. `python`: the bindings, with both of these.
+//! None is on by default. `rig`: [`rig`], the simulated arm and the safety guard of the rigs. `oracles`: slow
+//! computations by definition, against which tests compare the fast ones. `python`: the Python bindings, with both of
+//! these.
 //!
-//! The mathematics knows no file, no clock (but for the pace of the virtual rig) and no Python.
+//! Numerical code does not access files, clocks (except the timer of the virtual rig) or Python.
 #![forbid(unsafe_op_in_unsafe_fn)]
 #![cfg_attr(not(feature = "python"), forbid(unsafe_code))]
 #![cfg_attr(docsrs, feature(doc_cfg))]

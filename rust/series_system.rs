@@ -1,4 +1,4 @@
-//! Equations on a record as a series system A y = b: their free runs, damped where they grow, and the inverse of A.
+//! Equations on a record as a series system A y = b: forced response, inverse and stabilized copies.
 
 use crate::equation::Equation;
 use crate::error::{check_length, Error, Result};
@@ -6,22 +6,22 @@ use crate::fractional::kernels::kernel;
 use crate::regressors::{is_impulse, Record};
 use crate::series::{self, Buffers, Kernel, SumOfProducts};
 
-/// The series system A y = b of some equations: their outputs are unknown, every other signal is read from the record.
+/// Series system A y = b of equations. Their outputs are unknown, all other signals come from the record.
 ///
-/// Coefficients may be of any size here, as the steps of an estimator make them; what people give is checked before.
+/// Coefficients are not checked here, because an estimator's iterates may have any size. User input is checked before.
 pub(crate) struct System<'a> {
     record: &'a Record,
-    /// Whether the sensor of each output may still have held something.
+    /// Whether the sensor filter of each output may have an initial transient.
     held: Vec<bool>,
     pub(crate) matrix: Vec<Vec<Vec<f64>>>,
     pub(crate) rhs: Vec<Vec<f64>>,
 }
 
 impl<'a> System<'a> {
-    /// The system of equations with distinct outputs.
+    /// System of equations with distinct outputs.
     ///
     /// # Errors
-    /// Orders or signals that make no equation, as many coefficients as terms missing, two equations of one output.
+    /// Invalid orders or signals, a wrong number of coefficients, two equations with one output.
     pub(crate) fn new(equations: &[Equation], record: &'a Record) -> Result<Self> {
         let m = record.m();
         let n = equations.len();
@@ -36,7 +36,7 @@ impl<'a> System<'a> {
         }
         let mut matrix = vec![vec![vec![0.0; m]; n]; n];
         let mut rhs = vec![vec![0.0; m]; n];
-        // Terms often share an order: each kernel is made once.
+        // Terms often share an order, so each kernel is computed once.
         let mut kernels: Vec<(f64, Vec<f64>)> = Vec::new();
         let step = record.step();
         for (i, equation) in equations.iter().enumerate() {
@@ -49,7 +49,7 @@ impl<'a> System<'a> {
                 let unknown = outputs.iter().position(|&o| o == term.signal);
                 if unknown.is_none() {
                     let signal = record.driver(term.signal, eta);
-                    // What stands still drives nothing.
+                    // A zero signal contributes nothing.
                     if signal.iter().all(|v| *v == 0.0) {
                         continue;
                     }
@@ -67,7 +67,7 @@ impl<'a> System<'a> {
                 match unknown {
                     Some(j) => matrix[i][j].iter_mut().zip(kernel).for_each(|(a, v)| *a -= c * v),
                     None => {
-                        // Of a single sample, only that: nothing is to be transformed then.
+                        // Of a single nonzero sample only that one is used, which needs no transform.
                         let signal = record.driver(term.signal, eta);
                         let last = signal.iter().rposition(|v| *v != 0.0).map_or(0, |k| k + 1);
                         let integral = series::multiply(kernel, if last <= FEW { &signal[..last] } else { signal }, m);
@@ -80,7 +80,7 @@ impl<'a> System<'a> {
         Ok(Self { record, held, matrix, rhs })
     }
 
-    /// The matrix read at ρz, ρ = e^{−decay}, which makes every model stable for a large enough decay [1/pulse].
+    /// Matrix at ρz with ρ = e^{−decay}. A large enough decay [1/pulse] makes every model stable.
     pub(crate) fn damped(mut self, decay: f64) -> Self {
         if decay > 0.0 {
             self.matrix.iter_mut().flatten().for_each(|series| *series = read_at(decay, series));
@@ -88,7 +88,8 @@ impl<'a> System<'a> {
         self
     }
 
-    /// Free run with given initial terms: (exponent, coefficient) pairs per equation, empty at rest.
+    /// Response to inputs and initial terms: (exponent, coefficient) pairs per equation, empty for zero initial
+    /// conditions.
     pub(crate) fn respond(&self, initial: &[Vec<(f64, f64)>]) -> Result<Vec<Vec<f64>>> {
         let (rhs, beside) = self.driven(initial);
         let mut outputs = self.solve(&rhs)?;
@@ -96,7 +97,7 @@ impl<'a> System<'a> {
         Ok(outputs)
     }
 
-    /// The right-hand side with these initial terms, and those that are added to the outputs instead.
+    /// Right-hand side with these initial terms, and the impulses that are added to the outputs instead.
     #[allow(clippy::type_complexity)]
     fn driven(&self, initial: &[Vec<(f64, f64)>]) -> (Vec<Vec<f64>>, Vec<Vec<(f64, f64)>>) {
         let (beside, driving): (Vec<_>, Vec<_>) = (initial.iter().enumerate())
@@ -111,9 +112,11 @@ impl<'a> System<'a> {
         (rhs, beside)
     }
 
-    /// Free run where `bounded` takes it, else the first of damped copies that it takes ([`respond_damped`] at 4, 8, 16, …
-    /// a record, to where nothing is left), and whether it is one. What damping leaves of the inverse of the matrix is its
-    /// series read at ρz, as long as numbers hold it: it is made once, and a copy costs products.
+    /// Outputs if `bounded` accepts them, else those of the first damped copy that it accepts.
+    ///
+    /// The flag says whether the copy is damped ([`crate::simulate::respond_damped`] with decays of 4, 8, 16, … a
+    /// record). The damped inverse is the series of the inverse at ρz while it is finite. It is computed once, so a
+    /// copy costs only products.
     #[allow(clippy::cast_precision_loss)]
     pub(crate) fn bounded(
         &self,
@@ -159,13 +162,14 @@ impl<'a> System<'a> {
         }
     }
 
-    /// Whether an initial term of an equation is an impulse that only the sensor of its output gets: of an output that
-    /// passes the record's filter with all that drives it, the motion of both.
+    /// Whether an initial term is an impulse that acts on the sensor of the output only.
+    ///
+    /// If the output and its inputs pass the record's filter together, the impulse acts on the equation instead.
     fn is_beside(&self, equation: usize, exponent: f64) -> bool {
         is_impulse(exponent) && (!self.record.is_filtered() || self.held[equation])
     }
 
-    /// Adds impulses that only sensors get to the outputs.
+    /// Add the impulses of the sensors to the outputs.
     fn add_beside(&self, outputs: &mut [Vec<f64>], beside: &[Vec<(f64, f64)>]) {
         for (output, own) in outputs.iter_mut().zip(beside) {
             for &(exponent, value) in own.iter().filter(|(_, value)| *value != 0.0) {
@@ -179,7 +183,7 @@ impl<'a> System<'a> {
         series::Solver::new(&self.matrix)?.inverse()
     }
 
-    /// What a unit of each initial term, an equation and an exponent, does to every output while nothing else drives.
+    /// Response of every output to a unit of each initial term (equation, exponent), all other inputs zero.
     pub(crate) fn units(&self, units: &[(usize, f64)]) -> Result<Vec<Vec<Vec<f64>>>> {
         let mut solver = series::Solver::new(&self.matrix)?;
         match self.factored(&mut solver, units)? {
@@ -188,7 +192,7 @@ impl<'a> System<'a> {
         }
     }
 
-    /// The free run at rest, and [`System::units`].
+    /// Response with zero initial conditions, and [`System::unit_responses`].
     #[allow(clippy::type_complexity)]
     pub(crate) fn rest_and_units(&self, units: &[(usize, f64)]) -> Result<(Vec<Vec<f64>>, Vec<Vec<Vec<f64>>>)> {
         let mut solver = series::Solver::new(&self.matrix)?;
@@ -198,8 +202,9 @@ impl<'a> System<'a> {
         }
     }
 
-    /// The inverse of the matrix for products with so many units; none where there are none, or where it grows by so much
-    /// that products would lose the digits of its beginning.
+    /// Inverse of the matrix for unit responses by products.
+    ///
+    /// None without units, or if the inverse grows so much that products would lose the digits of its first terms.
     fn factored(&self, solver: &mut series::Solver<'_>, units: &[(usize, f64)]) -> Result<Option<Factored<'_, 'a>>> {
         if units.is_empty() {
             return Ok(None);
@@ -210,7 +215,7 @@ impl<'a> System<'a> {
         }
         let kernels = inverse.iter().map(|row| row.iter().map(|s| Kernel::new(s)).collect()).collect();
         let behind = (0..inverse.len()).map(|_| None).collect();
-        // Without a filter its spectra are all that is asked for.
+        // Without a filter only the spectra are needed.
         let inverse = if self.record.is_filtered() { inverse } else { Vec::new() };
         Ok(Some(Factored { system: self, inverse, kernels, behind, buffers: Buffers::default() }))
     }
@@ -229,26 +234,26 @@ impl<'a> System<'a> {
             .collect()
     }
 
-    /// The right-hand side of one initial term.
+    /// Right-hand side of one initial term.
     fn alone(&self, i: usize, exponent: f64) -> Vec<Vec<f64>> {
         let mut rows = vec![vec![0.0; self.record.m()]; self.matrix.len()];
         rows[i] = self.record.driving_term(exponent);
         rows
     }
 
-    /// What these right-hand sides make of the outputs.
+    /// Outputs for these right-hand sides.
     pub(crate) fn solve(&self, rhs: &[Vec<f64>]) -> Result<Vec<Vec<f64>>> {
         let borrowed: Vec<&[f64]> = rhs.iter().map(Vec::as_slice).collect();
         series::solve(&self.matrix, &borrowed)
     }
 }
 
-/// The inverse of a system's matrix, and of one that stands behind a filter together with it: one product a right-hand side.
+/// Inverse of a system's matrix, with and without the record's filter. Each right-hand side costs one product.
 struct Factored<'s, 'a> {
     system: &'s System<'a>,
     inverse: Vec<Vec<Vec<f64>>>,
     kernels: Vec<Vec<Kernel>>,
-    /// By equation, what its error does to every output behind the record's filter, once that is asked for.
+    /// By equation, response of every output to its error behind the record's filter, computed on demand.
     behind: Vec<Option<Vec<Kernel>>>,
     buffers: Buffers,
 }
@@ -290,16 +295,16 @@ impl Factored<'_, '_> {
     }
 }
 
-/// A series read at ρz, ρ = e^{−decay}.
+/// Series at ρz, ρ = e^{−decay}.
 #[allow(clippy::cast_precision_loss)]
 fn read_at(decay: f64, series: &[f64]) -> Vec<f64> {
     series.iter().enumerate().map(|(k, a)| a * libm::exp(-decay * k as f64)).collect()
 }
 
-/// Pulses of a signal that ends in zeros which a product takes one by one.
+/// Most pulses of a signal that a product sums directly. Longer signals are transformed.
 const FEW: usize = 64;
 
-/// Whether the second half of a series exceeds its first by so much that a transform would swamp the latter.
+/// Whether the second half of a series is so large that a transform loses the digits of the first half.
 fn grows(series: &[f64]) -> bool {
     let largest = |part: &[f64]| part.iter().fold(0.0_f64, |a, v| a.max(v.abs()));
     let (first, second) = series.split_at(series.len() / 2);
@@ -307,5 +312,6 @@ fn grows(series: &[f64]) -> bool {
     !(second <= GROWTH * first && first.is_finite())
 }
 
-/// By this factor: half of the digits of a transform's smallest values are lost to 1e−12 of its largest.
+/// Largest ratio of the second half to the first. A transform's rounding, 1e−12 of its largest value, then costs half
+/// of the digits.
 const GROWTH: f64 = 1e3;

@@ -1,10 +1,9 @@
-//! Recursion (44) while a run is recorded: rows in the order of time, each new one in constant time.
+//! Multi-innovation recursion (44) sample by sample, with constant time per sample.
 //!
 //! A new row needs the fractional integrals of every signal at the newest pulse, which depend on the whole past. The
-//! newest two pulses enter by the exact kernel (32); what is older has lag of at least one pulse and enters through
-//! the exponentials of [`crate::fractional::exponential_sum`], exact to rounding. An order above 1 is a running
-//! integral of the order less one. So a row costs O((signals + terms)·rates + p k² + k³), whatever the length of the
-//! run.
+//! newest two pulses enter by the exact kernel (32). Older pulses enter through a sum of exponentials,
+//! exact to rounding. An order above 1 is a running integral of the order minus one. A row costs
+//! O((signals + terms)·rates + p k² + k³), independent of the length of the run.
 
 use crate::equation::Structure;
 use crate::error::{check_finite, check_length, check_step, Error, Result};
@@ -13,24 +12,24 @@ use crate::fractional::exponential_sum::{decay, Rates};
 use crate::fractional::kernels::block_pulse_kernel;
 use crate::linalg::small::Recursion;
 
-/// Accuracy of the memory: at the rounding of the batch form's transforms.
+/// Relative accuracy of the sum of exponentials, at the rounding level of the batch form.
 const TOLERANCE: f64 = 2e-15;
 
-/// The state of one signal: exponentials of all pulses but the newest two, and the last pulse.
+/// History of one signal: exponential states of all pulses except the newest two, and the last pulse.
 #[derive(Debug, Clone)]
 struct Past {
     states: Vec<f64>,
     last: f64,
 }
 
-/// I^η of one signal at the newest pulse.
+/// Running integral I^η of one signal at the newest pulse.
 #[derive(Debug, Clone)]
 struct Integral {
     signal: usize,
-    /// On the newest pulse and the one before it.
+    /// Weights of the newest pulse and of the previous one.
     near: [f64; 2],
     far: Vec<f64>,
-    /// For orders above 1: the integral of the order less one, and its running integral so far.
+    /// For orders above 1: the integral of the order minus one, and its running sum.
     inner: Option<Box<(Integral, f64)>>,
     step: f64,
 }
@@ -53,7 +52,7 @@ impl Integral {
         let inner = if eta > 1.0 { Some(Box::new((Self::new(signal, q, step, rates)?, 0.0))) } else { None };
         let mut near = [kernel[0], kernel[1]];
         if eta > 1.0 {
-            // The running integral holds what the last pulse had amounted to at its end.
+            // The running sum already contains the contribution of the last pulse at its end.
             near[1] -= libm::pow(step, eta) / libm::tgamma(eta + 1.0);
         }
         let far = rates
@@ -84,19 +83,19 @@ impl Integral {
     }
 }
 
-/// One equation in a stream.
+/// Recursion of one equation in a stream.
 #[derive(Debug, Clone)]
 struct Fit {
     output: usize,
     integrals: Vec<Integral>,
     fixed: Vec<Option<f64>>,
     recursion: Recursion,
-    /// The p newest rows, each with its target, as a ring.
+    /// Ring buffer of the p newest rows, each with its target.
     rows: Vec<(Vec<f64>, f64)>,
     at: usize,
 }
 
-/// Recursion (44) for several equations on one stream of samples.
+/// Multi-innovation recursion (44) of several equations on one stream of samples.
 #[derive(Debug, Clone)]
 pub struct Streaming {
     inputs: Vec<bool>,
@@ -112,11 +111,13 @@ pub struct Streaming {
 }
 
 impl Streaming {
-    /// A stream of samples `step` s apart for at most `longest` pulses; `inputs` tells held inputs from outputs.
+    /// Stream of samples with the interval `step` \[s\], for at most `longest` pulses.
+    ///
+    /// `inputs` marks the zero-order-hold inputs; the other signals are outputs.
     ///
     /// # Errors
-    /// [`Error::OutOfRange`] for a step, length, prior or order of an integral that cannot be used;
-    /// [`Error::Length`] where `fixed` does not match the terms; [`Error::Structure`] for a signal that is not there.
+    /// [`Error::OutOfRange`] for an invalid step, length, prior or integration order; [`Error::Length`] if `fixed` does
+    /// not match the terms; [`Error::Structure`] for an unknown signal.
     ///
     /// ```
     /// # fn main() -> ftlm::error::Result<()> {
@@ -180,11 +181,11 @@ impl Streaming {
         })
     }
 
-    /// Takes one sample of every signal. Constant time.
+    /// Add one sample of every signal, in constant time.
     ///
     /// # Errors
-    /// [`Error::Length`], [`Error::NotFinite`]; [`Error::OutOfRange`] past the longest run;
-    /// [`Error::Diverged`] where the covariance loses its sign to rounding.
+    /// [`Error::Length`], [`Error::NotFinite`]; [`Error::OutOfRange`] beyond the longest run;
+    /// [`Error::Diverged`] if rounding makes the covariance indefinite.
     pub fn push(&mut self, sample: &[f64]) -> Result<()> {
         check_length("sample", self.inputs.len(), sample.len())?;
         check_finite("sample", sample)?;
@@ -214,13 +215,13 @@ impl Streaming {
         Ok(())
     }
 
-    /// Coefficients of every equation's terms after the newest sample, fixed ones as given.
+    /// Coefficients of the terms of every equation after the newest sample, fixed ones as given.
     #[must_use]
     pub fn coefficients(&self) -> Vec<Vec<f64>> {
         self.fits.iter().map(Fit::coefficients).collect()
     }
 
-    /// Pulses so far.
+    /// Number of pulses so far.
     #[must_use]
     pub fn pulses(&self) -> usize {
         self.pulses

@@ -1,18 +1,19 @@
-//! Fractional memory in bounded space: the kernel of I^q as a sum of decaying exponentials, shared by every order.
+//! Kernel of I^q as a sum of decaying exponentials: fractional memory in bounded space, with rates for all orders.
 //!
-//! t^{q−1}/Γ(q) = sin(πq)/π ∫ e^{x(1−q)} e^{−t e^x} dx over all real x. The trapezoidal rule in x converges like
-//! e^{−π²/Δx} for such integrands, so a few dozen rates e^x carry the whole past to any precision asked for; each rate
-//! needs one number of state a signal. What lies below the lowest rate is a geometric series and is put on four rates
-//! near zero with its first four moments kept. The rates do not depend on q: all orders on one signal share its states.
+//! t^{q−1}/Γ(q) = sin(πq)/π ∫ e^{x(1−q)} e^{−t e^x} dx over all real x. For such integrands the trapezoidal rule in x
+//! converges like e^{−π²/Δx}. A few dozen rates e^x therefore represent the whole history at any requested accuracy,
+//! and each rate needs one state a signal. Nodes below the lowest rate form a geometric series. Four rates near zero
+//! replace them and match its first four moments. Rates do not depend on q, so all orders of one signal share its
+//! states.
 
 use crate::error::{check_finite, Error, Result};
 
-/// The lowest rate of the rule times the longest lag: below it four moments are enough (1e−3⁴/4! < 1e−13).
+/// Lowest rate of the rule times the longest lag. Below it four moments suffice (1e−3⁴/4! < 1e−13).
 const SLOWEST: f64 = 1e-3;
-/// Rates below the rule's, as fractions of its lowest.
+/// Rates below those of the rule, relative to its lowest one.
 const TAIL: [f64; 4] = [0.0, 1.0 / 3.0, 2.0 / 3.0, 1.0];
 
-/// Decay rates that serve every kernel t^{q−1}/Γ(q), 0 < q ≤ 1, for lags between two limits.
+/// Decay rates for all kernels t^{q−1}/Γ(q), 0 < q ≤ 1, and lags between two limits.
 #[derive(Debug, Clone)]
 pub struct Rates {
     rates: Vec<f64>,
@@ -24,7 +25,6 @@ impl Rates {
     /// Rates for lags in `[shortest, longest]` s at a relative accuracy of about `tolerance`, 1e−14 at best.
     ///
     /// Their number grows with ln(longest/shortest)·ln(1/tolerance): 70 for 10⁶ at 1e−9.
-    ///
     /// # Errors
     /// [`Error::OutOfRange`] where the lags do not increase or the tolerance is outside (1e−15, 0.1).
     pub fn new(shortest: f64, longest: f64, tolerance: f64) -> Result<Self> {
@@ -44,10 +44,10 @@ impl Rates {
             return Err(bad("tolerance", tolerance, "(1e-15, 0.1)"));
         }
         let digits = -libm::log(tolerance);
-        // Γ's growth off the axis costs a little more than e^{−π²/Δx} says.
+        // The growth of Γ off the real axis costs slightly more than e^{−π²/Δx}.
         let spacing = std::f64::consts::PI * std::f64::consts::PI / (digits + 4.0);
         let lowest = SLOWEST / longest;
-        // Past this rate a lag of `shortest` leaves less than the tolerance even against t^{q−1} at q near 1.
+        // Above this rate the remainder at lag `shortest` is below the tolerance, even relative to t^{q−1} at q near 1.
         let highest = (digits + 8.0) / shortest;
         if !(highest / lowest).is_finite() {
             return Err(bad("longest lag", longest, "a range that floating point holds"));
@@ -106,7 +106,7 @@ impl Rates {
     }
 }
 
-/// Moments of a decay over a step of x = rate·step: e^{−x}, and the shares of the step's first and last value in
+/// Weights of a decay over a step, x = rate·step: e^{−x}, and the weights of the first and last value of the step in
 /// ∫₀¹ e^{−x(1−u)} (first·(1−u) + last·u) du.
 #[must_use]
 pub fn decay(x: f64) -> (f64, f64, f64) {
@@ -127,8 +127,9 @@ pub fn decay(x: f64) -> (f64, f64, f64) {
     (keep, (1.0 - keep * (1.0 + x)) / square, (x - 1.0 + keep) / square)
 }
 
-/// I^q of a signal that is linear between its samples, sample by sample through the exponentials, and how many numbers
-/// held its past. O(samples · rates).
+/// I^q of a signal that is linear between samples, online by the sum of exponentials, and the number of states.
+///
+/// O(samples · rates).
 ///
 /// # Errors
 /// An order outside (0, 1], [`Error::NotFinite`], and as [`Rates::new`] for a step or a tolerance.

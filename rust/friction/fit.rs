@@ -1,4 +1,4 @@
-//! Output error of bodies with friction, by Levenberg–Marquardt: orders, coefficients, and the states of every run.
+//! Output-error fit of bodies with friction by Levenberg–Marquardt: orders, coefficients and initial states.
 
 use super::model::{Evaluation, FrictionModel, Point};
 use crate::error::{check_finite, check_length, Result};
@@ -8,41 +8,41 @@ use crate::estimation::output_error::Experiment;
 use crate::linalg::orthogonal::extend_orthonormal;
 use crate::parallel::Stop;
 
-/// Where a fit starts.
+/// Initial guess of a fit.
 #[derive(Debug, Clone, Default, PartialEq)]
 pub struct Start {
     /// Free orders.
     pub orders: Vec<f64>,
     /// Free coefficients.
     pub coefficients: Vec<f64>,
-    /// Free numbers of inputs.
+    /// Free parameters of inputs.
     pub inputs: Vec<f64>,
-    /// States of each run; empty: those that suit the start best.
+    /// Initial states of each run. If empty, they are estimated at the initial guess.
     pub states: Vec<Vec<f64>>,
 }
 
-/// The optimum and what describes it.
+/// Optimum of a fit and its diagnostics.
 #[derive(Debug, Clone, PartialEq)]
 pub struct Fit {
     /// Free orders.
     pub orders: Vec<f64>,
     /// Free coefficients.
     pub coefficients: Vec<f64>,
-    /// Free numbers of inputs.
+    /// Free parameters of inputs.
     pub inputs: Vec<f64>,
-    /// States of each run.
+    /// Initial states of each run.
     pub states: Vec<Vec<f64>>,
-    /// The initial terms that they are, (exponent, coefficient), run by run and equation by equation.
+    /// Initial terms of the states, (exponent, coefficient), by run and equation.
     pub initial: Vec<Vec<Vec<(f64, f64)>>>,
     /// Half the weighted sum of squared residuals.
     pub cost: f64,
-    /// Weighted residuals, run after run.
+    /// Residuals with weights, run after run.
     pub residuals: Vec<f64>,
-    /// Their derivatives with respect to orders, coefficients and inputs, what states can follow taken out.
+    /// Derivatives with respect to orders, coefficients and inputs, after projecting out the states.
     pub jacobian: Vec<Vec<f64>>,
-    /// Evaluations of residuals.
+    /// Number of residual evaluations.
     pub evaluations: usize,
-    /// How it ended.
+    /// Termination status.
     pub status: Status,
 }
 
@@ -113,7 +113,7 @@ impl Problem for OutputError<'_> {
             .map_or(1.0, |j| self.model.coordinates[j].stretch(point.coefficients[j]))
     }
 
-    /// Orders and inputs' numbers have bounds, and friction is not negative.
+    /// Orders and input parameters have bounds, friction is not negative.
     fn room(&self, point: &Point, parameter: usize) -> (f64, f64) {
         if let Some(order) = point.orders.get(parameter) {
             let (low, high) = self.model.order_bounds[parameter];
@@ -131,7 +131,7 @@ impl Problem for OutputError<'_> {
         (f64::INFINITY, f64::INFINITY)
     }
 
-    /// Instants at which the body stops or turns pass from pulse to pulse, whatever moves them.
+    /// Times at which a body stops or reverses move from pulse to pulse with any parameter.
     fn kinked(&self, _point: &Point, _parameter: usize) -> bool {
         true
     }
@@ -141,7 +141,7 @@ impl Problem for OutputError<'_> {
     }
 }
 
-/// The same of one run with everything but its states known.
+/// Estimation of the initial state of one run with all other parameters fixed.
 struct Begun<'a> {
     model: &'a FrictionModel,
     experiment: &'a Experiment,
@@ -194,12 +194,12 @@ impl Problem for Begun<'_> {
     }
 }
 
-/// Constants at which the states of a run are begun, as shares of each friction while others are 0: where a body rests
-/// hangs on the sign of what is left of the two, which a descent does not cross.
+/// Constant forces tried as initial guesses, relative to each friction. The rest position depends on the sign of the
+/// net force, which a local optimization does not change.
 const BEGUN: [f64; 3] = [0.0, 0.5, -0.5];
 const BEGUN_SETTINGS: Settings = Settings { evaluations: 30, tolerance: 1e-6 };
 
-/// States of a run at given numbers: the best that descents from its first samples reach.
+/// Initial state of a run at fixed parameters: best result of local optimizations from its first samples.
 fn begun(
     model: &FrictionModel,
     orders: &[f64],
@@ -222,7 +222,7 @@ fn begun(
         if share != 0.0 && start == plain {
             continue;
         }
-        // One whose run leaves the range of numbers is none.
+        // A start with a simulation that overflows is skipped.
         if let Ok(found) = minimise(&problem, start, BEGUN_SETTINGS) {
             if found.cost < best.0 {
                 best = (found.cost, found.point);
@@ -232,16 +232,16 @@ fn begun(
     best.1
 }
 
-/// Weighted least squares on the output error from a start.
+/// Least-squares fit with weights of the output error from an initial guess.
 ///
 /// # Errors
-/// A start whose free run is not finite ([`crate::error::Error::Diverged`]); a model that names what is not there,
+/// An initial guess whose simulation overflows ([`crate::error::Error::Diverged`]), an inconsistent model or
 /// experiments that do not fit it ([`FrictionModel::check`]).
 pub fn fit(model: &FrictionModel, experiments: &[Experiment], start: &Start, settings: Settings) -> Result<Fit> {
     fit_until(model, experiments, start, settings, &Stop::default())
 }
 
-/// [`fit`], until it is told to stop.
+/// Interruptible [`fit`].
 ///
 /// # Errors
 /// As [`fit`]; [`crate::error::Error::Interrupted`].
@@ -306,5 +306,5 @@ pub fn fit_until(
     })
 }
 
-/// A state whose response lies in the span of the others up to this share adds nothing.
+/// Relative distance from the span of other responses below which a state is linearly dependent.
 const SPANNED: f64 = 1e-12;

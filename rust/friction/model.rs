@@ -1,4 +1,4 @@
-//! Bodies with friction whose orders and coefficients are free: residuals on every experiment, and their derivatives.
+//! Parameters of bodies with friction: residuals of all experiments and their derivatives.
 
 use super::convolution::{product, Integrated};
 use super::dynamics::{at_rest, Body, Operators, Run};
@@ -10,7 +10,7 @@ use crate::estimation::output_error::{Coordinate, Experiment, FreeEquation, Free
 use crate::regressors::{add_impulses, parted, Record};
 use crate::series::Kernel;
 
-/// Friction each of whose numbers may be free: a multiple of one coefficient.
+/// Friction law with free parameters, each a multiple of one coefficient.
 #[derive(Debug, Clone, PartialEq)]
 pub struct FreeLaw {
     /// fc.
@@ -22,7 +22,7 @@ pub struct FreeLaw {
 }
 
 impl FreeLaw {
-    /// Friction that is the same at every speed.
+    /// Friction that does not depend on speed.
     #[must_use]
     pub fn coulomb(coulomb: Monomial) -> Self {
         let known = |factor: f64| Monomial { factor, powers: Vec::new() };
@@ -33,55 +33,55 @@ impl FreeLaw {
         [&self.coulomb, &self.stribeck, &self.speed]
     }
 
-    /// At coefficients.
+    /// Law at these coefficients.
     pub(super) fn at(&self, coefficients: &[f64]) -> Law {
         let [coulomb, stribeck, speed] = self.numbers().map(|number| number.at(coefficients));
         Law { coulomb, stribeck, speed }
     }
 
-    /// Whether a coefficient is one of its forces, which are not negative.
+    /// Whether a coefficient is a force of this law, which must not be negative.
     pub(super) fn rubs(&self, coefficient: usize) -> bool {
         [&self.coulomb, &self.stribeck].iter().any(|number| number.powers.iter().any(|&(i, _)| i == coefficient))
     }
 }
 
-/// Which outputs pass a filter before they are compared.
+/// Outputs that pass a filter before the comparison.
 #[must_use]
 pub fn passing(experiments: &[Experiment]) -> Vec<bool> {
     experiments.first().and_then(|e| e.filter.as_ref()).map_or_else(Vec::new, |(_, passes)| passes.clone())
 }
 
-/// What is estimated: equations that follow each other's outputs, some with friction of their own output's velocity.
+/// Model with free parameters: coupled equations, some with friction of their own output's velocity.
 #[derive(Debug, Clone, PartialEq)]
 pub struct FrictionModel {
-    /// The linear terms.
+    /// Linear equations.
     pub equations: Vec<FreeEquation>,
-    /// Which of them have friction, and F of − F(Dy) sgn(Dy).
+    /// Equations with friction, and F of − F(Dy) sgn(Dy).
     pub frictions: Vec<(usize, FreeLaw)>,
-    /// What is free of inputs, one number of an input at most.
+    /// Free parameters of inputs, at most one an input.
     pub inputs: Vec<FreeInput>,
     /// Bounds of each free order.
     pub order_bounds: Vec<(f64, f64)>,
     /// Coordinate of each free coefficient.
     pub coordinates: Vec<Coordinate>,
-    /// Initial terms of each record, offsets, and free motions of the filter that outputs pass.
+    /// Initial terms of each record, offsets, and filter transients of filtered outputs.
     pub initial: Initial,
-    /// Which outputs pass the filter of every experiment before they are compared; empty: none.
+    /// Outputs that pass the filter of every experiment before the comparison. Empty if none does.
     pub filtered: Vec<bool>,
 }
 
-/// Values of all that is free.
+/// Values of all free parameters.
 #[derive(Debug, Clone, Default, PartialEq)]
 pub(super) struct Point {
     pub(super) orders: Vec<f64>,
     pub(super) coefficients: Vec<f64>,
-    /// Free numbers of inputs.
+    /// Free parameters of inputs.
     pub(super) inputs: Vec<f64>,
-    /// Of each run.
+    /// Initial states of each run.
     pub(super) states: Vec<Vec<f64>>,
 }
 
-/// Residuals at a point, and what their derivatives are made of.
+/// Residuals at a point, with intermediate results for their derivatives.
 pub(super) struct Evaluation {
     pub(super) residuals: Vec<f64>,
     pub(super) size: f64,
@@ -91,28 +91,28 @@ pub(super) struct Evaluation {
 struct Part {
     operators: Operators,
     run: Run,
-    /// How the means of each input with a free number move with it.
+    /// Derivatives of the means of each input with respect to its free parameter.
     bent: Vec<Vec<f64>>,
 }
 
-/// Samples from which a run's first velocity is taken.
+/// Samples for the initial velocity of a run.
 const FIRST_SAMPLES: usize = 8;
 
-/// Powers of t move smoothly with orders: the error of a central difference is 1e−10.
+/// Step of central differences. Powers of t are smooth in the orders, so the error is about 1e−10.
 const SHIFT: f64 = 1e-5;
 
-/// What a parameter moves.
+/// Parameter of a derivative.
 enum Moved {
-    /// A free order, a free coefficient, a state of one run.
+    /// Free order, free coefficient, or state of one run.
     Order(usize),
     Coefficient(usize),
     State(usize, usize),
-    /// A free number of an input.
+    /// Free parameter of an input.
     Input(usize),
 }
 
 impl FrictionModel {
-    /// Refuses what names something that is not there, or an experiment that this model cannot be compared with.
+    /// Return an error for an inconsistent model, or for experiments that do not fit it.
     ///
     /// # Errors
     /// [`Error::Structure`], [`Error::Length`].
@@ -167,12 +167,12 @@ impl FrictionModel {
         self.initial.check()
     }
 
-    /// Whether a coefficient is a force of some friction, which is not negative.
+    /// Whether a coefficient is a friction force, which must not be negative.
     pub(super) fn rubs(&self, coefficient: usize) -> bool {
         self.frictions.iter().any(|(_, law)| law.rubs(coefficient))
     }
 
-    /// Refuses free orders that make no equation.
+    /// Return an error for invalid free orders.
     pub(super) fn check_orders(&self, orders: &[f64]) -> Result<()> {
         let body = self.body(orders, &vec![0.0; self.coordinates.len()]);
         body.equations.iter().try_for_each(|e| e.structure.check(usize::MAX, |_| true))
@@ -196,7 +196,7 @@ impl FrictionModel {
         }
     }
 
-    /// States of every run at these orders, and the equations without their coefficients.
+    /// States of every run at these orders, and the equations with zero coefficients.
     pub(super) fn states(&self, orders: &[f64]) -> (Vec<State>, Vec<Equation>) {
         let moves = |i: usize, term: usize| {
             let alpha = &self.equations[i].order.weights;
@@ -207,8 +207,8 @@ impl FrictionModel {
         (State::all(&body.equations, &self.initial, &self.filtered, moves), body.equations)
     }
 
-    /// States of a run as its first samples have them: where the bodies are and how fast, constants beside frictions as
-    /// given, the rest 0.
+    /// Initial states from the first samples of a run: positions and velocities of the bodies, given constants for the
+    /// frictions, all other states 0.
     pub(super) fn first_states(&self, orders: &[f64], experiment: &Experiment, constants: &[f64]) -> Vec<f64> {
         let (states, equations) = self.states(orders);
         let begun: Vec<(f64, f64)> = experiment.samples.iter().map(|samples| first_of(samples, experiment)).collect();
@@ -224,7 +224,7 @@ impl FrictionModel {
         states.iter().map(value).collect()
     }
 
-    /// Powers of t of a run's states by equation: (exponent, coefficient).
+    /// Initial terms of a run's states by equation: (exponent, coefficient).
     pub(super) fn powers(&self, orders: &[f64], coefficients: &[f64], values: &[f64]) -> Vec<Vec<(f64, f64)>> {
         let body = self.body(orders, coefficients);
         let links = body.links();
@@ -241,7 +241,7 @@ impl FrictionModel {
         Forcing::of(&powers, &body.links(), record.m(), record.step())
     }
 
-    /// The record as its inputs act, none where that is as they are, and how these move with their free numbers.
+    /// Record with transformed inputs, and their derivatives in the free parameters. None without free inputs.
     fn acting(&self, record: &Record, values: &[f64]) -> Result<(Option<Record>, Vec<Vec<f64>>)> {
         if self.inputs.is_empty() {
             return Ok((None, Vec::new()));
@@ -258,7 +258,7 @@ impl FrictionModel {
 
     pub(super) fn evaluate(&self, experiments: &[Experiment], point: &Point) -> Result<Evaluation> {
         let body = self.body(&point.orders, &point.coefficients);
-        // Reported like a step too far, so that a search shortens it.
+        // Same error as for a step that is too long, so that an optimizer shortens it.
         let far = |_| Error::Diverged { what: "orders or friction out of range; the free run".into(), index: 0 };
         body.check(usize::MAX).map_err(far)?;
         let mut out = Evaluation { residuals: Vec::new(), size: 0.0, parts: Vec::with_capacity(experiments.len()) };
@@ -280,8 +280,10 @@ impl FrictionModel {
         Ok(out)
     }
 
-    /// Derivatives of the residuals with respect to orders, coefficients, then the states of run after run; without
-    /// `numbers` to states alone.
+    /// Derivatives of the residuals with respect to orders, coefficients and inputs, then to the states of run after
+    /// run.
+    ///
+    /// Without `numbers` only with respect to the states.
     pub(super) fn jacobian(
         &self,
         experiments: &[Experiment],
@@ -308,7 +310,7 @@ impl FrictionModel {
                     continue;
                 }
                 let slopes = self.slopes(&body, experiment, part, &spectra, point, index, moved)?;
-                // Residuals fall where the response rises.
+                // Residuals are measurement minus response.
                 column.extend(experiment.sampled(&slopes).into_iter().map(|v| -v));
             }
         }
@@ -318,7 +320,7 @@ impl FrictionModel {
         Ok(columns)
     }
 
-    /// How the outputs' means move with one parameter.
+    /// Derivatives of the outputs' means with respect to one parameter.
     #[allow(clippy::too_many_arguments)]
     fn slopes(
         &self,
@@ -333,7 +335,7 @@ impl FrictionModel {
         let (operators, motion, record) = (&part.operators, &part.run, &experiment.record);
         if let Moved::State(_, state) = *moved {
             if let Some(State::Power(i, e)) = self.states(&point.orders).0.get(state).filter(|s| s.is_impulse()) {
-                // What a filter still holds moves no body.
+                // A filter transient does not move a body.
                 let mut slopes = vec![vec![0.0; record.m()]; self.equations.len()];
                 let mut own = vec![Vec::new(); self.equations.len()];
                 own[*i].push((*e, 1.0));
@@ -394,7 +396,7 @@ impl FrictionModel {
         Ok(slopes)
     }
 
-    /// What a parameter moves of the body's numbers.
+    /// Derivatives of the orders, coefficients and friction parameters with respect to a parameter.
     fn moves(&self, point: &Point, moved: &Moved) -> Moves {
         let mut out = Moves {
             alphas: vec![0.0; self.equations.len()],
@@ -423,7 +425,7 @@ impl FrictionModel {
         out
     }
 
-    /// How what a run starts with moves: it is linear in states and coefficients, and smooth in orders.
+    /// Derivative of the initial forcing, which is linear in states and coefficients and smooth in orders.
     fn forcing_slope(&self, point: &Point, values: &[f64], record: &Record, moved: &Moved) -> Result<Forcing> {
         let idle = values.is_empty() || values.iter().all(|x| *x == 0.0);
         let none = || Ok(Forcing::none(record.m(), self.equations.len()));
@@ -432,7 +434,7 @@ impl FrictionModel {
                 let unit: Vec<f64> = (0..values.len()).map(|k| if k == state { 1.0 } else { 0.0 }).collect();
                 self.forcing(&point.orders, &point.coefficients, &unit, record)
             }
-            // What a run starts with knows nothing of its inputs.
+            // Initial forcing does not depend on inputs.
             Moved::Input(_) => none(),
             _ if idle => none(),
             Moved::Coefficient(j) => {
@@ -447,7 +449,7 @@ impl FrictionModel {
                     self.forcing(&point.orders, &shifted, values, record)
                 };
                 let size = point.coefficients[j].abs().max(1.0);
-                // Of one equation no more than a square; levels and velocities that feed through others at once are none.
+                // Quadratic at most for one equation. With direct feedthrough between equations it is rational.
                 let by = if self.equations.len() == 1 { size } else { SHIFT * size };
                 Ok(difference(&at(by)?, &at(-by)?, 2.0 * by))
             }
@@ -463,14 +465,14 @@ impl FrictionModel {
     }
 }
 
-/// Derivatives of each α, of (coefficient, integration) of each term, and of each fc, fs and vs.
+/// Derivatives of each α, of (coefficient, integration order) of each term, and of each fc, fs and vs.
 struct Moves {
     alphas: Vec<f64>,
     terms: Vec<Vec<(f64, f64)>>,
     frictions: Vec<[f64; 3]>,
 }
 
-/// Level and velocity of an output as its first samples have them.
+/// Initial position and velocity of an output from its first samples.
 fn first_of(samples: &[f64], experiment: &Experiment) -> (f64, f64) {
     let near = &samples[..samples.len().min(FIRST_SAMPLES)];
     #[allow(clippy::cast_precision_loss)]
@@ -496,7 +498,7 @@ fn difference(up: &Forcing, down: &Forcing, step: f64) -> Forcing {
     out
 }
 
-/// Spectra of outputs, and of velocities at edges, which terms of them take in.
+/// Spectra of outputs and of edge velocities that enter terms.
 struct Spectra(Vec<(Kernel, Kernel)>);
 
 impl Spectra {
@@ -509,7 +511,7 @@ impl Spectra {
         Self(run.outputs.iter().zip(&run.moved).enumerate().map(of).collect())
     }
 
-    /// Share of a term of an output through its kernels (0) or their slopes (1).
+    /// Contribution of a term of an output through its kernels (0) or their derivatives (1).
     fn own(&self, output: usize, kernels: &[Vec<f64>; 2], which: usize) -> Integrated {
         let (position, velocity) = &self.0[output];
         Integrated { output: product(position, &kernels[which]), edges: product(velocity, &kernels[which]) }

@@ -1,4 +1,6 @@
-//! The candidates of a lattice by index: which columns each one names, from tables, so that none costs a look-up.
+//! Candidate index of an order grid: from the number of a candidate to its regressor columns.
+//!
+//! Tables replace a look-up per candidate.
 
 use std::borrow::Cow;
 
@@ -13,19 +15,19 @@ use crate::order_search::options::{Budget, Options};
 use crate::parallel::Stop;
 use crate::regressors::Record;
 
-/// All candidates of a lattice over one equation, and what they share.
+/// All candidates of an order grid for one equation, with the data they share.
 pub(crate) struct Catalogue<'a> {
     pub(crate) problem: Problem,
     pub(crate) lattice: Cow<'a, Lattice>,
     pub(crate) options: Options,
-    /// What is left of the memory limit [bytes].
+    /// Memory that remains of the limit [bytes].
     pub(crate) spare: u64,
-    /// Column of each value of each term, per block of the lattice.
+    /// Column of each value of each term, per block of the order grid.
     tables: Vec<Vec<Vec<usize>>>,
 }
 
 impl<'a> Catalogue<'a> {
-    /// Builds regressors, their products and test vectors for all candidates.
+    /// Build regressors, their products and test vectors for all candidates.
     pub(crate) fn new(
         records: &[Record],
         lattice: Cow<'a, Lattice>,
@@ -59,20 +61,20 @@ impl<'a> Catalogue<'a> {
         Ok(Self { problem, lattice, options: options.clone(), spare, tables })
     }
 
-    /// Columns of the terms where a walk stands.
+    /// Columns of the terms at a cursor.
     pub(crate) fn positions(&self, cursor: &Cursor<'_>, positions: &mut [usize]) {
         let table = &self.tables[cursor.block()];
         cursor.each(0, |term, digit| positions[term] = table[term][digit]);
     }
 
-    /// Columns of the initial terms where a walk stands.
+    /// Columns of the initial terms at a cursor.
     pub(crate) fn initial(&self, cursor: &Cursor<'_>, initial: &mut Vec<usize>) {
         if self.options.initial != Initial::Rest {
             self.problem.initial_positions(&cursor.structure(), initial);
         }
     }
 
-    /// Columns of the values of one term in the block where a walk stands.
+    /// Columns of the values of one term in the cursor's block.
     #[inline(always)]
     pub(crate) fn of_term(&self, cursor: &Cursor<'_>, term: usize) -> &[usize] {
         &self.tables[cursor.block()][term]
@@ -83,7 +85,7 @@ impl<'a> Catalogue<'a> {
         &self.tables[block][term]
     }
 
-    /// Goes to the next candidate and its columns.
+    /// Advance to the next candidate and update its columns.
     #[inline(always)]
     pub(crate) fn next(&self, cursor: &mut Cursor<'_>, terms: &mut [usize]) {
         let changed = cursor.advance();
@@ -92,7 +94,7 @@ impl<'a> Catalogue<'a> {
     }
 }
 
-/// The column of every value of every term, per block, so that a candidate costs no look-up.
+/// Column of every value of every term, per block. The tables save a look-up per candidate.
 fn tables(lattice: &Lattice, problem: &Problem) -> Result<Vec<Vec<Vec<usize>>>> {
     lattice
         .blocks()
@@ -105,7 +107,7 @@ fn tables(lattice: &Lattice, problem: &Problem) -> Result<Vec<Vec<Vec<usize>>>> 
                         .iter()
                         .enumerate()
                         .map(|(i, &order)| {
-                            // Values out of this α's range are never asked for.
+                            // Values outside this α's range are never used.
                             if i < first {
                                 Ok(0)
                             } else {

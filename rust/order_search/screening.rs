@@ -1,4 +1,4 @@
-//! Screening: coefficients of candidates side by side, and those left open that no proved lower bound excludes.
+//! Screening of candidates in batches: coefficients in parallel lanes, then exclusion by lower bounds.
 
 use crate::order_search::candidate::columns::{part_of, Columns};
 use crate::order_search::candidate::normal_equations::{Solve, Squares};
@@ -10,27 +10,27 @@ use crate::order_search::dual_bound::tailored_vectors::Memory;
 use crate::order_search::grid::traversal::{spread, Cursor, Slab};
 use crate::simd::{self, WIDTH};
 
-/// A candidate that its bound has not excluded.
+/// Candidate that no bound has excluded.
 #[derive(Debug, Clone, Copy)]
 pub(crate) struct Open {
     pub(crate) index: u64,
     pub(crate) bound: f64,
-    /// A guess at its score, by which visits are ordered.
+    /// Score estimate that orders the evaluation.
     pub(crate) guess: f64,
 }
 
-/// Sorts by guess, ties by index; what has no order comes last.
+/// Sort by estimate, ties by index, NaN last.
 pub(crate) fn by_guess(open: &mut [Open]) {
     open.sort_unstable_by(|a, b| a.guess.total_cmp(&b.guess).then(a.index.cmp(&b.index)));
 }
 
-/// Screens candidates `lo … hi − 1` against a limit: the open ones, and the singular ones; compiled for the widest
-/// vectors at hand.
+/// Screen candidates `lo … hi − 1` against a limit. Return the open and the singular ones. Compiled for the widest
+/// vector instructions available.
 pub(crate) fn screen(catalogue: &Catalogue<'_>, lo: u64, hi: u64, limit: f64) -> (Vec<Open>, Vec<u64>) {
     simd::widest(Screening { catalogue, lo, hi, limit })
 }
 
-/// [`screen`] as a kernel.
+/// Kernel form of [`screen`].
 struct Screening<'a> {
     catalogue: &'a Catalogue<'a>,
     lo: u64,
@@ -77,14 +77,14 @@ impl simd::Kernel for Screening<'_> {
     }
 }
 
-/// What stretches of candidates are judged by first, where squared equation errors rank.
+/// Context of the row bound, which precedes other bounds if the squared equation error ranks.
 struct Sharing<'a> {
     squares: &'a Squares,
     limit: f64,
 }
 
 impl<'a> Sharing<'a> {
-    /// None where nothing would be excluded, or where coefficients are known.
+    /// `None` if nothing would be excluded, or if coefficients are fixed.
     fn of(catalogue: &'a Catalogue<'_>, limit: f64) -> Option<Self> {
         let Problem { squares, equations, .. } = &catalogue.problem;
         let squares = squares.as_ref().filter(|_| limit < f64::INFINITY && equations.whole().is_some())?;
@@ -92,22 +92,22 @@ impl<'a> Sharing<'a> {
     }
 }
 
-/// Memory of a screening of L candidates side by side.
+/// Workspace for screening L candidates in parallel lanes.
 pub(crate) struct Screen<const L: usize> {
     solve: Solve<L>,
     positions: Vec<Columns<L>>,
     initial: Vec<usize>,
-    /// Columns of the candidate that comes next.
+    /// Columns of the next candidate.
     terms: Vec<usize>,
-    /// One candidate's columns, coefficients and initial terms.
+    /// Columns, coefficients and initial terms of one candidate.
     columns: Vec<usize>,
     coefficients: Vec<f64>,
     weights: Vec<f64>,
-    /// What is remembered of the test vectors made for candidates.
+    /// Norm cache of the tailored test vectors.
     memory: Memory,
-    /// What is left of a stretch.
+    /// Open positions of a row.
     left: Vec<usize>,
-    /// What is remembered of the test vectors that follow coefficients, and the path that excluded one last.
+    /// Lookup state of the linearized test vectors, and the path that excluded the previous candidate.
     held: Held,
     path: usize,
 }
@@ -129,8 +129,8 @@ impl<const L: usize> Screen<L> {
         }
     }
 
-    /// Screens the next candidates as far as they differ in one term alone: how many; none where they are few, or where
-    /// nothing is proved of them together.
+    /// Screen the next candidates while only one term changes, by their common row bound. Return their number. `None`
+    /// if they are too few, or if nothing is proved of them together.
     #[inline(always)]
     fn stretch(
         &mut self,
@@ -199,7 +199,7 @@ impl<const L: usize> Screen<L> {
         self.judge(catalogue, std::array::from_fn(|n| index + n as u64), L, limit, found);
     }
 
-    /// Screens the candidates whose columns have been laid out.
+    /// Screen the candidates whose columns have been set.
     #[inline(always)]
     fn judge(
         &mut self,
@@ -224,7 +224,7 @@ impl<const L: usize> Screen<L> {
             let (bound, guess) = match (&squares, &catalogue.problem.bound) {
                 (Some((least, guess)), _) => (least[n], guess[n]),
                 (None, Some(bound)) => {
-                    // Coefficients that are yet to be refined give an order of visiting and prove nothing.
+                    // Unrefined coefficients order the evaluation but prove nothing.
                     let refined = catalogue.problem.refines();
                     let limit = if refined { f64::INFINITY } else { limit };
                     columns.iter_mut().zip(positions.iter()).for_each(|(t, p)| *t = p.at[n]);
@@ -239,7 +239,7 @@ impl<const L: usize> Screen<L> {
                 }
                 (None, None) => (0.0, spread(index)),
             };
-            // Written so that a bound that is not a number excludes nothing.
+            // This form of the condition lets a NaN bound exclude nothing.
             if bound > limit {
                 continue;
             }
@@ -262,8 +262,8 @@ impl<const L: usize> Screen<L> {
         }
     }
 
-    /// Screens these candidates, at most L, at rest: index, and columns of the two terms that vary in a slab with these
-    /// columns.
+    /// Screen at most L candidates of a slice, with zero initial conditions. `candidates` holds index and the columns
+    /// of the two varying terms. `columns` holds all others.
     #[inline(always)]
     pub(crate) fn these(
         &mut self,

@@ -1,4 +1,4 @@
-//! Least squares and multi-innovation least squares at given orders; joint output error.
+//! Bindings of least squares, multi-innovation least squares, instrumental variables and the joint output-error fit.
 
 use numpy::{PyArray1, PyArray2, PyReadonlyArray1, PyReadonlyArray2};
 use pyo3::prelude::*;
@@ -20,15 +20,15 @@ use crate::python::order_search::watch::{leavable, Stop};
 use crate::regressors::Record;
 use crate::signal::block_pulse::{Jumps, Readings};
 
-/// (coefficients, initial terms per record, exponents, dropped (record, position) pairs).
+/// Tuple of (coefficients, initial terms per record, exponents, dropped (record, position) pairs).
 pub type EstimateTuple = (Vec<f64>, Vec<Vec<f64>>, Vec<f64>, Vec<(usize, usize)>);
 
-/// Pulses of all records together.
+/// Total number of pulses of all records.
 pub fn pulses(records: &[Record]) -> usize {
     records.iter().map(Record::m).sum()
 }
 
-/// Pulses of all experiments together, each as often as it is evaluated at most.
+/// Total number of pulses of all experiments times the largest number of evaluations.
 pub fn evaluated(experiments: &[joint::Experiment], evaluations: usize) -> usize {
     experiments.iter().map(|e| e.record.m()).sum::<usize>().saturating_mul(evaluations)
 }
@@ -54,7 +54,7 @@ pub fn least_squares(
     Ok(tuple(leavable(py, points, None, move |_| batch::fit(&records, &structure, &fixed, &initial))?))
 }
 
-/// Output error and coefficients of each point; none where it is no number.
+/// Output error and coefficients of each point. None if they are not finite.
 type PointTuple = Option<(f64, Vec<f64>)>;
 
 #[pyfunction]
@@ -111,7 +111,7 @@ pub fn multi_innovation<'py>(
     Ok((tuple(estimate), None))
 }
 
-/// Refined instrumental variables: (estimates, covariances, iterations, converged, damped).
+/// Tuple of refined instrumental variables: (estimates, covariances, iterations, converged, instruments damped).
 type InstrumentTuple = (Vec<EstimateTuple>, Vec<Vec<f64>>, usize, bool, bool);
 
 #[pyfunction]
@@ -148,18 +148,18 @@ pub fn instrumental_variables(
     Ok((estimates, covariances, fit.iterations, fit.converged, fit.damped))
 }
 
-/// (constant, weight of each free order).
+/// Affine order: (constant, weight of each free order).
 pub type AffineArg = (f64, List<f64>);
-/// (known factor, (coefficient, power) pairs).
+/// Monomial of coefficients: (factor, (coefficient, power) pairs).
 pub type MonomialArg = (f64, List<(usize, i32)>);
-/// (output, alpha, [(signal, order, coefficient), …]).
+/// Equation with free parameters: (output, alpha, [(signal, order, coefficient), …]).
 pub type FreeEquationArg = (usize, AffineArg, List<(usize, AffineArg, MonomialArg)>);
-/// (places of the samples in pulses, places and sizes of the jumps of each signal that holds in between).
+/// Nonuniform samples: (sample positions in pulses, positions and sizes of the jumps of each held signal).
 pub type OwnTimesArg<'py> =
     (PyReadonlyArray1<'py, f64>, List<Option<(PyReadonlyArray1<'py, f64>, PyReadonlyArray1<'py, f64>)>>);
-/// (record, pulses a sample interval, samples of each output, filter of simulated outputs, weight of each output,
-/// (values at the samples, whether it holds) of each signal, shares of the compared samples of each output, times of
-/// their own).
+/// Experiment: (record, pulses per sampling interval, samples of each output, filter of simulated outputs, weight of
+/// each output, (values at the samples, whether held) of each signal, robust weights of the samples of each output,
+/// nonuniform sample times).
 pub type ExperimentArg<'py> = (
     RecordArg<'py>,
     usize,
@@ -175,7 +175,7 @@ fn affine((constant, weights): AffineArg) -> AffineOrder {
     AffineOrder { constant, weights: weights.into() }
 }
 
-/// The jumps of a held signal near the readings.
+/// Jumps of a held signal near the sample times.
 pub fn jumps_near(
     readings: &Readings,
     places: &PyReadonlyArray1<'_, f64>,
@@ -222,7 +222,7 @@ pub fn experiment(argument: &ExperimentArg<'_>) -> PyResult<joint::Experiment> {
     })
 }
 
-/// One equation whose orders and coefficients are free.
+/// Equation with free orders and coefficients.
 pub fn free_equation((output, order, terms): FreeEquationArg) -> joint::FreeEquation {
     joint::FreeEquation {
         output,
@@ -236,7 +236,7 @@ pub fn free_equation((output, order, terms): FreeEquationArg) -> joint::FreeEqua
     }
 }
 
-/// Coordinates by name.
+/// Coordinates of the parameters by name.
 pub fn coordinates(names: &[String]) -> PyResult<Vec<joint::Coordinate>> {
     let known = |name: &String| match name.as_str() {
         "plain" => Ok(joint::Coordinate::Plain),
@@ -251,7 +251,7 @@ pub fn coordinates(names: &[String]) -> PyResult<Vec<joint::Coordinate>> {
     Ok(names.iter().map(known).collect::<Result<Vec<_>, _>>()?)
 }
 
-/// How a search ended, as Python has it.
+/// Termination status of an optimization as text.
 pub fn status(status: joint::Status) -> &'static str {
     match status {
         joint::Status::Converged => "converged",
@@ -261,7 +261,7 @@ pub fn status(status: joint::Status) -> &'static str {
     }
 }
 
-/// What is free of inputs: signal, law, bounds, value at the start.
+/// Free parameter of an input: signal, law, bounds, initial guess.
 pub(super) type FreeInputArg = (usize, String, (f64, f64), f64);
 
 pub(super) fn free_inputs(inputs: &[FreeInputArg]) -> PyResult<Vec<joint::FreeInput>> {
@@ -332,7 +332,7 @@ pub fn output_error<'py>(
     Ok(dict)
 }
 
-/// Whether s^alpha less the own terms (coefficient, order) has a zero to the right of the imaginary axis, or on it.
+/// Whether s^alpha minus the own terms (coefficient, order) has a zero in the closed right half-plane.
 #[pyfunction]
 #[allow(clippy::needless_pass_by_value)]
 pub fn grows(py: Python<'_>, alpha: f64, own_terms: List<(f64, f64)>) -> PyResult<bool> {
@@ -343,7 +343,7 @@ pub fn grows(py: Python<'_>, alpha: f64, own_terms: List<(f64, f64)>) -> PyResul
     })
 }
 
-/// Recursion (44) on a stream of samples; see the module `estimate::streaming` of the core.
+/// Recursion (44) on a stream of samples, see module `estimate::streaming` of the core.
 #[pyclass(module = "ftlm._core")]
 pub struct Streaming {
     inner: StreamingFit,
@@ -370,7 +370,7 @@ impl Streaming {
         Ok(Self { inner })
     }
 
-    /// Takes samples, shape (n, signals).
+    /// Append samples, shape (n, signals).
     #[allow(clippy::needless_pass_by_value)]
     fn push(&mut self, py: Python<'_>, samples: PyReadonlyArray2<'_, f64>) -> PyResult<()> {
         let samples = rows(&samples)?;

@@ -1,4 +1,4 @@
-//! Free runs of bodies with friction, and their output error.
+//! Bindings of simulation and output-error fit with friction.
 
 use numpy::{PyArray1, PyArray2};
 use pyo3::prelude::*;
@@ -51,10 +51,10 @@ pub fn friction_respond<'py>(
     Ok(dict)
 }
 
-/// (place of the body's equation, fc, fs and vs).
+/// Friction of one equation: (equation, fc, fs and vs).
 pub type FrictionArg = (usize, [MonomialArg; 3]);
 
-/// Friction whose numbers may be free.
+/// Friction laws with free parameters.
 pub fn free_laws(frictions: List<FrictionArg>) -> Vec<(usize, FreeLaw)> {
     let law = |(place, numbers): FrictionArg| {
         let [coulomb, stribeck, speed] =

@@ -1,5 +1,6 @@
-//! Bindings: the only users of pyo3 and numpy. Arrays are checked here once, then trusted; Python is detached in every
-//! call that computes.
+//! Python bindings, the only users of pyo3 and numpy.
+//!
+//! Arrays are checked here once. Python is detached during every call that computes.
 
 mod convert;
 mod errors;
@@ -13,7 +14,7 @@ mod virtual_arm;
 
 use pyo3::prelude::*;
 
-/// The compiled core of ftlm.
+/// Core of ftlm, compiled.
 #[pymodule]
 mod _core {
     use super::*;
@@ -62,8 +63,7 @@ mod _core {
 
     #[pymodule_init]
     fn init(module: &Bound<'_, PyModule>) -> PyResult<()> {
-        // NumPy's interface and the one that counts borrows are found when they are first used, and would panic where a
-        // Ctrl-C arrives just then.
+        // NumPy's C API and its borrow checker are imported on first use, and would panic on a Ctrl-C at that moment.
         module.py().import("numpy")?;
         crate::python::errors::attached(|| {
             drop(numpy::PyArrayMethods::readonly(&numpy::PyArray1::<f64>::zeros(module.py(), 0, false)));
@@ -73,7 +73,7 @@ mod _core {
         module.add("SIMD", simd())
     }
 
-    /// The widest vector unit that this processor offers.
+    /// Widest vector unit of this processor.
     fn simd() -> &'static str {
         #[cfg(target_arch = "x86_64")]
         {

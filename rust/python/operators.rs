@@ -1,6 +1,4 @@
-//! Kernels, transforms, matrices, fractional integrals and derivatives, pulse means.
-//!
-//! Factors of tall matrices, given by their columns as rows of an array.
+//! Bindings of operators: kernels, transforms, operational matrices, fractional integrals, means, dense factors.
 
 use numpy::{PyArray1, PyArray2, PyReadonlyArray1, PyReadonlyArray2};
 use pyo3::prelude::*;

@@ -1,4 +1,4 @@
-//! Free runs, the two errors, explicit Euler, the four figures and the correlations of residuals.
+//! Bindings of simulation, output and equation error, explicit Euler, metrics and correlations.
 
 use numpy::{PyArray1, PyArray2, PyReadonlyArray1, PyReadonlyArray2};
 use pyo3::prelude::*;

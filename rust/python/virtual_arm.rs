@@ -1,4 +1,4 @@
-//! The virtual arm and the guard of both rigs.
+//! Bindings of the virtual arm and of the safety guard.
 
 use numpy::{PyArray1, PyArray2, PyReadonlyArray1, PyReadonlyArray2, PyUntypedArrayMethods};
 use pyo3::prelude::*;
@@ -11,7 +11,7 @@ use crate::rig::arm_model::{Arm, Parameters, SIGNALS};
 use crate::rig::safety_guard::{self, Fault};
 use crate::rig::virtual_arm::{Injection, Pace, Plant, Reading, Sensors};
 
-/// Columns of a row: written currents, four angles, two measured currents, delay.
+/// Number of columns of a sample: two written currents, four angles, two measured currents, delay.
 const COLUMNS: usize = 9;
 
 #[derive(FromPyObject)]
@@ -60,7 +60,7 @@ impl From<GuardSettings> for safety_guard::Settings {
     }
 }
 
-/// Limits, conversions and latched faults of one run; see the module `guard` of the core.
+/// Safety guard of one run, see module `rig::guard` of the core.
 #[pyclass(module = "ftlm._core")]
 pub struct Guard {
     inner: safety_guard::Guard,
@@ -166,7 +166,7 @@ impl From<SensorsArg> for Sensors {
     }
 }
 
-/// The physical arm behind its converters, stepped and paced; see the module `virtual_arm` of the core.
+/// Virtual arm with sensors and converters, see module `rig::virtual_arm` of the core.
 #[pyclass(module = "ftlm._core")]
 pub struct VirtualArm {
     plant: Plant,
@@ -191,7 +191,7 @@ impl VirtualArm {
         Ok(Self { plant, step, pace: None, rows: Vec::new() })
     }
 
-    /// Counts deadlines from now on, or steps as fast as possible.
+    /// Start with real-time deadlines from now on, or step as fast as possible.
     fn start(&mut self, paced: bool) -> PyResult<()> {
         attached(|| {
             self.pace = if paced { Some(Pace::new(self.step)?) } else { None };
@@ -228,7 +228,7 @@ impl VirtualArm {
         attached(|| self.plant.inject(injection))
     }
 
-    /// Samples at rest: readings go to the guard, 0 V to the output.
+    /// Run samples at rest: readings to the guard, 0 V to the output.
     #[allow(clippy::needless_pass_by_value)]
     fn rest(
         &mut self,
@@ -253,7 +253,7 @@ impl VirtualArm {
         Ok(())
     }
 
-    /// Samples under commands, until they end or a fault latches; what was read waits in `take`.
+    /// Run samples under commands, until these end or a fault latches. `take` returns the readings.
     #[allow(clippy::needless_pass_by_value)]
     fn run(
         &mut self,
@@ -279,7 +279,7 @@ impl VirtualArm {
                 let v = guard.inner.read(&reading, late);
                 let volts = guard.inner.command([command[0], command[1]]);
                 let [i1, i2] = guard.inner.written();
-                // A reading that is no number is a fault, which says so, and no measurement.
+                // A reading that is not finite raises a fault and is not recorded.
                 if v.iter().all(|x| x.is_finite()) {
                     self.rows.push([i1, i2, v[0], v[1], v[2], v[3], v[4], v[5], late]);
                 }
@@ -293,7 +293,7 @@ impl VirtualArm {
         Ok(())
     }
 
-    /// Rows since the last call, shape (n, 9).
+    /// Samples since the last call, shape (n, 9).
     fn take<'py>(&mut self, py: Python<'py>) -> PyResult<Bound<'py, PyArray2<f64>>> {
         let rows: Vec<Vec<f64>> = attached(|| Ok(std::mem::take(&mut self.rows).iter().map(|r| r.to_vec()).collect()))?;
         if rows.is_empty() {
@@ -326,7 +326,7 @@ impl VirtualArm {
         }
     }
 
-    /// Hands volts to the output stage and steps the arm under what the stage lets through.
+    /// Pass volts to the output stage and advance the arm under its result.
     fn write(&mut self, output: &Bound<'_, PyAny>, volts: [f64; 2]) -> PyResult<()> {
         let (through, enabled): ([f64; 2], bool) = output.call1((volts[0], volts[1]))?.extract()?;
         attached(|| {
@@ -336,7 +336,7 @@ impl VirtualArm {
     }
 }
 
-/// I^q of a signal that is linear between its samples, online through the sum of exponentials: what the arm computes.
+/// I^q of a signal that is linear between samples, online by the sum of exponentials, as the virtual arm computes it.
 #[pyfunction]
 #[allow(clippy::needless_pass_by_value)]
 pub fn fractional_memory<'py>(

@@ -1,9 +1,9 @@
-//! Truncated power series in the one-step delay: multiply, divide, solve, and the naive oracles beside them.
+//! Power series in the one-step delay, truncated: multiply, divide, solve, and naive oracles.
 //!
-//! A causal operator on pulse means is a polynomial in the delay z cut off at z^m; the fractional integral F^η is one of
-//! them. All such operators commute. Products ([`product`]) are convolutions by FFT, quotients ([`division`]) forward
-//! substitution in blocks joined by FFT products; [`solve`] solves several unknown series at once. Where all orders are
-//! whole, [`mod@running_sums`] does the same by running sums.
+//! A causal operator on pulse means is a polynomial in the delay z truncated at z^m. The fractional integral F^η is one
+//! of them. All such operators commute. Products ([`product`]) are convolutions by FFT. Quotients ([`division`]) use
+//! forward substitution in blocks that are joined by FFT products. [`system`] solves for several unknown series. If all
+//! orders are integers, [`recursion`] uses running sums.
 //!
 //! ```
 //! # fn main() -> ftlm::error::Result<()> {

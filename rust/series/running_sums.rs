@@ -1,21 +1,21 @@
-//! Systems of integrals of whole order, solved by running sums instead of transforms: O(n² K) a term.
+//! Systems of integrals of integer order by running sums instead of transforms: O(n² K) a term.
 //!
-//! In pulse means I^η of whole order is h^η/(η+1)!·A(z)/(1−z)^η with an Eulerian polynomial A of degree η. Written in
-//! powers of 1−z it is a sum of running sums Q^l, Q = 1/(1−z), l = 0 … η, so that a system of such integrals is
-//! y = G₀ + Q(G₁ + Q(G₂ + …)), each G_l linear in the unknowns and in what drives them: one state for each sum. The sums
-//! stay as small as the motion is, which a difference equation in y alone does not.
+//! In pulse means I^η of integer order is h^η/(η+1)!·A(z)/(1−z)^η with an Eulerian polynomial A of degree η. In powers
+//! of 1−z it is a combination of running sums Q^l, Q = 1/(1−z), l = 0 … η. A system of such integrals is thus y = G₀ +
+//! Q(G₁ + Q(G₂ + …)), each G_l linear in the unknowns and the inputs: one state for each sum. The sums stay as small as
+//! the motion, unlike the terms of a difference equation in y alone.
 
 use crate::error::{check_length, Error, Result};
 use crate::linalg::small;
 use crate::simd::{widest, Kernel};
 
-/// Highest order of an integral: beyond it transforms are as good.
+/// Highest order of an integral. Transforms are as fast for higher orders.
 pub const MAX_SUMS: usize = 6;
 
-/// Right-hand sides that are solved for side by side: each alone waits for its own last term.
+/// Right-hand sides solved side by side. A single one would wait for the latency of its last term.
 pub const ABREAST: usize = 4;
 
-/// Terms at a time, so that what drives them stays near.
+/// Terms of one chunk, so that its inputs stay in the cache.
 const BLOCK: usize = 256;
 
 /// Weights of the running sums Q^0 … Q^η in I^η of pulse means.
@@ -23,7 +23,7 @@ const BLOCK: usize = 256;
 /// By Frobenius' identity they are h^η/(η+1)!·(−1)^{η−l}·(l+1)!·S(η+1, l+1), S Stirling's numbers of the second kind.
 ///
 /// ```
-/// // I^1 of a pulse: half of it within itself, all of it in every later one.
+/// // I^1 of a pulse: half of it within the pulse, all of it in every later one.
 /// assert_eq!(ftlm::series::running_sums::running_sums(1, 0.1), [-0.05, 0.1]);
 /// ```
 #[must_use]
@@ -50,34 +50,35 @@ pub fn running_sums(eta: usize, step: f64) -> Vec<f64> {
     weights
 }
 
-/// What drives one equation: `weight` times I^`order` of a series.
+/// Input of one equation: `weight` times I^`order` of a series.
 #[derive(Debug, Clone, Copy)]
 pub struct Source<'a> {
-    /// The equation.
+    /// Index of the equation.
     pub equation: usize,
-    /// Whole order of the integral.
+    /// Integer order of the integral.
     pub order: usize,
-    /// What it weighs.
+    /// Coefficient.
     pub weight: f64,
-    /// The series.
+    /// Series of the input.
     pub series: &'a [f64],
 }
 
-/// y_i = Σ c·I^η y_j + what drives, solved for any number of right-hand sides.
+/// System y_i = Σ c·I^η y_j + inputs, for any number of right-hand sides.
 #[derive(Debug, Clone)]
 pub struct Recursion {
     n: usize,
     /// Number of running sums of each equation.
     sums: usize,
     step: f64,
-    /// What each unknown adds to each sum of each equation: `[(i·(sums + 1) + l)·n + j]`.
+    /// Weight of each unknown in each sum of each equation: `[(i·(sums + 1) + l)·n + j]`.
     own: Vec<f64>,
-    /// Inverse of the matrix of leading coefficients, row by row.
+    /// Inverse of the matrix of leading coefficients, row-major.
     inverse: Vec<f64>,
 }
 
 impl Recursion {
-    /// n equations with terms (i, j, η, c): c·I^η y_j in equation i; `sums` is the highest η of them and of all sources.
+    /// System of n equations with terms (i, j, η, c): c·I^η y_j in equation i. `sums` is the highest η of terms and
+    /// sources.
     ///
     /// # Errors
     /// [`Error::LeadingZero`] where the matrix of leading coefficients is singular, [`Error::Structure`] for an order
@@ -99,13 +100,13 @@ impl Recursion {
         Ok(Self { n, sums, step, own, inverse: small::inverse(&leading, n)? })
     }
 
-    /// The n unknown series of m terms that each list of sources drives.
+    /// Response of the n unknown series of m terms to each list of sources.
     ///
     /// # Errors
     /// [`Error::Length`] for a source shorter than m.
     ///
     /// # Panics
-    /// Where a source names an equation that is not there or an order above the sums.
+    /// If a source names an equation that does not exist or an order above the sums.
     pub fn solve(&self, m: usize, lists: &[Vec<Source>]) -> Result<Vec<Vec<Vec<f64>>>> {
         for source in lists.iter().flatten() {
             if source.series.len() < m {
@@ -128,7 +129,7 @@ impl Recursion {
         Ok(solved.map(|answer| vec![answer]).collect())
     }
 
-    /// One unknown under up to [`ABREAST`] right-hand sides; L is one more than there are sums.
+    /// One unknown for up to [`RIGHT_SIDE_LANES`] right-hand sides. L is the number of sums plus one.
     fn abreast<const L: usize>(&self, m: usize, lists: &[Vec<Source>]) -> Vec<Vec<f64>> {
         let mut own = [0.0; L];
         own.copy_from_slice(&self.own[..L]);
@@ -159,14 +160,14 @@ impl Recursion {
         out
     }
 
-    /// What a source adds to each sum, by its series.
+    /// Weights of a source in each sum.
     fn weights(&self, source: &Source) -> Vec<f64> {
         running_sums(source.order, self.step).iter().map(|w| w * source.weight).collect()
     }
 
     fn many(&self, m: usize, sources: &[Source]) -> Vec<Vec<f64>> {
         let (n, stride) = (self.n, self.sums + 1);
-        // Term by term, then equation by equation, what drives each sum.
+        // Inputs of each sum, term by term, then equation by equation.
         let mut drive = vec![0.0; m * n * stride];
         for source in sources {
             let weights = self.weights(source);
@@ -200,7 +201,7 @@ impl Recursion {
     }
 }
 
-/// One unknown under [`ABREAST`] right-hand sides over a block of terms.
+/// One unknown for [`RIGHT_SIDE_LANES`] right-hand sides over a chunk of terms.
 struct Block<'a, const L: usize> {
     own: &'a [f64; L],
     inverse: f64,

@@ -1,11 +1,11 @@
-//! All equations that drive each other together (Jakeman and Young, Refined instrumental
+//! Joint refinement of coupled equations by instrumental variables (Jakeman and Young, Refined instrumental
 //! variable methods of recursive time-series analysis, part II, Int. J. Control 29, 1979, 621-644).
 //!
-//! One equation filtered by its own 1/D̂ is left with the noise of every other measured output in it. Filtered by the
-//! inverse of the whole matrix Â of the equations, the errors of all of them become the noise of the outputs, white and
-//! separate, whose levels weigh the sum. With simulated outputs in its place, the same filter makes the instrument of a
-//! term what a change of its coefficient does to the free run, so where the steps stand still the weighted output error
-//! does, too.
+//! An equation filtered by its own 1/D̂ still contains the noise of the other measured outputs. Filtering by the
+//! inverse of the matrix Â of all equations turns the equation errors into the output noise, which is white and
+//! independent. The residuals are weighted by its variances. The same filter on simulated outputs makes each instrument
+//! the sensitivity of the simulation to that coefficient. A fixed point of the iteration is therefore a stationary
+//! point of the weighted output error.
 
 use super::prefilter::grows;
 use super::solution::{
@@ -18,56 +18,56 @@ use crate::regressors::Record;
 use crate::series::{Buffers, Kernel};
 use crate::series_system::System;
 
-/// A step that raises the cost is halved, at most so many times in a row.
+/// Maximum number of halvings of a step that increases the cost.
 const SHORTENED: usize = 8;
 
-/// A rise of the cost that says nothing: the odds of two sets of coefficients differ by a millionth.
+/// Increase of the cost (−2 log-likelihood) that counts as none: the likelihood ratio differs from 1 by a millionth.
 const EQUAL: f64 = 1e-6;
 
-/// What is refined: equations, known coefficients, exponents and omissions of their initial terms.
+/// Equations to refine: structures, fixed coefficients, exponents and exclusions of their initial terms.
 pub struct Problem<'a> {
-    /// As measured.
+    /// Records as measured.
     pub records: &'a [Record],
-    /// With clean substitutes for measured outputs that no equation has.
+    /// Records with noise-free substitutes for measured outputs without an equation.
     pub clean: &'a [Record],
     /// The equations.
     pub structures: &'a [Structure],
-    /// Known coefficients, per equation.
+    /// Values of the fixed coefficients, per equation; None if free.
     pub fixed: &'a [Vec<Option<f64>>],
     /// Exponents of initial terms, per equation.
     pub exponents: &'a [Vec<f64>],
-    /// (record, position) of initial terms left out, per equation.
+    /// (record, position) of excluded initial terms, per equation.
     pub dropped: &'a [Dropped],
 }
 
-/// Where the steps ended.
+/// Joint estimate of all equations.
 #[derive(Debug, Clone, PartialEq)]
 pub struct Ended {
     /// Per equation: coefficients of its terms, then of its initial terms record by record.
     pub solutions: Vec<Solution>,
-    /// Per equation: covariance of its free coefficients, row-major, robust to coloured residuals.
+    /// Per equation: covariance of its free coefficients, row-major, robust to colored residuals.
     pub covariances: Vec<Vec<f64>>,
-    /// Σ n ln(Σ ε²/n) over outputs: minus twice the logarithm of their likelihood, noise levels unknown.
+    /// Σ n ln(Σ ε²/n) over outputs: −2 log-likelihood with unknown noise variances.
     pub cost: f64,
-    /// Steps made.
+    /// Number of iterations.
     pub iterations: usize,
-    /// Whether the last step moved nothing any more.
+    /// True if the last step changed no coefficient by more than the tolerance.
     pub converged: bool,
 }
 
-/// An unknown: equation, and its term or its (record, position) of an initial term.
+/// Free coefficient: (equation, term), or (equation, record, position) of an initial term.
 #[derive(Debug, Clone, Copy, PartialEq)]
 enum Unknown {
     Term(usize, usize),
     Initial(usize, usize, usize),
 }
 
-/// Coefficients of all equations, and their covariances where asked for.
+/// Coefficients of all equations, and their covariances if requested.
 type Stepped = (Vec<Solution>, Vec<Vec<f64>>);
 
-/// What one set of coefficients does on every record.
+/// Simulation of every record with one set of coefficients, and its cost.
 struct Point {
-    /// Free runs, per record and equation.
+    /// Outputs of the simulation, by record and equation.
     responses: Vec<Vec<Vec<f64>>>,
     /// Weight 1/σ² of each output.
     weights: Vec<f64>,
@@ -75,13 +75,13 @@ struct Point {
 }
 
 impl Problem<'_> {
-    /// Steps from a start until they stand still; the cost never rises but by rounding.
+    /// Iterate from an initial guess until convergence; the cost never increases except by rounding.
     ///
-    /// None where the free run of the start grows out of its output's size: nothing can be filtered by its inverse.
+    /// None if the simulation from the initial guess diverges, so that its inverse cannot be used as a filter.
     /// O(iterations · n · Σ (terms · m log m + n² m log² m)) for n equations.
     ///
     /// # Errors
-    /// [`crate::error::Error::Singular`] where the instruments of all equations together do not tell the terms apart.
+    /// [`crate::error::Error::Singular`] if the instruments do not identify the coefficients of all equations together.
     pub fn refine(&self, start: &[Solution], settings: Settings) -> Result<Option<Ended>> {
         let unknowns = self.unknowns();
         let mut solutions = start.to_vec();
@@ -132,7 +132,7 @@ impl Problem<'_> {
         out
     }
 
-    /// Free runs and their cost; None where one leaves ten times its output's size.
+    /// Simulate all records and compute the cost; None if an output exceeds ten times the measured amplitude.
     #[allow(clippy::cast_precision_loss)]
     fn point(&self, solutions: &[Solution]) -> Result<Option<Point>> {
         let equations = equations(self.structures, solutions);
@@ -154,13 +154,13 @@ impl Problem<'_> {
             responses.push(outputs);
         }
         let n = count as f64;
-        // Exact data leave rounding, which weighs as any noise.
+        // With noise-free data the residuals are rounding errors, which are weighted like noise.
         let variances: Vec<f64> = sums.iter().map(|s| (s / n).max(f64::MIN_POSITIVE)).collect();
         let cost = variances.iter().map(|v| n * libm::log(*v)).sum();
         Ok(Some(Point { responses, weights: variances.iter().map(|v| 1.0 / v).collect(), cost }))
     }
 
-    /// New coefficients of all equations and, if asked for, the covariances; None where the inverse of the matrix grows.
+    /// New coefficients of all equations, with covariances if requested; None if the inverse matrix is unstable.
     fn step(
         &self,
         solutions: &[Solution],
@@ -186,7 +186,7 @@ impl Problem<'_> {
             });
             let simulated = Record::new(record.step(), simulated.collect(), None)?;
             let mut buffers = Buffers::default();
-            // Of every output, one after the other, in units of its noise.
+            // Response of every output in sequence, in units of the noise standard deviation of the output.
             let mut through = |i: usize, signal: &[f64]| -> Vec<f64> {
                 let spectrum = Kernel::new(signal);
                 let mut out = vec![0.0; n * m];

@@ -1,17 +1,22 @@
-//! What the estimators by instrumental variables share: settings, solutions, sums of products, long-run covariances.
+//! Instrumental-variable estimation at given orders (refined IV, Young and Jakeman; fractional orders: Victor, Malti,
+//! Garnier and Oustaloup, doi:10.1016/j.automatica.2012.12.006): settings, solutions and the long-run covariance.
+//!
+//! Least squares on the equation error is biased because a measured output enters its own regressors with its noise.
+//! Instruments are free of noise: they follow from the inputs and the model alone. Coupled equations are refined one by
+//! one and then together.
 
 use crate::equation::{Equation, Structure};
 use crate::error::{Error, Result};
 
-/// Steps, at most: what has not stood still by then goes round.
+/// Largest number of iterations accepted: an iteration that has not converged by then cycles.
 const MOST_STEPS: usize = 1000;
 
-/// How long to iterate.
+/// Termination criteria of the iteration.
 #[derive(Debug, Clone, Copy, PartialEq)]
 pub struct Settings {
-    /// Most steps.
+    /// Maximum number of iterations.
     pub iterations: usize,
-    /// Change of every coefficient, relative to its size, at which the steps end.
+    /// Relative change of every coefficient below which the iteration has converged.
     pub tolerance: f64,
 }
 
@@ -22,10 +27,10 @@ impl Default for Settings {
 }
 
 impl Settings {
-    /// Refuses settings with which no iteration ends.
+    /// Check that the settings are in range.
     ///
     /// # Errors
-    /// [`Error::OutOfRange`] for more than a thousand steps, and for a tolerance that is negative or no number.
+    /// [`Error::OutOfRange`] for more than 1000 iterations, and for a tolerance that is negative or not finite.
     ///
     /// ```
     /// # use ftlm::estimation::instrumental_variables::solution::Settings;
@@ -50,19 +55,19 @@ impl Settings {
     }
 }
 
-/// Coefficients of terms, then of the initial terms record by record.
+/// Coefficients of the terms, then of the initial terms record by record.
 pub type Solution = Vec<f64>;
 
-/// (record, position) of the initial terms left out.
+/// (record, position) of the excluded initial terms.
 pub type Dropped = Vec<(usize, usize)>;
 
-/// The equations that solutions make.
+/// Return the equations with the coefficients of the solutions.
 pub(super) fn equations(structures: &[Structure], solutions: &[Solution]) -> Vec<Equation> {
     let pairs = structures.iter().zip(solutions);
     pairs.map(|(s, x)| Equation { structure: s.clone(), coefficients: x[..s.terms.len()].to_vec() }).collect()
 }
 
-/// (exponent, coefficient) of the initial terms of record r that solutions hold, per equation.
+/// (exponent, coefficient) of the initial terms of record r, per equation.
 pub(super) fn initial_terms(
     r: usize,
     structures: &[Structure],
@@ -80,13 +85,14 @@ pub(super) fn initial_terms(
         .collect()
 }
 
+/// Return true if every coefficient changed by at most `tolerance` relative to its magnitude.
 pub(super) fn unmoved(before: &[f64], after: &[f64], terms: usize, tolerance: f64) -> bool {
     let largest = after[..terms].iter().fold(0.0_f64, |a, v| a.max(v.abs()));
     before[..terms].iter().zip(after).all(|(a, b)| (a - b).abs() <= tolerance * b.abs().max(1e-9 * largest))
 }
 
 pub(super) fn dot(a: &[f64], b: &[f64]) -> f64 {
-    // Four sums: one alone would wait for itself.
+    // Four independent sums: a single one is limited by the latency of the addition.
     let mut sums = [0.0; 4];
     let (left, right) = (a.chunks_exact(4), b.chunks_exact(4));
     let tail: f64 = left.remainder().iter().zip(right.remainder()).map(|(x, y)| x * y).sum();
@@ -98,7 +104,7 @@ pub(super) fn dot(a: &[f64], b: &[f64]) -> f64 {
     (sums[0] + sums[1]) + (sums[2] + sums[3]) + tail
 }
 
-/// The instruments of one record: columns, and the unknown that each belongs to.
+/// Instruments of one record: columns, and the index of the free coefficient of each.
 pub(super) struct Instruments {
     pub(super) columns: Vec<Vec<f64>>,
     pub(super) places: Vec<usize>,
@@ -110,23 +116,24 @@ impl Instruments {
     }
 }
 
-/// Less of an instrument than this outside the span of those before it is rounding.
+/// Relative norm of an instrument outside the span of the previous ones below which it is linearly dependent.
 const SPANNED: f64 = 1e-13;
 
-/// Makes the instruments of all records orthonormal, a column over all records for each of k unknowns: the factor Q of a
-/// QR factorisation, by Gram and Schmidt's process, done twice where it loses digits. They span what they did, so they
-/// give the same estimate; their products with the regressors are as well conditioned as these, where those of the
-/// instruments themselves are as badly as the square of that.
+/// Orthonormalize the instruments of all records, one column over all records for each of k free coefficients.
 ///
-/// O(records · k² m), where k counts the unknowns that a record has.
+/// The result is the factor Q of a QR factorization, by the Gram–Schmidt process with reorthogonalization. The span is
+/// unchanged, so the estimate is the same. The products of Q with the regressors have the condition number of the
+/// regressors, the products of the instruments themselves have its square.
+///
+/// O(records · k² m), where k counts the free coefficients of one record.
 ///
 /// # Errors
-/// [`Error::Singular`] where one depends on those before it.
+/// [`Error::Singular`] if a column depends linearly on the previous ones.
 pub(super) fn orthonormal(records: &mut [Instruments], k: usize) -> Result<()> {
     let mut held = vec![0; k];
     records.iter().flat_map(|r| &r.places).for_each(|&place| held[place] += 1);
     let singular = |place| Error::Singular { index: place, count: k };
-    // Unknowns of one record alone come first: those of different records are orthogonal as they are.
+    // Coefficients of a single record come first: columns of different records are already orthogonal.
     for record in &mut *records {
         for at in (0..record.places.len()).filter(|&at| held[record.places[at]] == 1) {
             let mut column = [std::mem::take(&mut record.columns[at])];
@@ -143,7 +150,7 @@ pub(super) fn orthonormal(records: &mut [Instruments], k: usize) -> Result<()> {
     }
     let shared: Vec<usize> = (0..k).filter(|&place| held[place] > 1).collect();
     for (n, &place) in shared.iter().enumerate() {
-        // An unknown that not all records have is nothing in the others.
+        // The column of a coefficient is empty in records without it.
         let mut pieces: Vec<Vec<f64>> = records.iter().map(|r| r.of(place).cloned().unwrap_or_default()).collect();
         let spanned = twice(&mut pieces, |pieces| {
             for (piece, record) in pieces.iter_mut().zip(&*records).filter(|(piece, _)| !piece.is_empty()) {
@@ -174,21 +181,22 @@ pub(super) fn orthonormal(records: &mut [Instruments], k: usize) -> Result<()> {
     Ok(())
 }
 
-/// Takes so much of a direction out of a column, all of it where not told.
+/// Subtract `along` times a unit direction from a column; by default its whole projection.
 fn remove(column: &mut [f64], direction: &[f64], along: Option<f64>) {
     let along = along.unwrap_or_else(|| dot(direction, column));
     column.iter_mut().zip(direction).for_each(|(v, q)| *v -= along * q);
 }
 
-/// Takes out of a column what those before it span, once more where little was left, and scales what is left to unit size;
-/// false where that is rounding.
+/// Orthogonalize a column by `clear`, twice if its norm drops by half, and normalize it.
+///
+/// Return false if the remainder is at rounding level.
 fn twice(pieces: &mut [Vec<f64>], clear: impl Fn(&mut [Vec<f64>])) -> bool {
     let whole = size(pieces);
     let (mut before, mut left) = (whole, whole);
     for _ in 0..2 {
         clear(pieces);
         left = size(pieces);
-        // What rounding left of the others weighs as much more as the column has shrunk.
+        // Rounding errors along the previous columns grow by the factor by which the column has shrunk.
         if left > 0.5 * before {
             break;
         }
@@ -203,8 +211,8 @@ fn size(pieces: &[Vec<f64>]) -> f64 {
     pieces.iter().map(|p| dot(p, p)).sum::<f64>().sqrt()
 }
 
-/// Adds the long-run covariance of the sums of scores to a k × k matrix, with Bartlett weights
-/// (doi:10.2307/1913610): what the filter leaves behind is not white where other measured outputs enter the equation.
+/// Add the long-run covariance of the summed scores to a k × k matrix, with Bartlett weights
+/// (doi:10.2307/1913610). Filtered residuals are not white if other measured outputs enter the equation.
 #[allow(clippy::cast_precision_loss, clippy::cast_possible_truncation, clippy::cast_sign_loss)]
 pub(super) fn long_run(scores: &[Vec<f64>], places: &[usize], meat: &mut [f64], k: usize) {
     let m = scores.first().map_or(0, Vec::len);

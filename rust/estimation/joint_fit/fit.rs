@@ -1,4 +1,4 @@
-//! One call from a structure, its runs and settings to a fit: starts, their race, weights, grids, the limit and its covariance.
+//! Joint fit of a structure to runs: initial guesses, multistart, reweighting, step refinement and covariance.
 
 use super::multistart::{finalists, race, Course, Starts};
 use super::objective::{Grid, Weights, FINEST};
@@ -13,28 +13,29 @@ use crate::error::{Error, Result};
 use crate::parallel::Stop;
 use crate::signal::statistics::{mean, median, robust_deviation};
 
-/// Share of a fit's course at whose end the race is, and of what is left of that what each of its sweeps takes.
+/// Share of the progress of a fit that belongs to the multistart. Each sweep takes [`SWEEP_PROGRESS_SHARE`] of the
+/// rest.
 const RACED: f64 = 0.5;
 const SWEEP: f64 = 0.3;
-/// Residual that costs 1 in a coarse fit, as a share of an output's size.
+/// Residual of unit weight in a coarse fit, relative to the standard deviation of the output.
 const COARSE_SHARE: f64 = 0.01;
-/// Least noise of an output, as a share of its size, and of an optimum to go on from.
+/// Smallest noise standard deviation of an output relative to its standard deviation; smallest one of a warm start.
 const LEAST_NOISE: f64 = 1e-3;
 const TINY: f64 = 1e-300;
-/// Evaluations of each finalist on all samples.
+/// Maximum evaluations of each survivor on all samples.
 const FINAL_LAP: usize = 60;
 
-/// How large an output is, and a first guess of its noise.
+/// Standard deviation of an output, and an initial guess of its noise standard deviation.
 #[derive(Debug, Clone, Copy, PartialEq)]
 pub struct Size {
-    /// Root of the mean of its variances on all runs.
+    /// Root mean variance over all runs.
     pub size: f64,
-    /// Deviation of what is white in it.
+    /// Standard deviation of the white noise.
     pub noise: f64,
 }
 
 impl Size {
-    /// Of what was read of an output by run; what is no number was not.
+    /// Scale of an output from its samples by run; NaN marks missing samples.
     #[must_use]
     pub fn of(runs: &[Vec<f64>]) -> Self {
         let variance = |samples: &Vec<f64>| {
@@ -46,7 +47,9 @@ impl Size {
         Self::guessed(size, runs)
     }
 
-    /// From its size and what was read of it by run: second differences tell noise, but none below a share of the size.
+    /// Scale of an output from its standard deviation and its samples by run.
+    ///
+    /// The noise is estimated from second differences, with a lower limit relative to the standard deviation.
     #[must_use]
     pub fn guessed(size: f64, runs: &[Vec<f64>]) -> Self {
         let noise = median(runs.iter().map(|samples| noise_of(samples)).collect());
@@ -54,7 +57,7 @@ impl Size {
     }
 }
 
-/// Deviation of white noise on a smooth signal, from the median of its second differences.
+/// Standard deviation of white noise on a smooth signal, from the median of its second differences.
 #[must_use]
 pub fn noise_of(samples: &[f64]) -> f64 {
     let bends = |samples: &[f64]| -> Vec<f64> {
@@ -63,71 +66,71 @@ pub fn noise_of(samples: &[f64]) -> f64 {
     };
     let mut found = bends(samples);
     if found.is_empty() {
-        // No three neighbours were read: those that were stand closest.
+        // No three neighboring samples are present: use the samples that are, in order.
         found = bends(&samples.iter().copied().filter(|v| !v.is_nan()).collect::<Vec<_>>());
     }
     robust_deviation(&found) / 6.0_f64.sqrt()
 }
 
-/// What a fit starts from.
+/// Initialization of a fit.
 #[derive(Debug, Clone)]
 pub enum Outset {
-    /// The automatic starts, or where a race of them got before, and known ones beside them.
+    /// Multistart from automatic initial guesses, or the result of an earlier one, plus given initial guesses.
     Starts {
-        /// Values of everything free, each a start.
+        /// Initial guesses, each with values of all free parameters.
         known: Vec<Vec<f64>>,
-        /// Where a race got.
+        /// Candidates of an earlier multistart.
         raced: Option<Vec<Runner>>,
     },
-    /// Values of everything free, the only start.
+    /// A single initial guess: values of all free parameters.
     Given(Vec<f64>),
-    /// A fit of the same structure to nearly the same runs: on its grid and with its weights.
+    /// Warm start from a fit of the same structure to similar runs, with its grid and weights.
     Near {
-        /// Its values of everything free.
+        /// Values of all free parameters.
         values: Vec<f64>,
-        /// Noise of each output.
+        /// Noise standard deviation of each output.
         noise: Vec<f64>,
-        /// Pulses a sample interval.
+        /// Block pulses per sampling interval.
         every: usize,
-        /// Where the race of its starts got, if there was one.
+        /// Candidates of its multistart; empty if there was none.
         raced: Vec<Runner>,
     },
 }
 
-/// How a fit is made.
+/// Settings of a fit.
 #[derive(Debug, Clone, Copy, PartialEq, Eq)]
 pub struct Settings {
-    /// What residuals cost; between starts squares decide.
+    /// Loss function of the residuals. The multistart compares sums of squares.
     pub loss: Loss,
-    /// Whether the grid is refined below the samples.
+    /// True to refine the step below the sampling interval.
     pub refine: bool,
-    /// Threads of the race; no number depends on them.
+    /// Threads of the multistart; results do not depend on it.
     pub threads: usize,
 }
 
 /// An optimum of the joint output error.
 #[derive(Debug, Clone, PartialEq)]
 pub struct JointFit {
-    /// The optimum with all that describes it.
+    /// The optimum and its statistics.
     pub finished: Finished,
-    /// Where the starts got, best first.
+    /// Candidates of the multistart, best first.
     pub reached: Vec<Runner>,
-    /// Where its free run grows, or another's would have: what was compared.
+    /// Comparison of a stable and an unstable optimum, if one was unstable.
     pub growth: Option<Growth>,
 }
 
-/// A structure on its runs, and how large its outputs are.
+/// Fit problem: parameter set, runs, initial guesses and output scales.
 #[derive(Clone, Copy)]
 pub struct Sought<'a> {
-    /// What is free.
+    /// Free parameters.
     pub free: &'a Free,
     /// The runs.
     pub source: &'a dyn Recordings,
-    /// Where its starts come from.
+    /// Source of initial guesses.
     pub starts: &'a dyn Starts,
-    /// Of each output.
+    /// Scale of each output.
     pub sizes: &'a [Size],
-    /// Whom to ask whether to go on.
+    /// Cancellation flag.
     pub stop: &'a Stop,
 }
 
@@ -139,18 +142,20 @@ impl<'a> Sought<'a> {
         Grid::new((&self.free.problem, source, self.stop), weights, sampling, false)
     }
 
-    /// Every output weighing alike: noise decides where the optimum is, not how to get near it.
+    /// Objective with equal weights of all outputs relative to their standard deviations.
+    ///
+    /// The noise levels determine the optimum, but are not needed to approach it.
     ///
     /// # Errors
-    /// Those of the source.
+    /// As the source.
     pub fn alike(&self, every: usize) -> Result<Grid<'a>> {
         self.grid(self.sizes.iter().map(|size| 1.0 / (COARSE_SHARE * size.size)).collect(), every)
     }
 
-    /// Where its starts get, best first; progress is (starts done, starts in all).
+    /// Run the multistart; return its candidates, best first. Progress is (starts done, all starts).
     ///
     /// # Errors
-    /// Those of the source, of the starts and of whoever is told; [`Error::Interrupted`].
+    /// As the source, the initial guesses and the listener; [`Error::Interrupted`].
     pub fn race(&self, threads: usize, told: &Listener<'_>) -> Result<Vec<Runner>> {
         let share = |size: &Size| (size.noise / (COARSE_SHARE * size.size)).powi(2);
         let floor = mean(&self.sizes.iter().map(share).collect::<Vec<_>>());
@@ -166,34 +171,34 @@ impl<'a> Sought<'a> {
     }
 }
 
-/// Fits a structure on its runs by output error; none where no start has a finite free run.
+/// Fit a structure to runs by output error; None if no initial guess has a finite simulation.
 ///
 /// # Errors
-/// Those of the source and the starts; [`Error::Beyond`] where squares of residuals are no numbers; what the last contender's
-/// descent ends with where none has a free run; [`Error::Interrupted`].
+/// As the source and the initial guesses; [`Error::Beyond`] if squares of residuals overflow; the error of the last
+/// survivor if no survivor can be simulated; [`Error::Interrupted`].
 ///
 /// ```
 /// # fn main() -> ftlm::error::Result<()> {
 /// use ftlm::equation::Initial;
 /// use ftlm::estimation::joint_fit::structure::{Coefficient, Equation, Order, Structure, Term};
 /// use ftlm::estimation::joint_fit::parameter_set::Free;
-/// use ftlm::estimation::joint_fit::initial_guesses::Lattices;
+/// use ftlm::estimation::joint_fit::initial_guesses::OrderGrids;
 /// use ftlm::estimation::joint_fit::fit;
 /// use ftlm::estimation::joint_fit::reweighting::Loss;
 /// use ftlm::estimation::joint_fit::fit::{Outset, Settings, Size, Sought};
 /// use ftlm::estimation::joint_fit::source::{Sampled, Signal};
 /// use ftlm::signal::block_pulse::Intersample;
 /// use ftlm::parallel::Stop;
-/// // y of D y = −2 y + 3 u in exact steps, and D^alpha y = a y + b u sought.
+/// // Data of D y = −2 y + 3 u in exact steps, fitted by D^alpha y = a y + b u.
 /// let (step, mut y) = (0.05, vec![0.0]);
 /// let u: Vec<f64> = (0..200).map(|k| if k % 40 < 20 { 1.0 } else { -1.0 }).collect();
 /// let fall = f64::exp(-2.0 * step);
 /// u.iter().for_each(|u| y.push(fall * y[y.len() - 1] + 1.5 * (1.0 - fall) * u));
 /// y.pop();
-/// let sizes = [Size::of(&[y.clone()])];
-/// let signal = |samples, between| Signal { samples, between };
+/// let sizes = [OutputScale::from_runs(&[y.clone()])];
+/// let signal = |samples, intersample| Signal { samples, intersample };
 /// let run = vec![signal(y, Intersample::Linear), signal(u, Intersample::Hold)];
-/// let runs = Sampled::new(step, vec![0], vec![run])?;
+/// let runs = SampledRuns::new(step, vec![0], vec![run])?;
 /// let term = |signal, name: &str| {
 ///     let coefficient = Coefficient::Free(name.into());
 ///     Term { signal, order: Order::number(0.0), coefficient, factor: 1.0 }
@@ -201,14 +206,14 @@ impl<'a> Sought<'a> {
 /// let terms = vec![term(0, "a"), term(1, "b")];
 /// let sought = Equation { output: 0, order: Order::free("alpha"), terms, friction: None };
 /// let signals = vec!["y".into(), "u".into()];
-/// let free = Free::of(Structure::new(signals, vec![sought], Initial::Rest))?;
+/// let free = ParameterSet::from_structure(Structure::new(signals, vec![sought], Initial::Rest))?;
 /// let stop = Stop::default();
-/// let starts = Lattices::new(&runs, 1, 1 << 28, &stop);
-/// let asked = Sought { free: &free, source: &runs, starts: &starts, sizes: &sizes, stop: &stop };
+/// let starts = OrderGrids::new(&runs, 1, 1 << 28, &stop);
+/// let problem = FitProblem { free: &free, source: &runs, starts: &starts, sizes: &sizes, stop: &stop };
 /// let settings = Settings { loss: Loss::Squares, refine: true, threads: 1 };
-/// let outset = Outset::Starts { known: Vec::new(), raced: None };
-/// let found = fit::fit(asked, outset, settings, &|_, _| Ok(()))?.expect("a start has a free run");
-/// let [alpha, a, b] = found.finished.estimate[..] else { panic!("three numbers") };
+/// let initialization = Initialization::Multistart { known: Vec::new(), candidates: None };
+/// let found = fit::fit(problem, initialization, settings, &|_, _| Ok(()))?.expect("a finite simulation");
+/// let [alpha, a, b] = found.finished.estimate[..] else { panic!("three parameters") };
 /// assert!((alpha - 1.0).abs() < 1e-3 && (a + 2.0).abs() < 1e-2 && (b - 3.0).abs() < 1e-2);
 /// # Ok(())
 /// # }
@@ -241,7 +246,7 @@ pub fn fit(sought: Sought<'_>, outset: Outset, settings: Settings, told: &Listen
     let Some(first) = contenders.first() else { return Ok(None) };
     pace.at(RACED)?;
     let mut grid = sought.grid(sought.sizes.iter().map(|size| 1.0 / size.noise).collect(), 1)?;
-    // Where a step passes faster than the samples see, a grid as coarse as the samples has an optimum of its own.
+    // If a response is faster than the sampling interval, a grid of that step has a spurious optimum.
     while grid.sampling.every < FINEST {
         let finer = grid.finer()?;
         if !grid.noticed(&first.attempt.place, &finer)? {
@@ -251,7 +256,7 @@ pub fn fit(sought: Sought<'_>, outset: Outset, settings: Settings, told: &Listen
     }
     let mut best = winner(free, &contenders, &sought.alike(grid.sampling.every)?)?;
     if sought.sizes.len() > 1 {
-        // Of one output the noise does not move the optimum.
+        // With a single output the noise level does not move the optimum.
         let place = &best.attempt.place;
         best = best.moved(grid.descend_in(&free.turned(place, false, &[]), place, LAST_LAP)?);
     }
@@ -263,10 +268,10 @@ pub fn fit(sought: Sought<'_>, outset: Outset, settings: Settings, told: &Listen
     Ok(Some(found))
 }
 
-/// What the start of a fit that was given one is called.
+/// Origin label of a given initial guess.
 const GIVEN: &str = "given start";
 
-/// What a fit comes to whose weights have settled: one that dies away where it may, on grids fine enough.
+/// Finish a fit with converged weights: prefer a stable optimum, refine the step and compute statistics.
 fn ended(free: &Free, best: Runner, grid: Grid<'_>, reached: Vec<Runner>, settings: Settings) -> Result<JointFit> {
     let (mut best, mut grid, growth) = steadied(free, best, grid, &reached)?;
     if growth.is_some_and(|growth| !growth.kept) {
@@ -281,13 +286,13 @@ fn ended(free: &Free, best: Runner, grid: Grid<'_>, reached: Vec<Runner>, settin
     Ok(JointFit { finished: optimum.finished(), reached, growth })
 }
 
-/// A runner on a grid whose weights have settled.
+/// Fit a candidate with iterated weights until they converge.
 fn weighed<'a>(runner: &Runner, grid: Grid<'a>, loss: Loss) -> Result<(Runner, Grid<'a>)> {
     let (attempt, grid) = settled(&runner.attempt.place, grid, loss)?;
     Ok((runner.moved(attempt), grid))
 }
 
-/// The best of the contenders on all samples, every output still weighing alike.
+/// Best survivor on all samples, with equal weights of all outputs.
 fn winner(free: &Free, contenders: &[Runner], near: &Grid<'_>) -> Result<Runner> {
     let mut ends = Vec::new();
     let mut last = None;
@@ -296,7 +301,7 @@ fn winner(free: &Free, contenders: &[Runner], near: &Grid<'_>) -> Result<Runner>
         match near.descend_in(&free.turned(place, false, &[]), place, FINAL_LAP) {
             Ok(attempt) => ends.push(runner.moved(attempt)),
             Err(Error::Interrupted) => return Err(Error::Interrupted),
-            // No finite free run on this grid; the others have one.
+            // No finite simulation on this grid; other survivors may have one.
             Err(error) => last = Some(error),
         }
     }
@@ -307,7 +312,7 @@ fn winner(free: &Free, contenders: &[Runner], near: &Grid<'_>) -> Result<Runner>
         _ => near.finer()?.ranked(&attempts)?[0],
     };
     let best = &ends[first];
-    // In logarithms it had its lap.
+    // The fit in logarithmic coordinates is done; repeat it in plain ones.
     let place = &best.attempt.place;
     let plain = near.descend_in(&free.turned(place, true, &[]), place, FINAL_LAP)?;
     Ok(if plain.cost <= best.attempt.cost { best.moved(plain) } else { best.clone() })

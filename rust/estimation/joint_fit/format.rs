@@ -1,7 +1,6 @@
-//! Numbers in words, as few digits as tell them apart.
+//! Formatting of numbers with few significant digits.
 
-/// A number in so many significant digits without zeros behind them, by a power of ten where it is large or small: what
-/// C and Python call the format `g`.
+/// Format a number like `g` in C and Python: significant digits without trailing zeros, with an exponent if needed.
 pub(crate) fn short(value: f64, digits: usize) -> String {
     if !value.is_finite() {
         return if value.is_nan() {
@@ -30,7 +29,7 @@ pub(crate) fn short(value: f64, digits: usize) -> String {
     }
 }
 
-/// Without zeros behind the point, and without a point before nothing.
+/// Remove trailing zeros after the decimal point, and a trailing point.
 fn trimmed(text: &str) -> &str {
     if text.contains('.') {
         text.trim_end_matches('0').trim_end_matches('.')

@@ -1,12 +1,10 @@
-//! A joint fit of all equations on all runs by output error: one call from a structure, its runs and settings to an optimum
-//! with its covariance.
+//! Joint fit of all equations to all runs by output error, from a structure to an optimum with its covariance.
 //!
-//! [`parameter_set::Free`] says what is free in a structure. [`initial_guesses::Lattices`] finds where to start from,
-//! [`multistart::race`] sends the starts over laps on thinned samples, [`reweighting::settled`] descends until each
-//! output weighs by its own residuals, [`stability_preference::steadied`] keeps free runs that grow only where the runs
-//! force them, and [`step_refinement::refined`] halves the step until that moves the estimate by little of its standard
-//! error, and tells the limit. [`fit::fit`] is all of it. What is compared with comes from a [`Source`], which samples
-//! runs as finely as it is asked.
+//! A `ParameterSet` lists the free parameters of a structure. Initial guesses come from coarse order grids. A
+//! multistart with successive halving optimizes them on subsampled records. Iterative reweighting then estimates the
+//! noise level of each output. An unstable optimum is kept only if it fits significantly better than a stable one.
+//! Finally the step is halved until the estimate changes by a small part of its standard error, and extrapolated to
+//! zero step. [`fit::fit`] runs all of it. The runs come from a [`Source`], which samples them at the requested step.
 
 pub mod covariance;
 pub mod fit;

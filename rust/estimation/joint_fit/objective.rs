@@ -1,4 +1,4 @@
-//! A problem on its runs, sampled so finely, and what each output weighs.
+//! Objective of a joint fit: a problem on sampled runs, with output weights and robust weights.
 
 use std::sync::Arc;
 
@@ -9,45 +9,45 @@ use crate::estimation::output_error::{Experiment, Settings};
 use crate::parallel::Stop;
 use crate::signal::statistics::{mean, robust_deviation, root_mean_square};
 
-/// A descent ends where a whole step would lower the cost by a smaller share than this.
+/// Relative cost decrease predicted for a full step below which an optimization has converged.
 pub const TOLERANCE: f64 = 1e-9;
-/// Discretisation that a fit may leave, in standard deviations of the noise.
+/// Largest acceptable discretization error, in standard deviations of the noise.
 const NOTICED: f64 = 0.3;
-/// Finest grid: pulses a sample interval.
+/// Finest grid, in block pulses per sampling interval.
 pub const FINEST: usize = 16;
 
-/// What each output weighs, 1/σ, and the shares of these weights by run and output that a robust loss leaves.
+/// Weights 1/σ of the outputs, and robust weights of the samples.
 #[derive(Debug, Clone, PartialEq)]
 pub struct Weights {
-    /// Of each output.
+    /// Weight 1/σ of each output.
     pub outputs: Vec<f64>,
-    /// Of each compared sample of each output of each run; none: all count alike.
+    /// Robust weight of each compared sample, by run and output; None for unit weights.
     pub shares: Option<Vec<Vec<Vec<f64>>>>,
 }
 
-/// A problem on its runs. On a steady one no descent goes from a free run that dies away to one that grows.
+/// Objective of a joint fit: weighted residuals of a problem on sampled runs.
 #[derive(Clone)]
 pub struct Grid<'a> {
-    /// What is free.
+    /// The optimization problem.
     pub problem: &'a Problem,
     source: &'a dyn Source,
     stop: &'a Stop,
-    /// What each output weighs.
+    /// Weights of outputs and samples.
     pub weights: Weights,
-    /// How finely the runs are sampled.
+    /// Sampling of the runs.
     pub sampling: Sampling,
-    /// Whether a free run that grows is no place to go.
+    /// True if an optimization must not go from a stable model to an unstable one.
     pub steady: bool,
-    /// What was read, by run and output, where something was not.
+    /// Mask of the present samples, by run and output; empty without missing samples.
     read: Arc<Vec<Vec<Vec<f64>>>>,
     experiments: Arc<Vec<Experiment>>,
 }
 
 impl<'a> Grid<'a> {
-    /// The runs of a source on a grid.
+    /// Objective of a problem on the runs of a source.
     ///
     /// # Errors
-    /// Those of the source; [`Error::Length`] for weights or shares of another number.
+    /// As the source; [`Error::Length`] for a wrong number of weights.
     pub fn new(
         (problem, source, stop): (&'a Problem, &'a dyn Source, &'a Stop),
         weights: Weights,
@@ -65,10 +65,10 @@ impl<'a> Grid<'a> {
         grid.reweighed(weights)
     }
 
-    /// The same runs with other weights.
+    /// Objective with other weights.
     ///
     /// # Errors
-    /// [`Error::Length`] for shares of another number.
+    /// [`Error::Length`] for a wrong number of robust weights.
     pub fn reweighed(&self, weights: Weights) -> Result<Self> {
         let mut experiments = Vec::clone(&self.experiments);
         if let Some(shares) = &weights.shares {
@@ -91,99 +91,98 @@ impl<'a> Grid<'a> {
         Ok(Self { weights, experiments: Arc::new(experiments), ..self.clone() })
     }
 
-    /// The same on half the step.
+    /// Objective on half the step.
     ///
     /// # Errors
-    /// Those of the source.
+    /// As the source.
     pub fn finer(&self) -> Result<Self> {
         let sampling = Sampling { every: 2 * self.sampling.every, ..self.sampling };
         Self::new((self.problem, self.source, self.stop), self.weights.clone(), sampling, self.steady)
     }
 
-    /// The same runs for another problem of the same outputs.
+    /// Objective of another problem with the same outputs.
     #[must_use]
     pub fn of(&self, problem: &'a Problem) -> Self {
         Self { problem, ..self.clone() }
     }
 
-    /// The same where no descent goes from a free run that dies away to one that grows.
+    /// Objective whose optimization does not go from a stable model to an unstable one.
     #[must_use]
     pub fn steadily(&self) -> Self {
         Self { steady: true, ..self.clone() }
     }
 
-    /// The runs as they are compared with.
+    /// The sampled runs.
     #[must_use]
     pub fn experiments(&self) -> &[Experiment] {
         &self.experiments
     }
 
-    /// Where the runs come from.
+    /// Source of the runs.
     #[must_use]
     pub fn source(&self) -> &'a dyn Source {
         self.source
     }
 
-    /// Whom to ask whether to go on.
+    /// Cancellation flag.
     #[must_use]
     pub fn stop(&self) -> &'a Stop {
         self.stop
     }
 
-    /// The unit of time of the runs.
+    /// Time scaling of the problem on these runs.
     #[must_use]
     pub fn clock(&self) -> super::parameter_set::Clock {
         super::parameter_set::Clock::of(self.problem, &self.source.spans())
     }
 
-    /// Levenberg–Marquardt from a place.
+    /// Minimize the cost from an iterate by Levenberg–Marquardt.
     ///
     /// # Errors
-    /// See [`Problem::descend`].
+    /// As [`Problem::minimize`].
     pub fn descend(&self, start: &Place, evaluations: usize) -> Result<Attempt> {
         let settings = Settings { evaluations, tolerance: TOLERANCE };
         self.problem.descend(&self.experiments, start, settings, self.steady, self.stop)
     }
 
-    /// The same in the coordinates of a problem turned towards a start, see [`super::parameter_set::Free::turned`].
+    /// Minimize the cost in the coordinates of another problem, see `ParameterSet::problem_at`.
     ///
     /// # Errors
-    /// See [`Problem::descend`].
+    /// As [`Problem::minimize`].
     pub fn descend_in(&self, turned: &Problem, start: &Place, evaluations: usize) -> Result<Attempt> {
         let settings = Settings { evaluations, tolerance: TOLERANCE };
         turned.descend(&self.experiments, start, settings, self.steady, self.stop)
     }
 
-    /// Whether halving the step moves the simulated samples by a share of the residuals that a fit would notice.
+    /// True if halving the step changes the simulated samples significantly relative to the residuals.
     ///
-    /// What is left over is noise at least; of a structure that is not all of the machine's physics it is more.
+    /// The residuals contain at least the noise, and the model error of an incomplete structure.
     ///
     /// # Errors
-    /// Those of the source, [`Error::Interrupted`].
+    /// As the source; [`Error::Interrupted`].
     pub fn matters(&self, place: &Place) -> Result<bool> {
         self.noticed(place, &self.finer()?)
     }
 
-    /// The same, half the step at hand.
+    /// True if the simulated samples differ significantly from those on the given finer grid.
     ///
     /// # Errors
     /// [`Error::Interrupted`].
     pub fn noticed(&self, place: &Place, finer: &Self) -> Result<bool> {
         let (Some(here), Some(there)) = (self.evaluated(place)?, finer.evaluated(place)?) else {
-            // Finite on one grid and not on the other: it matters.
+            // The simulation is finite on one grid only: the difference is significant.
             return Ok(true);
         };
         let moved: Vec<f64> = there.residuals.iter().zip(&here.residuals).map(|(a, b)| (a - b).powi(2)).collect();
         let left = mean(&there.residuals.iter().map(|e| e * e).collect::<Vec<_>>()).max(1.0);
-        // Squares beyond the numbers belong to a free run that one of the grids does not carry.
+        // Overflow of the squares means that the simulation diverges on one of the grids.
         Ok(!left.is_finite() || mean(&moved) > NOTICED * NOTICED * left)
     }
 
-    /// Places of attempts in the order of their cost on the grid that they come from or on this finer one, whichever is
-    /// the larger.
+    /// Indices of results, sorted by the larger of their costs on their own grid and on this finer one.
     ///
-    /// The pulse scheme of a stiff equation has a mode that alternates from pulse to pulse. A fit may use it to follow
-    /// noise, at the cost of a free run that no other grid has.
+    /// The pulse scheme of a stiff equation has a mode that alternates from pulse to pulse. A fit can use this mode to
+    /// follow noise, but its simulation is not reproduced on any other grid.
     ///
     /// # Errors
     /// [`Error::Interrupted`].
@@ -203,7 +202,7 @@ impl<'a> Grid<'a> {
         Ok(order)
     }
 
-    /// A place with its residuals and its cost on this grid, without derivatives; none where it has no finite free run.
+    /// Residuals and cost of an iterate, without derivatives; None if its simulation is not finite.
     ///
     /// # Errors
     /// [`Error::Interrupted`].
@@ -215,13 +214,13 @@ impl<'a> Grid<'a> {
         }
     }
 
-    /// Shares with which the compared samples count, by run and output; none: all count alike.
+    /// Weights of the compared samples, by run and output; None for unit weights.
     fn shares(&self) -> impl Iterator<Item = (&Experiment, usize, Option<&[f64]>)> {
         let outputs = self.problem.outputs.len();
         self.experiments.iter().flat_map(move |e| (0..outputs).map(move |i| (e, i, e.shares.get(i).map(Vec::as_slice))))
     }
 
-    /// Residuals of an attempt over the noise by run and output, whatever their shares; not a number where none was read.
+    /// Residuals in units of the noise by run and output, without robust weights; NaN for missing samples.
     #[must_use]
     pub fn residuals(&self, attempt: &Attempt) -> Vec<Vec<Vec<f64>>> {
         let outputs = self.problem.outputs.len();
@@ -245,7 +244,7 @@ impl<'a> Grid<'a> {
         parts
     }
 
-    /// Share of every residual, as they are strung together.
+    /// Weight of every residual, in the order of the residual vector.
     #[must_use]
     pub fn every_share(&self) -> Vec<f64> {
         let of = |(experiment, _, shares): (&Experiment, usize, Option<&[f64]>)| {
@@ -254,7 +253,7 @@ impl<'a> Grid<'a> {
         self.shares().flat_map(of).collect()
     }
 
-    /// Weighted residuals that are there by output, all runs one after another.
+    /// Residuals of the present samples by output, in units of the noise, all runs concatenated.
     #[must_use]
     pub fn pooled(&self, attempt: &Attempt) -> Vec<Vec<f64>> {
         let parts = self.residuals(attempt);
@@ -262,13 +261,15 @@ impl<'a> Grid<'a> {
         (0..self.problem.outputs.len()).map(of).collect()
     }
 
-    /// Root mean square of the weighted residuals by output, over all runs; infinite beyond the numbers.
+    /// Root mean square of the weighted residuals by output, over all runs; infinite on overflow.
     #[must_use]
     pub fn levels(&self, attempt: &Attempt) -> Vec<f64> {
         self.pooled(attempt).iter().map(|e| root_mean_square(e)).collect()
     }
 
-    /// Deviation of the usual residuals by output, in units of the weights; of all where half of them are none.
+    /// Robust standard deviation of the residuals by output, in units of the weights.
+    ///
+    /// If more than half of the residuals are zero, the root mean square of all.
     #[must_use]
     pub fn scales(&self, attempt: &Attempt) -> Vec<f64> {
         let of = |e: &Vec<f64>| match robust_deviation(e) {

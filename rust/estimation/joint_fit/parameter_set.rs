@@ -1,8 +1,6 @@
-//! Everything that is free in a structure, with bounds and coordinates.
+//! Parameter set of a joint fit: free parameters with bounds, coordinates and time scaling.
 //!
-//! Numbers of a fit in a unit of time of the runs' own, so that nothing hangs on the unit in which time is told.
-//!
-//! A coefficient before D^ν y beside D^α y is a time to the power of −(α − ν), which free orders change.
+//! A coefficient of D^ν y in an equation for D^α y has the unit time^−(α − ν), which changes with the free orders.
 
 use std::collections::BTreeMap;
 
@@ -16,38 +14,38 @@ use crate::fractional::kernels::MAX_ORDER;
 use crate::friction::FreeLaw;
 use crate::signal::statistics::median;
 
-/// Highest order that a fit tries of itself, where the structure holds none above it.
+/// Default upper bound of free orders, unless the structure contains a higher order.
 pub const SEARCHED_ORDER: f64 = 3.0;
-/// Own bounds of highest orders where the structure gives none.
+/// Default bounds of the highest orders.
 pub const ALPHA_BOUNDS: (f64, f64) = (0.05, SEARCHED_ORDER);
-/// The same beside friction.
+/// Default bounds of the highest orders of equations with friction.
 const FRICTION_BOUNDS: (f64, f64) = (1.001, 2.0);
-/// Least distance of a ratio from what it exceeds, and its largest value, where equations tell it; and where none does.
+/// Ratios estimated from the equations lie at least this far above their lower bound, and below [`MAX_RATIO`].
+/// [`DEFAULT_RATIO_EXCESS`] above the lower bound is the initial guess if no equation determines the ratio.
 const LEAST_RATIO: f64 = 0.05;
 const LARGEST_RATIO: f64 = 20.0;
 const USUAL_RATIO: f64 = 0.5;
 
-/// A structure, its initial terms decided, and what is free in it: orders are affine in free ones, coefficients products of
-/// free ones.
+/// Set of free parameters of a structure: orders are affine in the free orders, coefficients are products of free ones.
 #[derive(Debug, Clone, PartialEq)]
 pub struct Free {
     /// The structure.
     pub structure: Structure,
     /// Names of the free orders.
     pub orders: Vec<String>,
-    /// Names of the free coefficients, those of a law among them.
+    /// Names of the free coefficients, including the factors of laws.
     pub coefficients: Vec<String>,
-    /// Coefficients that a law gives.
+    /// Coefficients determined by a law.
     pub products: Vec<Law>,
-    /// As descents take it.
+    /// The optimization problem.
     pub problem: Problem,
 }
 
 impl Free {
-    /// What is free in a structure.
+    /// Parameter set of a structure.
     ///
     /// # Errors
-    /// Those of [`Structure::check`] and of [`Problem::new`].
+    /// As [`Structure::check`] and [`Problem::new`].
     pub fn of(structure: Structure) -> Result<Self> {
         structure.check()?;
         let named = structure.coefficient_names();
@@ -102,26 +100,28 @@ impl Free {
         Ok(Self { orders, coefficients, products, problem, structure })
     }
 
-    /// Least and largest value of each free order.
+    /// Lower and upper bound of each free order.
     #[must_use]
     pub fn bounds(&self) -> &[(f64, f64)] {
         &self.problem.model.order_bounds
     }
 
-    /// Whether signals are compared or followed through friction.
+    /// True if an equation has friction.
     #[must_use]
     pub fn has_friction(&self) -> bool {
         !self.problem.frictions.is_empty()
     }
 
-    /// Everything that is free: orders, coefficients, then numbers of inputs.
+    /// Names of all free parameters: orders, coefficients, then input parameters.
     pub fn names(&self) -> impl Iterator<Item = &String> {
         let inputs = self.structure.inputs.iter().map(|Input { name, .. }| name);
         self.orders.iter().chain(&self.coefficients).chain(inputs)
     }
 
-    /// The problem from a start, coefficients in logarithms where it allows them unless they are to be plain, and some
-    /// numbers, by their places, held where they are.
+    /// Problem with coordinates for an optimization from `start`.
+    ///
+    /// Nonzero coefficients use logarithms unless `plain`. The parameters with the indices `held` are fixed at their
+    /// values.
     #[must_use]
     pub fn turned(&self, start: &Place, plain: bool, held: &[usize]) -> Problem {
         let mut problem = self.problem.clone();
@@ -130,7 +130,7 @@ impl Free {
             let is_speed = problem.frictions.iter().any(|(_, law)| law.speed.powers.iter().any(|&(i, _)| i == j));
             let ratio = !named.contains(name) && self.exceeds(name) == 1.0;
             problem.model.coordinates[j] = match () {
-                // A speed is positive, wherever it goes.
+                // The Stribeck velocity is always positive.
                 () if (plain || value == 0.0) && !is_speed => Coordinate::Plain,
                 () if ratio && value > 1.0 => Coordinate::ExcessLogarithm,
                 () => Coordinate::Logarithm,
@@ -150,7 +150,7 @@ impl Free {
         problem
     }
 
-    /// Every coefficient of the structure, by name, from the free ones.
+    /// All coefficients of the structure, by name, from the values of the free coefficients.
     #[must_use]
     pub fn named(&self, values: &[f64]) -> BTreeMap<String, f64> {
         let free: BTreeMap<&String, f64> = self.coefficients.iter().zip(values.iter().copied()).collect();
@@ -163,7 +163,7 @@ impl Free {
         self.structure.coefficient_names().into_iter().map(of).collect()
     }
 
-    /// Free coefficients from freely estimated ones; ratios as the median of what the equations can say.
+    /// Free coefficients from unconstrained estimates. Ratios are medians over the equations that determine them.
     #[must_use]
     pub fn free_from(&self, estimated: &BTreeMap<String, f64>) -> Vec<f64> {
         let of = |name: &String| {
@@ -187,7 +187,7 @@ impl Free {
         self.coefficients.iter().map(of).collect()
     }
 
-    /// Second order with one derivative of the output, everything else as it is, as far as the bounds allow.
+    /// Integer orders within the bounds: second order with first and zeroth derivatives.
     #[must_use]
     pub fn whole_orders(&self) -> Vec<f64> {
         let mut usual: BTreeMap<&String, f64> = BTreeMap::new();
@@ -199,25 +199,25 @@ impl Free {
             usual.extend(own);
         }
         let pairs = self.orders.iter().zip(self.bounds());
-        // Bounds that meet the wrong way round are refused before.
+        // `clamp` would panic on crossed bounds, which are rejected elsewhere.
         pairs.map(|(name, (low, high))| usual.get(name).copied().unwrap_or(0.0).max(*low).min(*high)).collect()
     }
 
-    /// The same equations with other initial terms, what else a run starts with as it is.
+    /// Parameter set with other initial terms.
     ///
     /// # Errors
-    /// Those of [`Free::of`].
+    /// As [`ParameterSet::from_structure`].
     pub fn starting(&self, initial: Initial, history: bool) -> Result<Self> {
         Self::of(Structure { initial, history, ..self.structure.clone() })
     }
 
-    /// What a ratio of the coefficient law exceeds.
+    /// Lower bound of a ratio of the coefficient law.
     fn exceeds(&self, ratio: &String) -> f64 {
         self.structure.hints.exceeds.get(ratio).copied().unwrap_or(1.0)
     }
 }
 
-/// Bounds of free orders: those that were given, else as wide as a fit looks by itself.
+/// Bounds of the free orders: given ones, else defaults.
 fn bounds(structure: &Structure, orders: &[String]) -> Vec<(f64, f64)> {
     let highest: Vec<&String> =
         structure.equations.iter().filter(|e| e.order.is_single()).flat_map(|e| e.order.names()).collect();
@@ -232,7 +232,7 @@ fn bounds(structure: &Structure, orders: &[String]) -> Vec<(f64, f64)> {
         let own = || (if above { ALPHA_BOUNDS.0 } else { 0.0 }, reach(structure, name, above));
         let (low, high) = structure.bounds.get(name).copied().unwrap_or_else(own);
         if inertia.contains(&name) {
-            // A velocity needs inertia, and friction of it an order of 2 at most.
+            // Friction needs a velocity state, and is defined for orders up to 2.
             return (low.max(FRICTION_BOUNDS.0), high.min(FRICTION_BOUNDS.1));
         }
         (low, high)
@@ -240,14 +240,14 @@ fn bounds(structure: &Structure, orders: &[String]) -> Vec<(f64, f64)> {
     orders.iter().map(of).collect()
 }
 
-/// How high a free order is sought: 3, or past the highest number in its equations where that is more.
+/// Default upper bound of a free order: 3, or one above the highest fixed order of its equations if that is larger.
 fn reach(structure: &Structure, name: &String, above: bool) -> f64 {
     let beside = structure.equations.iter().filter(|e| e.orders().any(|order| order.names().any(|n| n == name)));
     let numbers = beside.flat_map(Equation::orders).filter(|order| !order.is_free()).map(|order| order.constant);
     numbers.map(|n| n + f64::from(u8::from(above))).fold(SEARCHED_ORDER, f64::max).min(MAX_ORDER)
 }
 
-/// The unit of time of some runs, and which numbers of a problem are powers of it.
+/// Time scaling of a problem: the unit of time of its runs, and the power of it in each parameter.
 #[derive(Debug, Clone)]
 pub struct Clock {
     unit: Unit,
@@ -257,8 +257,9 @@ pub struct Clock {
 }
 
 impl Clock {
-    /// The unit is that of a frequency half way, in logarithms, between that of the runs and Nyquist's; each run is told
-    /// by its sample interval and its duration.
+    /// Time scaling for runs of the given (sampling interval, duration).
+    ///
+    /// The unit belongs to the geometric mean of the lowest frequency of the runs and the Nyquist frequency.
     #[must_use]
     pub fn of(problem: &Problem, spans: &[(f64, f64)]) -> Self {
         let spans: Vec<f64> = spans.iter().map(|(step, duration)| libm::log(*step) + libm::log(*duration)).collect();
@@ -276,8 +277,7 @@ impl Clock {
         self.unit.unit()
     }
 
-    /// By what each number is to be multiplied for its value in the unit; only orders change that, and they are the same
-    /// in any unit.
+    /// Factor of each parameter for its value in the unit. It depends on the orders only, which have no unit.
     fn factors(&self, values: &[f64]) -> Vec<f64> {
         let of = |i: usize| match i.checked_sub(self.orders) {
             Some(j) if j < self.coefficients => self.unit.factor(j, &values[..self.orders]),
@@ -286,7 +286,7 @@ impl Clock {
         (0..self.size).map(of).collect()
     }
 
-    /// Share of itself by which each number falls with a step of the orders, its value in the unit kept.
+    /// Relative decrease of parameter i with a step of the orders, at a constant value in the unit.
     fn fall(&self, i: usize, moved: &[f64]) -> f64 {
         match i.checked_sub(self.orders) {
             Some(j) if j < self.coefficients => {
@@ -296,19 +296,19 @@ impl Clock {
         }
     }
 
-    /// Parameters in the unit.
+    /// Convert parameters to the unit.
     #[must_use]
     pub fn told(&self, values: &[f64]) -> Vec<f64> {
         values.iter().zip(self.factors(values)).map(|(v, f)| v * f).collect()
     }
 
-    /// Parameters from those in the unit.
+    /// Convert parameters back from the unit.
     #[must_use]
     pub fn untold(&self, values: &[f64]) -> Vec<f64> {
         values.iter().zip(self.factors(values)).map(|(v, f)| v / f).collect()
     }
 
-    /// A small step of the parameters at some values, from the one in the unit.
+    /// Convert a small step in the unit to a step of the parameters at the given values.
     #[must_use]
     pub fn step(&self, values: &[f64], moved: &[f64]) -> Vec<f64> {
         let factors = self.factors(values);
@@ -316,7 +316,7 @@ impl Clock {
         values.iter().enumerate().map(of).collect()
     }
 
-    /// Standard errors in the unit, from a covariance by rows; infinite where the runs do not see all that takes part.
+    /// Standard errors in the unit, from a row-major covariance; infinite for a parameter that is not identifiable.
     #[must_use]
     pub fn errors(&self, values: &[f64], covariance: &[f64]) -> Vec<f64> {
         let (n, factors) = (values.len(), self.factors(values));

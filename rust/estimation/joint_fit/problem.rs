@@ -1,10 +1,4 @@
-//! What is free in a joint fit, with friction and without.
-//!
-//! A point in the space of parameters, and what a descent said about it.
-//!
-//! How far an extrapolated estimate may go: bounds, and orders that stay below the highest of their equation.
-//!
-//! An attempt in a race: where it is, and where it came from.
+//! Problem of a joint fit with and without friction: iterates, optimization, candidates and feasible steps.
 
 use crate::equation::AffineOrder;
 use crate::error::{check_length, Error, Result};
@@ -16,22 +10,22 @@ use crate::linalg::dense;
 use crate::parallel::Stop;
 use crate::signal::statistics::inner;
 
-/// Equations on their runs, and the friction of their bodies.
+/// Optimization problem: parameterized equations and their friction laws.
 #[derive(Debug, Clone, PartialEq)]
 pub struct Problem {
-    /// Names of the outputs, an equation each, for words about them.
+    /// Names of the outputs, one per equation, for messages.
     pub outputs: Vec<String>,
-    /// The equations; an optimum is followed in its coordinates.
+    /// The equations and the coordinates of the optimization.
     pub model: FreeModel,
-    /// Which equations have friction, and how much.
+    /// Friction laws by index of their equation.
     pub frictions: Vec<(usize, FreeLaw)>,
 }
 
 impl Problem {
-    /// Equations whose coefficients have coordinates of their own, but for speeds, which are positive wherever they go.
+    /// Problem in the coordinates of the model; Stribeck velocities are positive and use logarithms.
     ///
     /// # Errors
-    /// [`Error::Length`], [`Error::Structure`] where something is named that is not there, or bounds do not rise.
+    /// [`Error::Length`], [`Error::Structure`] for an unknown coefficient or equation, or crossed bounds.
     pub fn new(outputs: Vec<String>, mut model: FreeModel, frictions: Vec<(usize, FreeLaw)>) -> Result<Self> {
         check_length("outputs", model.equations.len(), outputs.len())?;
         let (orders, coefficients) = (model.order_bounds.len(), model.coordinates.len());
@@ -63,13 +57,13 @@ impl Problem {
         Ok(Self { outputs, model, frictions })
     }
 
-    /// How many orders, coefficients and numbers of inputs are free.
+    /// Number of free orders, coefficients and input parameters.
     #[must_use]
     pub fn size(&self) -> usize {
         self.model.order_bounds.len() + self.model.coordinates.len() + self.model.inputs.len()
     }
 
-    /// Values of everything free as a point.
+    /// Convert the values of all free parameters to a point.
     ///
     /// # Errors
     /// [`Error::Length`].
@@ -80,7 +74,7 @@ impl Problem {
         Ok(Point { orders: orders.into(), coefficients: coefficients.into(), inputs: inputs.into() })
     }
 
-    /// Bounds of everything that is free; those of coefficients are infinite, but friction takes energy.
+    /// Bounds of all free parameters. Coefficients are unbounded, except that friction must dissipate energy.
     #[must_use]
     pub fn bounds(&self) -> Vec<(f64, f64)> {
         let mut coefficients = vec![(f64::NEG_INFINITY, f64::INFINITY); self.model.coordinates.len()];
@@ -96,16 +90,16 @@ impl Problem {
         self.model.order_bounds.iter().copied().chain(coefficients).chain(ends).collect()
     }
 
-    /// Whether the free run of an equation grows at a point, and initial terms may take away what it becomes.
+    /// True if an equation is unstable at a point and free initial terms may compensate the growth.
     #[must_use]
     pub fn grows(&self, point: &Point) -> bool {
         self.frictions.is_empty() && !self.model.initial.at_rest() && self.model.grows(point)
     }
 
-    /// Levenberg–Marquardt from a place; a steady one goes from a free run that dies away to none that grows.
+    /// Minimize the cost by Levenberg–Marquardt; if `steady`, a stable iterate does not become unstable.
     ///
     /// # Errors
-    /// Those of [`fit_until`] and, with friction, of [`crate::friction::fit_until`].
+    /// As [`fit_until`] and, with friction, [`friction::fit_until`].
     pub fn descend(
         &self,
         experiments: &[Experiment],
@@ -151,36 +145,36 @@ impl Problem {
     }
 }
 
-/// Where a descent starts.
+/// Iterate of an optimization: parameters and initial states.
 #[derive(Debug, Clone, Default, PartialEq)]
 pub struct Place {
-    /// Free orders, coefficients and numbers of inputs.
+    /// Free orders, coefficients and input parameters.
     pub point: Point,
-    /// States of each run with friction, where they are known.
+    /// Initial states of each run with friction; empty if unknown.
     pub states: Vec<Vec<f64>>,
 }
 
-/// Where it ended.
+/// Result of an optimization.
 #[derive(Debug, Clone, PartialEq)]
 pub struct Attempt {
-    /// The point.
+    /// The final iterate.
     pub place: Place,
     /// Half the weighted sum of squared residuals.
     pub cost: f64,
-    /// Weighted residuals, runs one after the other, outputs within.
+    /// Vector of weighted residuals, ordered by run, then by output.
     pub residuals: Vec<f64>,
-    /// Their derivatives, a row a parameter; none where only residuals were asked for.
+    /// Derivatives of the residuals, one row per parameter; empty if only residuals were requested.
     pub jacobian: Vec<Vec<f64>>,
-    /// Coefficients of the initial terms by run and equation; of bodies with friction their states.
+    /// Coefficients of the initial terms by run and equation; initial states if there is friction.
     pub initial: Vec<Vec<Vec<f64>>>,
-    /// Evaluations of residuals.
+    /// Number of residual evaluations.
     pub evaluations: usize,
-    /// How it ended.
+    /// Reason of termination.
     pub status: Status,
 }
 
 impl Attempt {
-    /// A place before any descent: none costs more.
+    /// Result before any optimization, with infinite cost.
     #[must_use]
     pub fn unrun(place: Place) -> Self {
         let (cost, evaluations, status) = (f64::INFINITY, 0, Status::Exhausted);
@@ -195,20 +189,22 @@ impl Attempt {
         2.0 * self.cost / self.residuals.len() as f64
     }
 
-    /// Whether the gradient vanished, but for what pushes out of a bound; a fit stopped at a wall has not.
+    /// True if the gradient vanished, except for components that point out of an active bound.
+    ///
+    /// An optimization that stopped at the limit of its domain has not converged.
     #[must_use]
     pub fn converged(&self) -> bool {
         self.status == Status::Converged
     }
 
-    /// Orders, coefficients, numbers of inputs.
+    /// All parameters: orders, coefficients, input parameters.
     #[must_use]
     pub fn values(&self) -> Vec<f64> {
         let Point { orders, coefficients, inputs } = &self.place.point;
         [orders.as_slice(), coefficients, inputs].concat()
     }
 
-    /// The same place at other values.
+    /// Iterate with other parameter values and the same states.
     #[must_use]
     pub fn at(&self, values: &[f64]) -> Place {
         let point = &self.place.point;
@@ -219,14 +215,14 @@ impl Attempt {
     }
 }
 
-/// What the core keeps between the highest order of an equation and those of its own terms.
+/// Smallest difference between the highest order of an equation and the orders of its autoregressive terms.
 const LEAST_INTEGRATION: f64 = 1e-3;
-/// Orders of a model are rounded to 1e-9, two of them apart; another signal's may reach the highest but not pass it.
+/// Rounding error of the difference of two orders, each rounded to 1e-9. Orders of other signals may equal the highest.
 const ROUNDED: f64 = 2e-9;
-/// A direction shorter than this share of the longest is none.
+/// Relative singular value below which a constraint normal is linearly dependent.
 const ALONG: f64 = 1e-9;
 
-/// a·x + b ≥ m.
+/// Affine constraint a·x + b ≥ m.
 struct Constraint {
     normal: Vec<f64>,
     offset: f64,
@@ -234,10 +230,9 @@ struct Constraint {
 }
 
 impl Problem {
-    /// The last point on the way from a feasible one to another that keeps the bounds and the constraints of orders.
+    /// Last point between a feasible point and another that satisfies the bounds and the constraints of the orders.
     ///
-    /// A constraint that already holds with equality is kept by going along it. Every constraint is affine, so the last
-    /// point is exact.
+    /// The step is projected on the active constraints. All constraints are affine, so the result is exact.
     ///
     /// # Errors
     /// [`Error::Length`].
@@ -248,7 +243,7 @@ impl Problem {
         let room: Vec<f64> = (constraints.iter())
             .map(|c| {
                 let room = inner(&c.normal, at) + c.offset;
-                // A point that the core let pass closer than a margin keeps what it has.
+                // A point accepted within the margin keeps its distance.
                 (room - c.margin.min(room)).max(0.0)
             })
             .collect();
@@ -313,25 +308,25 @@ impl Problem {
     }
 }
 
-/// An attempt with the start that led to it, and those of others that came to the same place.
+/// Candidate of the multistart: optimization result, origin, and origins of merged duplicates.
 #[derive(Debug, Clone, PartialEq)]
 pub struct Runner {
-    /// Where it is.
+    /// Current optimization result.
     pub attempt: Attempt,
-    /// Its start, in words.
+    /// Description of its initial guess.
     pub origin: String,
-    /// Those of the others.
+    /// Origins of merged duplicates.
     pub alike: Vec<String>,
 }
 
 impl Runner {
-    /// Before its first descent.
+    /// Candidate before its first optimization.
     #[must_use]
     pub fn at(place: Place, origin: impl Into<String>) -> Self {
         Self { attempt: Attempt::unrun(place), origin: origin.into(), alike: Vec::new() }
     }
 
-    /// The same where a descent led it.
+    /// Candidate with a new optimization result.
     #[must_use]
     pub fn moved(&self, attempt: Attempt) -> Self {
         Self { attempt, ..self.clone() }

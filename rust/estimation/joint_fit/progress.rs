@@ -1,14 +1,14 @@
-//! How much of a fit is done, told as it goes; it never goes back.
+//! Progress of a fit, which never decreases.
 
 use crate::error::Result;
 
-/// Parts of a whole that has no count of its own.
+/// Number of parts into which the progress of a fit is divided.
 pub const PARTS: usize = 1000;
 
-/// Who is told (parts done, [`PARTS`]); an error ends the fit.
+/// Progress callback of (parts done, [`PROGRESS_PARTS`]); an error ends the fit.
 pub type Listener<'a> = dyn Fn(usize, usize) -> Result<()> + 'a;
 
-/// The share of a whole that is done, of work whose parts do not know each other.
+/// Progress of a fit as a share of 1, over phases of unknown length.
 pub struct Pace<'a> {
     told: &'a Listener<'a>,
     reached: f64,
@@ -18,16 +18,16 @@ pub struct Pace<'a> {
 }
 
 impl<'a> Pace<'a> {
-    /// Nothing is done yet.
+    /// Progress 0, with a callback.
     #[must_use]
     pub fn new(told: &'a Listener<'a>) -> Self {
         Self { told, reached: 0.0, said: None, begun: 0.0, last: 0.0 }
     }
 
-    /// So much of the whole is done.
+    /// Advance to a share of the whole.
     ///
     /// # Errors
-    /// What whoever is told ends with.
+    /// The error of the callback.
     #[allow(clippy::cast_possible_truncation, clippy::cast_sign_loss, clippy::cast_precision_loss)]
     pub fn at(&mut self, share: f64) -> Result<()> {
         self.reached = self.reached.max(share.min(1.0));
@@ -39,11 +39,11 @@ impl<'a> Pace<'a> {
         (self.told)(parts, PARTS)
     }
 
-    /// So much of a part that ends at a share of the whole is done. Where it begins to count anew, each sweep takes the same
-    /// share of what is left.
+    /// Advance within a phase that ends at a share of the whole. A phase can count from zero repeatedly; each sweep
+    /// takes the share `sweep` of the rest.
     ///
     /// # Errors
-    /// See [`Pace::at`].
+    /// As [`FitProgress::advance_to`].
     #[allow(clippy::cast_precision_loss)]
     pub fn until(&mut self, share: f64, sweep: f64, done: usize, of: usize) -> Result<()> {
         let fraction = done as f64 / of.max(1) as f64;

@@ -1,44 +1,42 @@
-//! Huber's loss: squares for usual residuals, sizes for the others, so that a few that are far off decide nothing.
+//! Iteratively reweighted noise levels and Huber weights.
 //!
-//! The minimum is found by least squares with weights that follow the residuals until they stand still (doi:10.1214/aoms/
-//! 1177703732, doi:10.1080/03610927708827533). The scale is the median of the sizes, which outliers do not move.
-//!
-//! Descents until each output weighs by its own residuals.
+//! The minimum of Huber's loss is found by iteratively reweighted least squares (doi:10.1214/aoms/1177703732,
+//! doi:10.1080/03610927708827533). The scale is the median absolute residual, which is robust to outliers.
 
 use super::objective::{Grid, Weights};
 use super::problem::{Attempt, Place};
 use crate::error::{Error, Result};
 use crate::signal::statistics::BEND;
 
-/// Residuals beyond so many deviations are outliers: of normal noise one in two millions is.
+/// Standard deviations above which a residual is an outlier: one in two million for normal noise.
 const FAR: f64 = 5.0;
-/// Shares are settled when none moves by more than this.
+/// Change of the robust weights below which they have converged.
 const ROBUST_WEIGHT_TOLERANCE: f64 = 2e-3;
-/// Deviations below this are none.
+/// Lower limit of a standard deviation in a quotient.
 const TINY: f64 = 1e-300;
 
-/// What residuals cost.
+/// Loss function of the residuals.
 #[derive(Debug, Clone, Copy, PartialEq, Eq)]
 pub enum Loss {
-    /// Their squares.
+    /// Least squares.
     Squares,
-    /// Squares of usual ones, sizes of the others.
+    /// Huber's loss.
     Huber,
 }
 
-/// What a robust loss did.
+/// Counts of downweighted residuals and outliers of a robust loss.
 #[derive(Debug, Clone, Copy, PartialEq, Eq)]
 pub struct Robust {
-    /// Residuals beyond 1.345 deviations, which count less; of normal noise 18 % are.
+    /// Residuals beyond 1.345 standard deviations, which are downweighted; 18 % of normal noise.
     pub lowered: usize,
-    /// Those beyond five.
+    /// Residuals beyond five standard deviations.
     pub outliers: usize,
-    /// Residuals in all.
+    /// Number of residuals.
     pub samples: usize,
 }
 
 impl Robust {
-    /// Counted at an optimum.
+    /// Counts at an optimum.
     #[must_use]
     pub fn of(grid: &Grid<'_>, attempt: &Attempt) -> Self {
         let mut counted = Self { lowered: 0, outliers: 0, samples: 0 };
@@ -52,7 +50,7 @@ impl Robust {
     }
 }
 
-/// Roots of Huber's weights of the compared samples, by run and output; 1 where nothing was read.
+/// Square roots of Huber's weights of the compared samples, by run and output; 1 for missing samples.
 pub(super) fn huber(grid: &Grid<'_>, attempt: &Attempt, levels: &[f64]) -> Vec<Vec<Vec<f64>>> {
     let root = |size: f64| if size > BEND { (BEND / size).sqrt() } else { 1.0 };
     let of = |(e, level): (Vec<f64>, &f64)| e.iter().map(|e| root(e.abs() / level.max(TINY))).collect();
@@ -60,7 +58,7 @@ pub(super) fn huber(grid: &Grid<'_>, attempt: &Attempt, levels: &[f64]) -> Vec<V
     parts.map(|part| part.into_iter().zip(levels).map(of).collect()).collect()
 }
 
-/// Whether shares have settled.
+/// True if robust weights have converged.
 pub(super) fn same(before: Option<&Vec<Vec<Vec<f64>>>>, after: Option<&Vec<Vec<Vec<f64>>>>) -> bool {
     let flat = |shares: &Vec<Vec<Vec<f64>>>| shares.iter().flatten().flatten().copied().collect::<Vec<_>>();
     match (before, after) {
@@ -70,18 +68,18 @@ pub(super) fn same(before: Option<&Vec<Vec<Vec<f64>>>>, after: Option<&Vec<Vec<V
     }
 }
 
-/// Evaluations of each descent.
+/// Maximum evaluations of each optimization.
 pub const LAST_LAP: usize = 120;
-/// Descents to settled weights, and to those of a robust loss, which settle by a factor of some four each.
+/// Maximum number of reweightings. Robust weights converge by a factor of about four each.
 const ROUNDS: usize = 4;
 const ROBUST_ROUNDS: usize = 15;
-/// Weights are settled when no output's residuals differ from their weight by more than this share.
+/// Relative difference between noise levels and weights below which the weights have converged.
 const NOISE_LEVEL_TOLERANCE: f64 = 0.01;
 
-/// Descends on a grid until the weights are those of the residuals, pooled over runs, and so are robust shares.
+/// Fit by iteratively reweighted least squares, until weights and robust weights match the residuals over all runs.
 ///
 /// # Errors
-/// Those of [`Grid::descend`]; [`Error::Beyond`] where it ends beyond the range of numbers.
+/// As [`Objective::minimize`]; [`Error::Beyond`] if the residuals overflow.
 pub fn settled<'a>(start: &Place, grid: Grid<'a>, loss: Loss) -> Result<(Attempt, Grid<'a>)> {
     let rounds = if loss == Loss::Huber { ROBUST_ROUNDS } else { ROUNDS };
     let (mut place, mut grid, mut turn) = (start.clone(), grid, 0);

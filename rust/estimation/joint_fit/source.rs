@@ -1,35 +1,37 @@
-//! Where the runs of a joint fit come from: sampled as finely as it is asked.
+//! Source of the runs of a joint fit, sampled on a requested grid.
 
 use crate::error::{check_length, check_points, check_step, Error, Result};
 use crate::estimation::output_error::{Experiment, Instant};
 use crate::regressors::Record;
 use crate::signal::block_pulse::{pulse_means, Intersample};
 
-/// Runs that can be sampled on any grid. Weights of what it gives are not looked at; shares say what was read.
+/// Source of runs that can be sampled on any grid.
+///
+/// The output weights of its experiments are ignored. Their sample weights mark missing samples.
 pub trait Source {
-    /// Sample interval and duration of each run \[s\].
+    /// Sampling interval and duration of each run \[s\].
     fn spans(&self) -> Vec<(f64, f64)>;
 
-    /// The runs sampled so.
+    /// Sample the runs.
     ///
     /// # Errors
-    /// Whatever keeps it from that.
+    /// If the runs cannot be sampled.
     fn experiments(&self, sampling: Sampling) -> Result<Vec<Experiment>>;
 }
 
-/// How finely runs are sampled.
+/// Sampling of the runs: step, decimation and length.
 #[derive(Debug, Clone, Copy, PartialEq, Eq, Hash)]
 pub struct Sampling {
-    /// Pulses a sample interval.
+    /// Block pulses per sampling interval.
     pub every: usize,
-    /// Of how many samples one counts.
+    /// Decimation factor of the samples.
     pub decimation: usize,
-    /// So many sample intervals from the beginning of each run on; none: all.
+    /// Number of leading sampling intervals of each run to use; None for all.
     pub first: Option<usize>,
 }
 
 impl Sampling {
-    /// Refuses a sampling of nothing, and one finer than memory.
+    /// Check that pulses and decimation are positive and not excessive.
     ///
     /// # Errors
     /// [`Error::OutOfRange`].
@@ -51,44 +53,46 @@ impl Default for Sampling {
     }
 }
 
-/// Runs of which starts can be made, too: what was read, and records for estimators on the equation error.
+/// Source of runs that also supplies samples and block-pulse records for initial guesses.
 pub trait Recordings: Source {
-    /// Which signals are inputs of the runs, and which of them hold between samples.
+    /// Intersample behavior of the signals that are inputs; None for other signals.
     fn inputs(&self) -> Vec<Option<Intersample>>;
 
-    /// What was read of a signal by run, at regular times; not a number where nothing was.
+    /// Uniform samples of a signal by run; NaN for missing samples.
     ///
     /// # Errors
-    /// Whatever keeps it from that.
+    /// If the samples are not available.
     fn samples(&self, signal: usize) -> Result<Vec<Vec<f64>>>;
 
-    /// Each run on so many pulses, every signal behind the sensor filter, equations driven by what was measured, free
-    /// numbers of inputs at these values.
+    /// Record of each run with `m` block pulses.
+    ///
+    /// All signals have passed the sensor filter, the inputs are the measured ones, and `inputs` are the values of the
+    /// free input parameters.
     ///
     /// # Errors
-    /// Whatever keeps it from that.
+    /// If the records are not available.
     fn records(&self, m: usize, inputs: &[f64]) -> Result<Vec<Record>>;
 }
 
-/// A signal that was read at regular times.
+/// Uniformly sampled signal.
 #[derive(Debug, Clone, PartialEq)]
 pub struct Signal {
-    /// What was read.
+    /// Sample values.
     pub samples: Vec<f64>,
-    /// What it does in between.
+    /// Behavior between the samples.
     pub between: Intersample,
 }
 
-/// Runs whose signals were all read at the same regular times, throughout, without a filter.
+/// Runs of signals sampled at the same uniform times, without gaps and without a sensor filter.
 ///
 /// ```
 /// # fn main() -> ftlm::error::Result<()> {
-/// use ftlm::estimation::joint_fit::source::{Sampled, Sampling, Signal, Source};
+/// use ftlm::estimation::joint_fit::source::{SampledRuns, Sampling, Signal, Source};
 /// use ftlm::signal::block_pulse::Intersample;
-/// let y = Signal { samples: vec![0.0, 1.0, 4.0, 9.0], between: Intersample::Linear };
-/// let u = Signal { samples: vec![1.0, 2.0, 2.0, 2.0], between: Intersample::Hold };
-/// let runs = Sampled::new(0.1, vec![0], vec![vec![y, u]])?;
-/// let fine = runs.experiments(Sampling { every: 2, ..Sampling::default() })?;
+/// let y = Signal { samples: vec![0.0, 1.0, 4.0, 9.0], intersample: Intersample::Linear };
+/// let u = Signal { samples: vec![1.0, 2.0, 2.0, 2.0], intersample: Intersample::Hold };
+/// let runs = SampledRuns::new(0.1, vec![0], vec![vec![y, u]])?;
+/// let fine = runs.experiments(Sampling { pulses_per_sample: 2, ..Sampling::default() })?;
 /// assert_eq!(fine[0].record.signal(1), [1.0, 1.0, 2.0, 2.0, 2.0, 2.0]);
 /// # Ok(())
 /// # }
@@ -101,7 +105,7 @@ pub struct Sampled {
 }
 
 impl Sampled {
-    /// Runs of one sample interval, signals in one order, and which of them are the outputs of the equations.
+    /// Runs of one sampling interval, with the signals in the same sequence and the indices of the outputs.
     ///
     /// # Errors
     /// [`Error::Length`], [`Error::OutOfRange`], [`Error::Structure`].

@@ -1,8 +1,8 @@
-//! Optima whose free run grows: kept where the runs force them, not where one that dies away explains them as well.
+//! Choice between an unstable optimum and a stable one: the unstable one must fit significantly better.
 //!
-//! A run that starts in motion gives an equation initial terms of its own. They cost a growing mode nothing: fitted, they
-//! take away all that it becomes until the end of the run, and what is left runs backwards in time. Such an equation
-//! answers its inputs before they come, which no machine does, and where residuals are coloured it may well leave less.
+//! With nonzero initial conditions an equation has free initial terms for each run. They can cancel an unstable mode up
+//! to the end of the run, which makes the response noncausal: the output reacts before the input. No machine does that,
+//! but with autocorrelated residuals such a model can fit better.
 
 use std::collections::BTreeMap;
 
@@ -14,31 +14,35 @@ use super::structure::Coefficient;
 use crate::error::{Error, Result};
 use crate::signal::statistics::mean;
 
-/// Stretches of the runs whose sums of squares are compared, and the 99 % quantile of Student's t of one less.
+/// Number of segments of the runs whose sums of squares are compared; then the 99 % quantile of Student's t for one
+/// degree of freedom less.
 const STRETCHES: f64 = 20.0;
 const STUDENT_99: f64 = 2.54;
-/// Residuals larger by this factor force what no stretch may show: a run that grows is seen at its end alone.
+/// Ratio of the residuals above which the better optimum is chosen without a test: instability can show up only at the
+/// end of a run.
 const FAR_LARGER: f64 = 2.0;
-/// Optima of the race that are looked at, and evaluations of each.
+/// Maximum number of stable candidates of the multistart to try, and evaluations of each.
 const LOOKED_AT: usize = 3;
 const EVALUATIONS: usize = 60;
 
-/// An optimum whose free run grows beside the best one found whose free run does not.
+/// Comparison of an unstable optimum with the best stable one.
 #[derive(Debug, Clone, Copy, PartialEq)]
 pub struct Growth {
-    /// Whether the growing one is the fit's, because the runs force it or there was no other.
+    /// True if the unstable optimum is the result, because it fits significantly better or no stable one exists.
     pub kept: bool,
-    /// Share by which residuals of the other one are larger (root mean square); infinite where there was none, below 0
-    /// where the growing one was no optimum.
+    /// Relative excess of the root mean square residual of the stable one. Infinite if there is none, negative if the
+    /// unstable one was no optimum.
     pub excess: f64,
-    /// Whether the other one stands where free runs begin to grow, no optimum of its own.
+    /// True if the stable one lies on the stability limit and is no local optimum.
     pub at_limit: bool,
 }
 
-/// The optimum to go on from, on a grid that stays where free runs die away if it does, and what was compared.
+/// Choose between the best optimum and a stable one; return it with its objective and the comparison.
+///
+/// The objective requires stability if the stable optimum is chosen.
 ///
 /// # Errors
-/// Those of the source, [`Error::Interrupted`].
+/// As the source, [`Error::Interrupted`].
 pub fn steadied<'a>(
     free: &Free,
     best: Runner,
@@ -52,7 +56,7 @@ pub fn steadied<'a>(
     let mut ends = Ends { free, grid: held.clone() }.stable(&best, reached)?;
     let unit = grid.clock();
     for one in known_orders(free) {
-        // What the equation explains with an order known without growing, it explains with that order free.
+        // A stable optimum with one order fixed is a candidate for the full equation.
         let there = known(&one, free, &held, |runner| one.without(runner, &unit), &best, reached)?;
         if let Some(there) = there {
             let there = one.embedded(&there, free);
@@ -71,7 +75,7 @@ pub fn steadied<'a>(
     Ok((other, held, Some(Growth { kept: false, excess, at_limit })))
 }
 
-/// Where the problem with one order known stands without growing, if there is such a place.
+/// Stable optimum of the problem with one order fixed, if any.
 fn known(
     one: &Held,
     free: &Free,
@@ -89,7 +93,7 @@ fn known(
     Ok(caught(narrow.nearest(&inside).map(Some))?.flatten())
 }
 
-/// What a computation found; nothing where it ended with any error but a stop.
+/// Convert any error except [`Error::Interrupted`] to None.
 fn caught<T>(found: Result<T>) -> Result<Option<T>> {
     match found {
         Err(Error::Interrupted) => Err(Error::Interrupted),
@@ -97,12 +101,12 @@ fn caught<T>(found: Result<T>) -> Result<Option<T>> {
     }
 }
 
-/// Whether the free run of an equation grows where an attempt is.
+/// True if an equation is unstable at a candidate.
 fn grows(free: &Free, runner: &Runner) -> bool {
     free.problem.grows(&runner.attempt.place.point)
 }
 
-/// Free coefficients before own terms, with the factor that they are multiplied by.
+/// Names of the free autoregressive coefficients, with their fixed factors.
 fn own_terms(free: &Free) -> BTreeMap<&String, f64> {
     let own = free.structure.equations.iter().flat_map(|equation| equation.own());
     own.filter_map(|term| match &term.coefficient {
@@ -112,9 +116,10 @@ fn own_terms(free: &Free) -> BTreeMap<&String, f64> {
     .collect()
 }
 
-/// The point with own terms that all pull back, whose free run dies away up to order 2, and which of them turned.
+/// Candidate with all autoregressive coefficients negative, which is stable up to order 2, and the changed indices.
 ///
-/// Those are held where the rest follows first: released at once, what drives would be that of the growing optimum.
+/// The changed coefficients are first kept fixed while the others adapt, because the input coefficients still belong to
+/// the unstable optimum.
 #[must_use]
 pub fn dissipative(free: &Free, runner: &Runner) -> (Runner, Vec<usize>) {
     let own = own_terms(free);
@@ -129,9 +134,7 @@ pub fn dissipative(free: &Free, runner: &Runner) -> (Runner, Vec<usize>) {
     (elsewhere(runner, place, "all own terms pulling back"), turned)
 }
 
-/// The point without one own term after the other, each held at 0 where the rest follows first.
-///
-/// What a term less explains without growing, the whole equation explains, too.
+/// Candidates with one autoregressive coefficient at 0 each, which is first kept fixed while the others adapt.
 #[must_use]
 pub fn lacking(free: &Free, runner: &Runner) -> Vec<(Runner, Vec<usize>)> {
     let places = own_places(free);
@@ -148,7 +151,7 @@ pub fn lacking(free: &Free, runner: &Runner) -> Vec<(Runner, Vec<usize>)> {
     }
 }
 
-/// Places of the coefficients before own terms.
+/// Indices of the free autoregressive coefficients.
 fn own_places(free: &Free) -> Vec<usize> {
     let own = own_terms(free);
     (0..free.coefficients.len()).filter(|&k| own.contains_key(&free.coefficients[k])).collect()
@@ -159,7 +162,7 @@ fn elsewhere(runner: &Runner, place: super::problem::Place, words: &str) -> Runn
     Runner { origin, attempt: Attempt { place, ..runner.attempt.clone() }, ..runner.clone() }
 }
 
-/// A problem on a grid where no descent goes to a free run that grows.
+/// Search for stable optima of a problem.
 struct Ends<'f, 'g> {
     free: &'f Free,
     grid: Grid<'g>,
@@ -171,7 +174,7 @@ impl Ends<'_, '_> {
         Ok(start.moved(self.grid.descend_in(&self.free.turned(place, true, held), place, EVALUATIONS)?))
     }
 
-    /// Where attempts end whose free runs die away: those of a race, and what is nearest to a growing optimum.
+    /// Stable optima from stable candidates of the multistart and from modifications of the unstable optimum.
     fn stable(&self, best: &Runner, reached: &[Runner]) -> Result<Vec<Runner>> {
         let raced = reached.iter().filter(|runner| !grows(self.free, runner)).take(LOOKED_AT);
         let mut starts: Vec<(Runner, Vec<usize>)> = raced.map(|runner| (runner.clone(), Vec::new())).collect();
@@ -180,13 +183,13 @@ impl Ends<'_, '_> {
         let mut ends = Vec::new();
         for (start, turned) in starts.into_iter().filter(|(start, _)| !grows(self.free, start)) {
             let near = if turned.is_empty() { Ok(start) } else { self.descend(&start, &turned) };
-            // Some have no finite free run on this grid; the others have one.
+            // Candidates without a finite simulation on this grid are skipped.
             ends.extend(caught(near.and_then(|near| self.steadily(&near)))?);
         }
         Ok(ends)
     }
 
-    /// Where a descent ends that goes to no free run that grows, along the limit of growth if it comes there.
+    /// Minimize over stable models, along the stability limit if it is reached.
     fn steadily(&self, start: &Runner) -> Result<Runner> {
         let end = self.descend(start, &[])?;
         if end.attempt.converged() {
@@ -195,9 +198,10 @@ impl Ends<'_, '_> {
         self.along_limit(end)
     }
 
-    /// The lowest point beside one at the limit of growth: from there on with one own term held after the other.
+    /// Minimize along the stability limit, with one autoregressive coefficient fixed at a time.
     ///
-    /// A descent stands where a step of all numbers would grow, though the rest may still fall along the limit.
+    /// An optimization stops if a step of all parameters would be unstable, although the cost can still decrease along
+    /// the limit.
     fn along_limit(&self, end: Runner) -> Result<Runner> {
         let status = end.attempt.status;
         let mut best = end.clone();
@@ -205,15 +209,15 @@ impl Ends<'_, '_> {
             let there = caught(self.descend(&end, &[self.free.orders.len() + k]))?;
             best = there.filter(|there| there.level() < best.level()).unwrap_or(best);
         }
-        // Held, it stood still in fewer numbers than the fit has.
+        // With a fixed coefficient it converged in fewer parameters than the fit has.
         best.attempt.status = status;
         Ok(best)
     }
 
-    /// The end that a growing optimum is compared with.
+    /// Stable candidate to compare with the unstable optimum.
     ///
-    /// Where free runs begin to grow a descent stands at a wall, which is no optimum: one of those is taken instead, but
-    /// for where the runs refuse all of them for the wall.
+    /// A converged optimum is preferred over a candidate on the stability limit, unless the latter fits significantly
+    /// better than all of them.
     fn nearest(&self, ends: &[Runner]) -> Result<Runner> {
         let attempts: Vec<&Attempt> = ends.iter().map(|runner| &runner.attempt).collect();
         let order = self.grid.finer()?.ranked(&attempts)?;
@@ -223,9 +227,9 @@ impl Ends<'_, '_> {
     }
 }
 
-/// Whether the best point leaves less than another one by more than chance, neither of them inside the other.
+/// Vuong's test of non-nested models: true if the best fits significantly better than the other.
 ///
-/// The means of the squares over stretches of the runs are compared (Vuong, doi:10.2307/1912557; for coloured residuals
+/// The mean squares over segments of the runs are compared (Vuong, doi:10.2307/1912557; for autocorrelated residuals
 /// Rivers & Vuong, doi:10.1111/1368-423X.t01-1-00071).
 #[must_use]
 #[allow(clippy::cast_precision_loss, clippy::cast_possible_truncation, clippy::cast_sign_loss)]
@@ -258,7 +262,7 @@ pub fn forced(grid: &Grid<'_>, best: &Attempt, other: &Attempt) -> bool {
     middle > STUDENT_99 * (spread / count).sqrt()
 }
 
-/// Squares of weighted residuals of all outputs, sample by sample; what was not read counts nothing.
+/// Sum of squared weighted residuals of all outputs, by sample; missing samples count 0.
 fn summed(outputs: &[Vec<f64>]) -> Vec<f64> {
     let mut total = vec![0.0; outputs.first().map_or(0, Vec::len)];
     for residuals in outputs {

@@ -1,4 +1,4 @@
-//! Halving the step until that moves the estimate by little of its standard error.
+//! Step refinement: the step is halved until the estimate changes by a small part of its standard error.
 
 use super::covariance::covariance;
 use super::objective::{Grid, Weights, FINEST};
@@ -9,67 +9,66 @@ use crate::error::{Error, Result};
 use crate::estimation::output_error::Status;
 use crate::signal::statistics::inner;
 
-/// Refinement ends when halving the step moves no estimate, or none extrapolated to step 0, by this share of its standard
-/// error.
+/// Change of an estimate, or of its extrapolation to zero step, below which the refinement has converged.
 const REFINED: f64 = 0.1;
-/// Logarithm of residuals by which halving the step may raise them before other starts have their way on the finer grid.
+/// Increase of the log residuals by halving the step above which other survivors are tried on the finer grid.
 const ROSE: f64 = 5e-4;
 
-/// Where a fit ended on its finest grid, and its estimate at step 0.
+/// Optimum on the finest grid, and its extrapolation to zero step.
 #[derive(Clone)]
 pub struct Optimum<'a> {
     /// The optimum of the finest grid.
     pub attempt: Attempt,
     /// That grid.
     pub grid: Grid<'a>,
-    /// Parameters at step 0, as far as two grids tell them.
+    /// Parameters extrapolated to zero step from two grids.
     pub estimate: Vec<f64>,
-    /// Whether halving the step moved no estimate by a tenth of its standard error.
+    /// True if halving the step changed no estimate by more than a tenth of its standard error.
     pub settled: bool,
     covariance: Vec<f64>,
 }
 
-/// An optimum with all that describes it.
+/// Optimum with its covariance, noise levels and residuals.
 #[derive(Debug, Clone, PartialEq)]
 pub struct Finished {
     /// The optimum of the finest grid.
     pub attempt: Attempt,
-    /// Its weights.
+    /// Weights at the optimum.
     pub weights: Weights,
-    /// Pulses a sample interval of that grid.
+    /// Block pulses per sampling interval of that grid.
     pub every: usize,
-    /// Parameters at step 0, within bounds.
+    /// Parameters extrapolated to zero step, within bounds.
     pub estimate: Vec<f64>,
-    /// Whether halving the step moved no estimate by a tenth of its standard error.
+    /// True if halving the step changed no estimate by more than a tenth of its standard error.
     pub settled: bool,
-    /// Of the parameters, by rows.
+    /// Row-major covariance of the parameters.
     pub covariance: Vec<f64>,
-    /// Standard deviation of the residuals by output; under a robust loss from the median of their sizes.
+    /// Standard deviation of the residuals by output; with a robust loss from the median absolute residual.
     pub noise: Vec<f64>,
-    /// Residuals over the noise by run and output; not a number where none was read.
+    /// Residuals in units of the noise by run and output; NaN for missing samples.
     pub residuals: Vec<Vec<Vec<f64>>>,
-    /// What a robust loss did; none for squares.
+    /// Counts of downweighted residuals of a robust loss; None for squares.
     pub robust: Option<Robust>,
 }
 
-/// Halves the step until that moves the estimate by little of its standard error.
+/// Halve the step until the estimate changes by a small part of its standard error.
 ///
-/// A coarse grid may lead along a flat valley to where equations end, and there a finer one leads nowhere: then others have
-/// their way on it as well.
+/// On a coarse grid an optimization can follow a flat valley to the limit of its domain, where a finer grid makes no
+/// progress. Then the other survivors are optimized on the finer grid as well.
 ///
 /// # Errors
-/// Those of [`settled`] and of [`covariance`].
+/// As [`fit_reweighted`] and [`covariance`].
 pub fn refined<'a>(best: Attempt, grid: Grid<'a>, loss: Loss, others: &[Place]) -> Result<Optimum<'a>> {
     let clock = grid.clock();
     let (mut best, mut grid, mut others) = (best, grid, others);
     let (mut estimate, mut still, mut before) = (best.values(), false, None::<Attempt>);
     let mut spread = None;
     while !still && grid.sampling.every < FINEST {
-        // On a finer grid residuals may shrink to their noise, so weights follow anew.
+        // Residuals can shrink to the noise on a finer grid, so the weights are iterated again.
         let half = grid.finer()?;
         let start = expected(&half, &clock, &best, before.as_ref())?;
         let (finer, fine) = match settled(&start, half.clone(), loss) {
-            // Where two grids point there may be no free run.
+            // The extrapolated start may have no finite simulation.
             Err(error) if error != Error::Interrupted => settled(&best.place, half, loss)?,
             found => found?,
         };
@@ -77,10 +76,10 @@ pub fn refined<'a>(best: Attempt, grid: Grid<'a>, loss: Loss, others: &[Place]) 
         let mut fine = fine;
         if (finer.status == Status::Wall && before.is_none()) || (rose && !others.is_empty()) {
             let freed = freed(&finer, &fine, others, loss)?;
-            // They have had their way.
+            // The other survivors are tried once.
             others = &[];
             if let Some((other, there)) = freed {
-                // Two grids have two optima, of which they tell nothing together.
+                // The two grids have different optima, so they cannot be extrapolated.
                 (before, spread) = (None, None);
                 estimate = other.values();
                 (best, grid) = (other, there);
@@ -91,8 +90,8 @@ pub fn refined<'a>(best: Attempt, grid: Grid<'a>, loss: Loss, others: &[Place]) 
         let (there, here) = (finer.values(), best.values());
         let found = covariance(&finer, &grid)?;
         let errors = clock.errors(&there, &found);
-        // The scheme is of second order, so two grids tell the limit (Richardson); a third tells whether that is so. Of a
-        // flat valley in which neither stood still, or of two fits that a wall stopped, they tell nothing.
+        // The scheme is of second order: Richardson extrapolation of two grids gives the limit, a third grid confirms
+        // it. Optimizations that did not converge cannot be extrapolated.
         let mut limit = there.clone();
         if finer.converged() && best.converged() {
             limit = beyond(&grid, &clock, &there, &here, 3.0)?;
@@ -111,16 +110,16 @@ pub fn refined<'a>(best: Attempt, grid: Grid<'a>, loss: Loss, others: &[Place]) 
 }
 
 impl<'a> Optimum<'a> {
-    /// An optimum of a grid that is not refined.
+    /// Optimum of a grid without refinement.
     ///
     /// # Errors
-    /// Those of [`covariance`].
+    /// As [`covariance`].
     pub fn unrefined(attempt: Attempt, grid: Grid<'a>) -> Result<Self> {
         let covariance = covariance(&attempt, &grid)?;
         Ok(Self { estimate: attempt.values(), settled: true, covariance, attempt, grid })
     }
 
-    /// The optimum with its covariance, its noise and its residuals.
+    /// Compute covariance, noise levels and residuals of the optimum.
     #[must_use]
     pub fn finished(self) -> Finished {
         let Self { attempt, grid, estimate, settled, covariance } = self;
@@ -141,14 +140,14 @@ impl<'a> Optimum<'a> {
     }
 }
 
-/// Where two grids point from the finer one, a share of the way that led there.
+/// Extrapolate two grids beyond the finer one, by the difference divided by `share`.
 fn beyond(grid: &Grid<'_>, clock: &Clock, fine: &[f64], coarse: &[f64], share: f64) -> Result<Vec<f64>> {
     let (fine, coarse) = (clock.told(fine), clock.told(coarse));
     let ahead: Vec<f64> = fine.iter().zip(&coarse).map(|(f, c)| f + (f - c) / share).collect();
     Ok(clock.untold(&grid.problem.feasible(&fine, &ahead)?))
 }
 
-/// Where to begin on half the step: what moved the optimum from the last grid to this moves it a quarter as far.
+/// Start on half the step: the optimum is expected to move a quarter as far as at the last halving.
 fn expected(grid: &Grid<'_>, clock: &Clock, best: &Attempt, before: Option<&Attempt>) -> Result<Place> {
     match before {
         Some(before) if best.converged() && before.converged() => {
@@ -158,8 +157,9 @@ fn expected(grid: &Grid<'_>, clock: &Clock, best: &Attempt, before: Option<&Atte
     }
 }
 
-/// Another attempt on the grid of one that a wall stopped, its weights settled, if that leaves less; none that grows where
-/// the grid is steady.
+/// Best other candidate, with converged weights, if it fits better than one stopped at the limit of its domain.
+///
+/// Unstable candidates are excluded if the objective requires stability.
 ///
 /// # Errors
 /// [`Error::Interrupted`].
@@ -184,15 +184,15 @@ pub fn freed<'a>(
     Ok(best)
 }
 
-/// Minus the logarithm of the likelihood per sample, but for a constant.
+/// Negative log-likelihood per sample, up to a constant.
 fn likelihood(attempt: &Attempt, grid: &Grid<'_>) -> f64 {
     grid.levels(attempt).iter().zip(&grid.weights.outputs).map(|(level, w)| libm::log(level.max(1e-300) / w)).sum()
 }
 
-/// What is nearer to the truth on half the step, the limit that two grids tell or the optimum of the finer one.
+/// Select the extrapolated limit or the optimum of the finer grid, whichever fits better on half the step.
 ///
-/// Along the bottom of a flat and curved valley, where numbers cannot be told apart, a straight line leads out of it. Where
-/// the residuals follow it there is none, and a limit on which grids agree is nearer.
+/// Extrapolation along a straight line leaves a flat curved valley of poorly determined parameters. If the residuals
+/// are linear along the line and the grids agree, the limit is better.
 fn nearer(best: &Attempt, grid: &Grid<'_>, limit: Vec<f64>, clock: &Clock, settled: bool) -> Result<Vec<f64>> {
     let here = best.values();
     let moved: Vec<f64> = clock.told(&limit).iter().zip(clock.told(&here)).map(|(a, b)| a - b).collect();
@@ -202,7 +202,7 @@ fn nearer(best: &Attempt, grid: &Grid<'_>, limit: Vec<f64>, clock: &Clock, settl
     }
     let length = |row: &[f64]| inner(row, row).sqrt();
     if inner(&way, &way) <= REFINED * REFINED {
-        // Both leave the same.
+        // Both have the same residuals.
         return Ok(limit);
     }
     let ahead = best.at(&limit);
@@ -218,7 +218,7 @@ fn nearer(best: &Attempt, grid: &Grid<'_>, limit: Vec<f64>, clock: &Clock, settl
     let finer = match grid.finer() {
         Ok(finer) => finer,
         Err(Error::Interrupted) => return Err(Error::Interrupted),
-        // Neither has a free run there.
+        // Neither can be simulated on half the step.
         Err(_) => return Ok(limit),
     };
     let mut costs = [f64::INFINITY; 2];

@@ -1,42 +1,37 @@
-//! The linear problem at a point of a search, and its steps: damped, within bounds, with a learnt curvature or without.
+//! Steps of a nonlinear least-squares problem: problem trait, damped step, secant curvature, valley extrapolation.
 //!
-//! What a sum of squares must say of itself to be minimised.
+//! With an incomplete model the residuals stay large, and in an ill-conditioned valley the second-order part is as
+//! large as JᵀJ. Gauss–Newton then converges slowly. The secant updates of Dennis, Gay & Welsch (NL2SOL,
+//! doi:10.1145/355958.355965) need no evaluation, and are used only if they predict the cost better.
 //!
-//! What Gauss–Newton leaves out of the curvature of a sum of squares: Σ e ∇²e, learnt from the steps that were taken.
-//!
-//! Where a model leaves out a part of a machine its residuals stay large, and along a valley their own curvature is as
-//! large as that of the columns: Gauss–Newton then creeps. The secant updates of Dennis, Gay & Welsch (NL2SOL,
-//! doi:10.1145/355958.355965) cost no evaluation, and are used only where they foretell the cost better.
-//!
-//! Leaps along the bottom of a curved valley, where steps that lower the cost are short beside the way that is left.
-//!
-//! Numbers that data hardly tell apart make a valley that bends: steps follow its bottom one short chord after another, all
-//! in one direction. What they came to together is repeated a few times over in one leap, from the end of which ordinary
-//! steps lead down to the bottom again; where they do not soon end below the point that was left, the search goes on there.
+//! Poorly determined parameters cause a curved valley, along which successive steps have nearly the same direction. The
+//! sum of the last steps is multiplied and tried as one extrapolation step. Ordinary steps follow from there. If they
+//! do not soon reach a lower cost, the search returns to the point before the extrapolation.
 
 use crate::error::Result;
 use crate::linalg::dense;
 use crate::linalg::orthogonal::norm;
 use crate::linalg::small::{self, back_substitute};
 
-/// Least damping: below it the factor's rounding damps more.
+/// Smallest damping; below it the rounding error of the factor dominates.
 pub(crate) const LEAST_DAMPING: f64 = 1e-12;
 
-/// The linear problem at a point: R of [J | e] with J in coordinates and unit columns, and what may move. What every
-/// evaluation solves for comes first, so that the lower part of R belongs to the rest with that projected out.
+/// Linearization of a problem at a point: R of [J | e] with J in coordinates and unit columns, and the free parameters.
+///
+/// Eliminated parameters come first, so that the lower part of R belongs to the others with these projected out.
 pub(crate) struct Linear {
     r: Vec<f64>,
-    /// The parameter at each place.
+    /// Parameter of each column.
     order: Vec<usize>,
-    /// Length of a coordinate's unit in scaled steps, 0 where nothing moves with it.
+    /// Norm of each column before scaling; 0 without effect.
     pub(crate) scales: Vec<f64>,
     /// Products of the unit columns with the residuals.
     gradient: Vec<f64>,
     /// Distances from the bounds, in scaled steps.
     room: Vec<(f64, f64)>,
-    /// What is left out of the steps.
+    /// True for parameters excluded from the steps.
     held: Vec<bool>,
-    /// How many every evaluation solves for.
+    /// Number of eliminated parameters.
     pub(crate) projected: usize,
     /// Norm of the residuals.
     pub(crate) norm: f64,
@@ -90,31 +85,32 @@ impl Linear {
         }
     }
 
-    /// Largest component of the gradient along what is free to move.
+    /// Largest gradient component of a free parameter.
     pub(crate) fn slope(&self) -> f64 {
         self.gradient.iter().zip(&self.held).filter(|(_, held)| !**held).fold(0.0, |a, (g, _)| a.max(g.abs()))
     }
 
-    /// Minimises ‖J s + e‖² + λ‖s‖² over what is free and within its bounds, and the share of the cost that falls.
+    /// Minimize ‖J s + e‖² + λ‖s‖² over the free parameters within bounds; return the step and its relative decrease of
+    /// the cost.
     pub(crate) fn step(&self, damping: f64) -> (Vec<f64>, f64) {
         let step = self.within(|held| Some(damped_step(&self.r, held, self.projected, damping))).unwrap_or_default();
         let falls = self.falls(&step, 0);
         (step, falls)
     }
 
-    /// The same with a learnt curvature, what every evaluation solves for left to it; none where that has no minimum.
+    /// Step with secant curvature over the parameters that are not eliminated; None if the model has no minimum.
     pub(crate) fn curved_step(&self, damping: f64, curvature: &Curvature) -> Option<(Vec<f64>, f64)> {
         let step = self.within(|held| self.curved(held, damping, curvature))?;
         let falls = self.falls(&step, self.projected) - self.bent(&step, curvature);
         Some((step, falls))
     }
 
-    /// Share of the cost that a learnt curvature adds along a scaled step.
+    /// Relative increase of the cost along a scaled step by the secant curvature.
     pub(crate) fn bent(&self, step: &[f64], curvature: &Curvature) -> f64 {
         curvature.along(&self.unscaled(step)) / (self.norm * self.norm).max(f64::MIN_POSITIVE)
     }
 
-    /// A step of what is free that pushes nothing out of its bounds.
+    /// Step of the free parameters within bounds, by an active-set iteration.
     fn within(&self, step_of: impl Fn(&[bool]) -> Option<Vec<f64>>) -> Option<Vec<f64>> {
         let mut held = self.held.clone();
         let mut step = loop {
@@ -132,7 +128,7 @@ impl Linear {
         Some(step)
     }
 
-    /// Share of the cost that falls along a step as the columns say, those before `first` projected out.
+    /// Relative decrease of the cost along a step predicted by JᵀJ, with the columns before `first` projected out.
     pub(crate) fn falls(&self, step: &[f64], first: usize) -> f64 {
         let k = step.len();
         let image = |i: usize| (i..k).map(|j| self.r[i * (k + 1) + j] * step[j]).sum::<f64>();
@@ -142,7 +138,7 @@ impl Linear {
         (-2.0 * along - moved) / (self.norm * self.norm).max(f64::MIN_POSITIVE)
     }
 
-    /// JᵀJ s in coordinates for a step in coordinates, by parameter, what every evaluation solves for projected out.
+    /// Product JᵀJ s in coordinates, by parameter, with the eliminated parameters projected out.
     pub(crate) fn columns_along(&self, step: &[f64]) -> Vec<f64> {
         let k = self.scales.len();
         let scaled: Vec<f64> = self.order.iter().zip(&self.scales).map(|(&i, scale)| step[i] * scale).collect();
@@ -163,7 +159,7 @@ impl Linear {
         out
     }
 
-    /// Gradient in coordinates, by parameter; 0 of what every evaluation solves for.
+    /// Gradient in coordinates, by parameter; 0 for eliminated parameters.
     pub(crate) fn gradient_by_parameter(&self) -> Vec<f64> {
         let mut out = vec![0.0; self.scales.len()];
         for (place, &i) in self.order.iter().enumerate().skip(self.projected) {
@@ -172,7 +168,7 @@ impl Linear {
         out
     }
 
-    /// Minimises the cost with a learnt curvature and damping; none where it is no minimum.
+    /// Minimize the quadratic model with secant curvature and damping; None if it is not positive definite.
     fn curved(&self, held: &[bool], damping: f64, curvature: &Curvature) -> Option<Vec<f64>> {
         let k = held.len();
         let free: Vec<usize> = (self.projected..k).filter(|&i| !held[i]).collect();
@@ -196,7 +192,7 @@ impl Linear {
         Some(step)
     }
 
-    /// A scaled step in the parameters' coordinates, by parameter.
+    /// Convert a scaled step to the coordinates, by parameter.
     pub(crate) fn unscaled(&self, step: &[f64]) -> Vec<f64> {
         let mut out = vec![0.0; step.len()];
         for ((&i, s), scale) in self.order.iter().zip(step).zip(&self.scales) {
@@ -206,8 +202,9 @@ impl Linear {
     }
 }
 
-/// Minimises ‖R s + e‖² + λ‖s‖² for the triangular factor of [J | e], with 0 for what is held; what is projected is hardly
-/// damped.
+/// Minimize ‖R s + e‖² + λ‖s‖² for the triangular factor of [J | e], with 0 for fixed parameters.
+///
+/// Eliminated parameters have the smallest damping.
 fn damped_step(r: &[f64], held: &[bool], projected: usize, damping: f64) -> Vec<f64> {
     let (k, free) = (held.len(), (0..held.len()).filter(|&j| !held[j]).collect::<Vec<_>>());
     if free.is_empty() {
@@ -238,17 +235,19 @@ fn damped_step(r: &[f64], held: &[bool], projected: usize, damping: f64) -> Vec<
     step
 }
 
-/// A sum of squares to minimise.
+/// Nonlinear least-squares problem.
 pub trait Problem {
-    /// What the residuals depend on.
+    /// Argument of the residuals.
     type Point: Clone;
-    /// Residuals at a point, with whatever their derivatives there need.
+    /// Residuals at a point, and intermediates for their derivatives.
     type Evaluation;
 
-    /// Evaluates a point. [`crate::error::Error::Diverged`] and [`crate::error::Error::LeadingZero`] mean that a step went too far: it is shortened.
+    /// Evaluate a point.
+    ///
+    /// After [`crate::error::Error::Diverged`] and [`crate::error::Error::LeadingZero`] the step is shortened.
     ///
     /// # Errors
-    /// Any other error ends the search.
+    /// Any other error terminates the minimization.
     fn evaluate(&self, point: &Self::Point) -> Result<Self::Evaluation>;
 
     /// The residuals of an evaluation.
@@ -257,63 +256,63 @@ pub trait Problem {
     /// Derivatives of the residuals with respect to every parameter, one column each.
     ///
     /// # Errors
-    /// As [`Problem::evaluate`]; [`crate::error::Error::Diverged`] counts as a step too far.
+    /// As [`Problem::evaluate`]; [`crate::error::Error::Diverged`] shortens the step.
     fn jacobian(&self, point: &Self::Point, evaluation: &Self::Evaluation) -> Result<Vec<Vec<f64>>>;
 
-    /// The point moved by steps in the parameters' coordinates, within its bounds, and the largest relative move.
+    /// Move a point by steps in the coordinates, within bounds; return it and the largest relative change.
     fn moved(&self, point: &Self::Point, steps: &[f64]) -> (Self::Point, f64);
 
-    /// The point to which an evaluation belongs, where it solved for parameters in which the residuals are linear.
+    /// Point of an evaluation, with the eliminated linear parameters at their optimum.
     fn settled(&self, _evaluation: &Self::Evaluation, point: Self::Point) -> Self::Point {
         point
     }
 
-    /// Whether every evaluation solves for a parameter: its steps need no damping.
+    /// True if every evaluation eliminates a parameter; its steps need no damping.
     fn projected(&self, _parameter: usize) -> bool {
         false
     }
 
-    /// Derivative of a parameter with respect to the coordinate in which it is stepped.
+    /// Derivative of a parameter with respect to its coordinate.
     fn stretch(&self, _point: &Self::Point, _parameter: usize) -> f64 {
         1.0
     }
 
-    /// Other parameters that move with a parameter's coordinate, and how much.
+    /// Derivatives of other parameters with respect to the coordinate of a parameter, as (index, derivative).
     fn carried(&self, _point: &Self::Point, _parameter: usize) -> Vec<(usize, f64)> {
         Vec::new()
     }
 
-    /// How far a parameter may move down and up in its coordinate before it stands on a bound.
+    /// Distance of a parameter from its lower and upper bound, in its coordinate.
     fn room(&self, _point: &Self::Point, _parameter: usize) -> (f64, f64) {
         (f64::INFINITY, f64::INFINITY)
     }
 
-    /// Whether the cost may have corners along a parameter: a minimum there has no slope.
+    /// True if the cost can have kinks along a parameter, so that its gradient need not vanish at a minimum.
     fn kinked(&self, _point: &Self::Point, _parameter: usize) -> bool {
         false
     }
 
-    /// Norm of what the residuals are differences of, which bounds their rounding.
+    /// Norm of the signals whose difference the residuals are; it bounds their rounding error.
     fn size(&self, _evaluation: &Self::Evaluation) -> f64 {
         0.0
     }
 
-    /// Whether a point may be trusted: from one that may, no step leads to one that may not.
+    /// True if a point is admissible. No step leads from an admissible point to one that is not.
     fn trusted(&self, _point: &Self::Point) -> bool {
         true
     }
 
-    /// Whether a search may leap along valleys: not where many starts are to find an optimum each, which a leap may pass.
+    /// True if the minimization may extrapolate along valleys. A multistart disables it, to keep distinct optima.
     fn leaps(&self) -> bool {
         true
     }
 }
-/// A model must be better by this factor at the last step to be taken for the next one.
+/// Ratio of the prediction errors at the last step above which the better model is used for the next one.
 const BETTER: f64 = 1.5;
-/// Predictions closer to the truth than this share of the fall are both right.
+/// Relative prediction error below which Gauss–Newton is accurate enough.
 const RIGHT: f64 = 0.1;
 
-/// The learnt matrix, in the coordinates of the steps, and whether it is used.
+/// Secant approximation of the second-order part, in the coordinates of the steps.
 pub(crate) struct Curvature {
     count: usize,
     matrix: Vec<f64>,
@@ -322,17 +321,17 @@ pub(crate) struct Curvature {
 }
 
 impl Curvature {
-    /// Nothing known of so many parameters.
+    /// Zero matrix for `count` parameters.
     pub(crate) fn new(count: usize) -> Self {
         Self { count, matrix: vec![0.0; count * count], learnt: false, used: false }
     }
 
-    /// Whether it is of so many parameters.
+    /// True if the matrix has `count` rows.
     pub(crate) fn is_for(&self, count: usize) -> bool {
         self.count == count
     }
 
-    /// An element of the matrix.
+    /// Element (i, j) of the matrix.
     pub(crate) fn at(&self, i: usize, j: usize) -> f64 {
         self.matrix[i * self.count + j]
     }
@@ -341,12 +340,12 @@ impl Curvature {
         self.matrix.chunks_exact(self.count.max(1)).map(|row| row.iter().zip(step).map(|(a, s)| a * s).sum()).collect()
     }
 
-    /// Its share of the second-order change of twice the cost along a step.
+    /// Second-order change of twice the cost along a step, by this matrix.
     pub(crate) fn along(&self, step: &[f64]) -> f64 {
         self.times(step).iter().zip(step).map(|(a, s)| a * s).sum()
     }
 
-    /// Compares what was foretold without the matrix, and with it, with the fall of the cost.
+    /// Decide on the use of the matrix by comparing predictions without and with it to the actual decrease.
     pub(crate) fn judge(&mut self, without: f64, with: f64, fall: f64) {
         let (missed, missed_with) = ((without - fall).abs(), (with - fall).abs());
         if self.used {
@@ -356,7 +355,7 @@ impl Curvature {
         }
     }
 
-    /// Learns from a step after which the gradient had changed by `change`, of which `columns` is what the columns say.
+    /// Update the matrix by a step: `change` of the gradient, and `columns`, the part of it due to JᵀJ.
     pub(crate) fn learn(&mut self, step: &[f64], change: &[f64], columns: &[f64]) {
         let dot = |a: &[f64], b: &[f64]| a.iter().zip(b).map(|(x, y)| x * y).sum::<f64>();
         let wanted: Vec<f64> = change.iter().zip(columns).map(|(y, c)| y - c).collect();
@@ -365,7 +364,7 @@ impl Curvature {
         if !(scale.is_finite() && scale.abs() > 1e-6 * size && size > 0.0) {
             return;
         }
-        // What was learnt elsewhere counts no more than what is seen here.
+        // Sizing: earlier updates must not exceed the curvature observed along this step.
         let before = self.along(step);
         let sizing = if before == 0.0 { 1.0 } else { (dot(step, &wanted) / before).abs().min(1.0) };
         self.matrix.iter_mut().for_each(|v| *v *= sizing);
@@ -383,33 +382,33 @@ impl Curvature {
         }
     }
 }
-/// Steps on which a leap is founded.
+/// Number of steps that are extrapolated.
 const STEPS: usize = 4;
-/// Of the length of these steps the share that their sum has at least: else they lead nowhere together.
+/// Ratio of the norm of the sum of the steps to the sum of their norms below which they have no common direction.
 const STRAIGHT: f64 = 0.8;
-/// Share of the cost that a step lowers at most: who gets on needs no leap.
+/// Relative decrease of the cost per step above which no extrapolation is needed.
 const CREEPS: f64 = 1e-3;
-/// Evaluations within which a leap must come to something.
+/// Evaluations after an extrapolation within which the cost must decrease.
 const PATIENCE: usize = 6;
-/// How often the sum of the steps is repeated, at first and at most.
+/// Factor of the sum of the steps, initially and at most.
 const REACH: f64 = 2.0;
 const FARTHEST: f64 = 16.0;
 
-/// The last steps of a search, and the point that it left by a leap.
+/// Last steps of a minimization, and the point before a trial extrapolation.
 pub(crate) struct Valley<P> {
     steps: Vec<Vec<f64>>,
     reach: f64,
-    /// Where it leapt from, what it cost there, and after how many evaluations.
+    /// Point before the extrapolation, its cost, and the number of evaluations.
     left: Option<(P, f64, usize)>,
 }
 
 impl<P> Valley<P> {
-    /// Nothing known.
+    /// Extrapolation without recorded steps.
     pub(crate) fn new() -> Self {
         Self { steps: Vec::new(), reach: REACH, left: None }
     }
 
-    /// Takes a step, in coordinates, that lowered the cost by a share of it.
+    /// Record a step in coordinates and its relative decrease of the cost.
     pub(crate) fn moved(&mut self, step: &[f64], gain: f64) {
         if gain > CREEPS {
             self.steps.clear();
@@ -418,7 +417,7 @@ impl<P> Valley<P> {
         }
     }
 
-    /// The leap that the last steps ask for, if that many evaluations are left for it.
+    /// Extrapolation step from the last steps, if they are straight and enough evaluations are left.
     pub(crate) fn leap(&mut self, evaluations: usize) -> Option<Vec<f64>> {
         if self.left.is_some() || self.steps.len() < STEPS || evaluations <= PATIENCE {
             return None;
@@ -431,18 +430,18 @@ impl<P> Valley<P> {
         straight.then(|| sum.iter().map(|s| self.reach * s).collect())
     }
 
-    /// The search leapt from this point, at this cost.
+    /// Begin a trial extrapolation from this point and cost.
     pub(crate) fn left(&mut self, from: P, cost: f64, evaluations: usize) {
         self.left = Some((from, cost, evaluations));
     }
 
-    /// A leap led nowhere.
+    /// Reject the trial extrapolation.
     pub(crate) fn fell(&mut self) {
         self.reach = (0.5 * self.reach).max(1.0);
         self.steps.clear();
     }
 
-    /// The point that was left, where the leap from it has come to nothing; a search that ends has no time left.
+    /// Point to return to if the trial extrapolation failed; also if the search terminates during the trial.
     pub(crate) fn outcome(&mut self, cost: f64, evaluations: usize, ends: bool) -> Option<P> {
         let (from, least, since) = self.left.take()?;
         if cost < least {

@@ -1,50 +1,50 @@
-//! Nonlinear least squares by Levenberg–Marquardt, for any problem that can say its residuals and their derivatives.
+//! Nonlinear least squares with bounds by Levenberg–Marquardt.
 //!
-//! Columns are scaled by the Jacobian's norms, steps follow from a QR factor of [J | e] with the damping below it, and a
-//! rejected step costs no Jacobian. A problem says itself how a point moves: in which coordinates, and within which bounds.
-//! What stands on a bound and is pushed out of it is left out of step and gradient, so that the rest moves on.
+//! Columns are scaled by the column norms of the Jacobian. Steps follow from a QR factor of [J | e] with the damping
+//! below it. A rejected step costs no Jacobian. The problem defines the coordinates and bounds of its parameters.
+//! Parameters at an active bound are excluded from step and gradient.
 //!
-//! Where Gauss–Newton foretells the fall of the cost badly, what it leaves out is learnt (`Curvature`); along a valley
-//! the search leaps (`Valley`).
+//! If Gauss–Newton predicts the decrease of the cost badly, secant updates of the second-order part are used. Along an
+//! ill-conditioned valley, several steps are extrapolated.
 //!
-//! A minimum is where the gradient vanishes, and nothing else is called one: the cosine between the residuals and every
-//! column that is free to move, the relative offset of Dennis & Schnabel (doi:10.1137/1.9781611971200, §7.2) and MINPACK.
+//! Convergence means a vanishing gradient: the cosine between the residuals and every free column, as in Dennis &
+//! Schnabel (doi:10.1137/1.9781611971200, §7.2) and MINPACK.
 
 pub use super::damped_step::Problem;
 
 use super::damped_step::{Curvature, Linear, Valley, LEAST_DAMPING};
 use crate::error::{check_length, Error, Result};
 
-/// Damping of the first step: near Gauss–Newton's, yet safe where a start is some tens of percent off.
+/// Damping of the first step: close to Gauss–Newton, but safe for an initial guess that is off by some tens of percent.
 const FIRST_DAMPING: f64 = 1e-3;
-/// Damping beyond which a step is shorter than rounding.
+/// Damping above which a step is at rounding level.
 const LARGEST_DAMPING: f64 = 1e12;
-/// A step as good as its prediction lowers the damping by this factor, a rejected one raises it by as much.
+/// Factor by which an accurately predicted step decreases the damping and a rejected step increases it.
 const FACTOR: f64 = 10.0;
-/// Share of the predicted fall of the cost that a step reaches whose damping is right.
+/// Ratio of actual to predicted decrease of the cost above which the damping is decreased.
 const FAIR: f64 = 0.25;
-/// Residuals that are differences of signals carry rounding of this share of them at most, once no step lowers the cost.
+/// Rounding error of the residuals relative to the signals, for the convergence test if no step decreases the cost.
 const ROUNDING: f64 = 1e-10;
 
-/// Where the search for the optimum ended.
+/// Reason of termination.
 #[derive(Debug, Clone, Copy, PartialEq, Eq)]
 pub enum Status {
-    /// The gradient is zero, but for what pushes out of a bound and for rounding.
+    /// The gradient is zero up to rounding, except at active bounds.
     Converged,
-    /// The last allowed evaluation still moved.
+    /// The budget of evaluations is exhausted.
     Exhausted,
-    /// No step lowers the cost although the gradient is not zero.
+    /// No step decreases the cost although the gradient is not zero.
     Stalled,
-    /// The way down leads where the problem has no value, or none that may be trusted.
+    /// The descent direction leaves the domain of the problem: the value is not finite or not admissible.
     Wall,
 }
 
-/// How long to search.
+/// Termination criteria.
 #[derive(Debug, Clone, Copy, PartialEq)]
 pub struct Settings {
-    /// Most evaluations of the residuals; 0 for those of the start without their derivatives.
+    /// Maximum number of residual evaluations; 0 for the residuals of the initial guess without derivatives.
     pub evaluations: usize,
-    /// Share of the cost by which a Gauss–Newton step lowers it at a minimum, and so the square of the gradient's cosine.
+    /// Relative decrease of the cost by a Gauss–Newton step at convergence: the square of the cosine of the gradient.
     pub tolerance: f64,
 }
 
@@ -54,7 +54,7 @@ impl Default for Settings {
     }
 }
 
-/// A minimum, or where the search for it ended.
+/// Result of a minimization.
 #[derive(Debug, Clone, PartialEq)]
 pub struct Minimum<P, E> {
     /// The best point.
@@ -63,11 +63,11 @@ pub struct Minimum<P, E> {
     pub evaluation: E,
     /// Half the sum of squared residuals.
     pub cost: f64,
-    /// Derivatives of the residuals there, one column a parameter; none where only residuals were asked for.
+    /// Derivatives of the residuals, one column per parameter; empty if only residuals were requested.
     pub jacobian: Vec<Vec<f64>>,
-    /// Evaluations of residuals.
+    /// Number of residual evaluations.
     pub evaluations: usize,
-    /// How it ended.
+    /// Reason of termination.
     pub status: Status,
 }
 
@@ -76,11 +76,12 @@ fn cost(residuals: &[f64]) -> f64 {
     0.5 * residuals.iter().map(|e| e * e).sum::<f64>()
 }
 
-/// Minimises half the sum of squared residuals from a start. An evaluation costs what the problem says, a step O(k² N)
-/// for k parameters and N residuals.
+/// Minimize half the sum of squared residuals from an initial guess.
+///
+/// A step costs O(k² N) for k parameters and N residuals, in addition to the evaluations.
 ///
 /// # Errors
-/// As the problem's own at the start; [`Error::Length`] for columns of the Jacobian that do not match the residuals.
+/// Those of the problem at the initial guess; [`Error::Length`] for a Jacobian that does not match the residuals.
 ///
 /// ```
 /// use ftlm::error::Result;
@@ -102,13 +103,13 @@ fn cost(residuals: &[f64]) -> f64 {
 ///     fn jacobian(&self, x: &f64, _: &[f64; 1]) -> Result<Vec<Vec<f64>>> {
 ///         Ok(vec![vec![2.0 * x]])
 ///     }
-///     fn moved(&self, x: &f64, steps: &[f64]) -> (f64, f64) {
+///     fn apply_step(&self, x: &f64, steps: &[f64]) -> (f64, f64) {
 ///         (x + steps[0], steps[0].abs())
 ///     }
 /// }
 ///
 /// # fn main() -> Result<()> {
-/// let found = minimise(&Root, 1.0, Settings::default())?;
+/// let found = minimize(&Root, 1.0, Settings::default())?;
 /// assert!((found.point - 2.0_f64.sqrt()).abs() < 1e-9);
 /// # Ok(())
 /// # }
@@ -154,7 +155,7 @@ pub fn minimise<P: Problem>(
     }
 }
 
-/// A point with all that the next step from it is made of.
+/// State of the iteration: point, evaluation, Jacobian, damping and curvature.
 struct At<P: Problem> {
     point: P::Point,
     evaluation: P::Evaluation,
@@ -174,22 +175,22 @@ impl<P: Problem> At<P> {
     }
 }
 
-/// What one step came to: its coordinates and the share of the cost that fell, or the end.
+/// Result of one iteration: the step in coordinates and its relative decrease of the cost, or termination.
 enum Advance {
     Moved(Vec<f64>, f64),
     Ended(Status),
 }
 
-/// What a search knows beside where it is.
+/// Settings and progress of a minimization.
 struct Search<'a, P> {
     problem: &'a P,
     settings: Settings,
     evaluations: usize,
-    /// Share of the cost by which the last step lowered it.
+    /// Relative decrease of the cost by the last step.
     gain: f64,
-    /// Whether the last step that was tried led where there is no value.
+    /// True if the last trial step left the domain of the problem.
     hit: bool,
-    /// Whether parameters stay that have corners.
+    /// True if parameters with kinks are kept fixed.
     corners: bool,
 }
 
@@ -201,7 +202,7 @@ impl<P: Problem> Search<'_, P> {
         Ok(jacobian)
     }
 
-    /// The start, without its derivatives.
+    /// Evaluate the initial guess, without derivatives.
     fn start(&self, start: P::Point) -> Result<At<P>> {
         let evaluation = self.problem.evaluate(&start)?;
         let point = self.problem.settled(&evaluation, start);
@@ -210,12 +211,12 @@ impl<P: Problem> Search<'_, P> {
         Ok(At { point, evaluation, cost, jacobian: Vec::new(), trusted, damping, curvature, before: None })
     }
 
-    /// Forgets how the last steps went.
+    /// Reset the progress of the last steps.
     fn anew(&mut self) {
         (self.gain, self.hit) = (f64::INFINITY, false);
     }
 
-    /// Where a leap leads, in coordinates; none where the problem has no value or none that may be trusted.
+    /// Evaluate an extrapolation step; None if it leaves the domain of the problem.
     fn landed(&mut self, from: &At<P>, leap: &[f64]) -> Result<Option<At<P>>> {
         let next = self.problem.moved(&from.point, leap).0;
         self.evaluations += 1;
@@ -230,10 +231,10 @@ impl<P: Problem> Search<'_, P> {
         }
     }
 
-    /// One step that lowers the cost, or why there is none.
+    /// Make one step that decreases the cost, or return the reason of termination.
     fn advance(&mut self, at: &mut At<P>) -> Result<Advance> {
         let (problem, settings) = (self.problem, self.settings);
-        // The gradient's cosine at a minimum: its square is a share of the cost.
+        // Cosine of the gradient at convergence; its square is a relative decrease of the cost.
         let flat = settings.tolerance.max(f64::EPSILON).sqrt();
         loop {
             if self.evaluations >= settings.evaluations {
@@ -253,7 +254,7 @@ impl<P: Problem> Search<'_, P> {
             let level = slope <= flat * linear.norm;
             let (newton, falls) = linear.step(LEAST_DAMPING);
             let nowhere = problem.moved(&at.point, &linear.unscaled(&newton)).1 <= settings.tolerance;
-            // A flat gradient along a valley may still have far to go: a whole step says so, unless none has led anywhere.
+            // In a valley a small gradient can still be far from the minimum: check the predicted decrease as well.
             if nowhere || (level && (falls <= settings.tolerance || self.gain <= settings.tolerance)) {
                 return Ok(Advance::Ended(Status::Converged));
             }
@@ -263,13 +264,13 @@ impl<P: Problem> Search<'_, P> {
             self.hit = false;
             match self.lowered(at, &linear, (slope, level))? {
                 Some(advance) => return Ok(advance),
-                // What has corners stays, and the rest goes on.
+                // Fix the parameters with kinks and continue with the others.
                 None => (self.corners, at.damping, self.gain) = (true, FIRST_DAMPING, f64::INFINITY),
             }
         }
     }
 
-    /// Steps ever shorter until one lowers the cost; none where parameters with corners are to stay first.
+    /// Shorten the step until it decreases the cost; None if parameters with kinks must be fixed first.
     fn lowered(&mut self, at: &mut At<P>, linear: &Linear, (slope, level): (f64, bool)) -> Result<Option<Advance>> {
         let (problem, settings) = (self.problem, self.settings);
         loop {
@@ -283,7 +284,7 @@ impl<P: Problem> Search<'_, P> {
             let steps = linear.unscaled(&step);
             let (next, moved) = problem.moved(&at.point, &steps);
             if moved <= settings.tolerance || at.damping > LARGEST_DAMPING {
-                // No step lowers the cost any more: at its bottom, for rounding, at a wall or at a corner.
+                // No step decreases the cost: converged, at rounding level, at the domain limit or at a kink.
                 return Ok(if level || slope <= ROUNDING * problem.size(&at.evaluation) {
                     Some(Advance::Ended(Status::Converged))
                 } else if self.hit {
@@ -299,7 +300,7 @@ impl<P: Problem> Search<'_, P> {
             }
             self.evaluations += 1;
             let trusts = problem.trusted(&next);
-            // A step that lowers nothing, or leaves the numbers, is shortened.
+            // A step that does not decrease the cost or overflows is shortened.
             let tried = problem.evaluate(&next).and_then(|found| {
                 let reached = cost(problem.residuals(&found));
                 if !reached.is_finite() || (at.trusted && !trusts) {

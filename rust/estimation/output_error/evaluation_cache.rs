@@ -1,5 +1,6 @@
-//! What the evaluations of one search have in common: kernels of orders that stay, their spectra, and of runs on one grid
-//! whatever does not depend on the run.
+//! Cache of kernels and spectra across the evaluations of one optimization.
+//!
+//! Kernels of unchanged orders, their spectra, and everything shared by runs on one grid are computed once.
 
 use std::cell::RefCell;
 use std::collections::HashMap;
@@ -12,30 +13,30 @@ use crate::error::Result;
 use crate::regressors::Record;
 use crate::series::Kernel;
 
-/// Powers of t that are kept of long records and of others.
+/// Maximum number of cached powers of t for long records, and for others.
 const FEW_POWERS: usize = 8;
 const MANY_POWERS: usize = 64;
 
-/// Runs of one grid are this share as long as the longest at least: shorter ones would pay for transforms of its length.
+/// Smallest length of a run relative to the longest on its grid; shorter runs would need unnecessarily long transforms.
 const AS_LONG: f64 = 0.7;
 
-/// What runs of one step and one filter share: kernels, powers of t, and A⁻¹ at the last point, as long as the longest.
+/// Cache of runs with the same step and filter: kernels, powers of t, and A⁻¹ at the last point, for the longest run.
 struct Grid {
-    /// A record of nothing, as long as the longest.
+    /// Zero record of the length of the longest run.
     bare: Record,
-    /// The filter that all its signals pass.
+    /// Sensor filter of all signals.
     filter: Option<Rc<Filter>>,
     runs: usize,
     /// The last operator of each term of each equation.
     operators: HashMap<(usize, usize), Rc<Operator>>,
-    /// Powers of t that initial terms bring, by the bits of their exponents.
+    /// Initial terms t^e, by the bits of their exponents.
     powers: HashMap<u64, Rc<Power>>,
-    /// What the last equations were, by the bits of their own terms, and their inverse.
+    /// Inverse of the last equations, with the bits of their autoregressive terms as key.
     solved: Option<(Vec<u64>, Rc<Solved>)>,
 }
 
 impl Grid {
-    /// Whether an experiment is on the grid of a longer one.
+    /// True if an experiment can share the cache of a longer one.
     fn holds(&self, experiment: &Experiment) -> bool {
         let record = &experiment.record;
         let filters = match (self.bare.filter(), record.filter()) {
@@ -51,19 +52,19 @@ impl Grid {
     }
 }
 
-/// What stays of one experiment from one evaluation to the next.
+/// Cache of one experiment across evaluations.
 pub(crate) struct Shelf {
     grid: Rc<RefCell<Grid>>,
-    /// Points of every series that is multiplied, in all factors together.
+    /// Length of the spectra.
     pub(crate) total: usize,
-    /// Spectra of signals that drive and have no free number.
+    /// Spectra of inputs without a free parameter.
     drivers: HashMap<(usize, bool), Rc<Kernel>>,
-    /// Weighted samples of impulses that the filter of an output gets, by output and the bits of their exponents.
+    /// Impulses at the sensor filters in weighted samples, by output and the bits of their exponents.
     impulses: HashMap<(usize, u64), Vec<f64>>,
 }
 
 impl Shelf {
-    /// One for each experiment; what is on one grid shares it.
+    /// One cache per experiment; experiments on the same grid share a part of it.
     ///
     /// # Errors
     /// As [`Record::new`].
@@ -97,10 +98,10 @@ impl Shelf {
         Ok(places.into_iter().map(shelf).collect())
     }
 
-    /// Answers to the powers t^e of equations, each with `m` pulses of `n` unknowns or more.
+    /// Responses to the initial terms t^e of equations, each with at least `m` pulses of `n` outputs.
     ///
     /// # Errors
-    /// As [`Solved::natural`].
+    /// As [`SystemInverse::initial_term_responses`].
     pub(crate) fn natural(
         &self,
         solved: &Solved,
@@ -116,26 +117,26 @@ impl Shelf {
         self.grid.borrow().bare.m()
     }
 
-    /// Whether other runs are on the grid.
+    /// True if other runs are on the grid.
     fn shared(&self) -> bool {
         self.grid.borrow().runs > 1
     }
 
-    /// The operator of a term that is integrated by `eta`; its order may be free.
+    /// Operator of a term of integration order `eta`.
     pub(crate) fn operator(&self, place: (usize, usize), eta: f64, free: bool) -> Rc<Operator> {
         let mut grid = self.grid.borrow_mut();
         if let Some(known) = grid.operators.get(&place).filter(|o| o.eta().to_bits() == eta.to_bits()) {
             return known.clone();
         }
         let (m, step) = (grid.bare.m(), grid.bare.step());
-        // Terms of one order are integrated alike, whatever they are of.
+        // Terms of the same order share an operator.
         let alike = grid.operators.values().find(|o| o.serves(eta, free)).cloned();
         let made = alike.unwrap_or_else(|| Rc::new(Operator::new(eta, free, m, step)));
         grid.operators.insert(place, made.clone());
         made
     }
 
-    /// The equations whose own terms have these bits, or what is made of them.
+    /// Inverse of the equations with these bits of autoregressive terms, computed by `made` if not cached.
     ///
     /// # Errors
     /// Those of `made`.
@@ -144,7 +145,7 @@ impl Shelf {
         match known {
             Some(solved) => Ok(solved),
             None => {
-                // What is past frees its memory before what follows takes its own.
+                // Free the memory of the old inverse before computing the new one.
                 self.grid.borrow_mut().solved = None;
                 let solved = Rc::new(made()?);
                 if self.shared() {
@@ -155,7 +156,8 @@ impl Shelf {
         }
     }
 
-    /// The spectrum of a signal that drives a term integrated by `eta`, for products of [`FACTORS`] series; of what an actuator makes of it.
+    /// Spectrum of the input of a term of integration order `eta`, after its input nonlinearity, for products of
+    /// [`SPECTRUM_FACTORS`] series.
     pub(crate) fn driver(
         &mut self,
         model: &FreeModel,
@@ -175,15 +177,15 @@ impl Shelf {
         self.drivers.entry((signal, eta < 0.0)).or_insert_with(made).clone()
     }
 
-    /// Of a series, for products of [`FACTORS`] of them.
+    /// Spectrum of a series, for products of [`SPECTRUM_FACTORS`] series.
     pub(crate) fn spectrum(&self, series: &[f64]) -> Rc<Kernel> {
         Rc::new(Kernel::with_length(series, self.total))
     }
 
-    /// What an initial term t^e adds, as long as the longest run.
+    /// Initial term t^e, of the length of the longest run.
     pub(crate) fn power(&self, exponent: f64) -> Rc<Power> {
         let mut grid = self.grid.borrow_mut();
-        // Exponents that move with free orders would fill the shelf.
+        // Exponents that change with free orders would fill the cache.
         if grid.powers.len() > if grid.bare.m() > KEPT_PULSES { FEW_POWERS } else { MANY_POWERS } {
             grid.powers.clear();
         }
@@ -195,17 +197,17 @@ impl Shelf {
         made
     }
 
-    /// What the filter makes of a series that is no signal of the record.
+    /// Filter a series that is no signal of the record.
     pub(crate) fn filtered(&self, series: &[f64]) -> Vec<f64> {
         self.grid.borrow().filter.as_ref().map_or_else(|| series.to_vec(), |filter| filter.of(series))
     }
 
-    /// Its spectrum, for a product with one more series.
+    /// Spectrum of the filtered series, for a product with one more series.
     pub(crate) fn filtered_spectrum(&self, series: &[f64]) -> Rc<Kernel> {
         Rc::new(filtered_spectrum(series, self.grid.borrow().filter.as_deref(), self.total))
     }
 
-    /// Weighted samples of an impulse, or of a derivative of one, that only the filter of an output gets.
+    /// Samples of the response of the sensor filter of an output to an impulse or its derivative, weighted.
     pub(crate) fn impulse(&mut self, experiment: &Experiment, output: usize, exponent: f64) -> Vec<f64> {
         let made = || {
             let mut means = vec![vec![0.0; experiment.record.m()]; experiment.samples.len()];

@@ -1,4 +1,4 @@
-//! One run to compare with, sample by sample.
+//! Experiment: one run whose samples are compared with the simulation.
 
 use std::sync::Arc;
 
@@ -7,51 +7,49 @@ use crate::regressors::{is_impulse, Record};
 use crate::series;
 use crate::signal::block_pulse::{Jumps, Readings};
 
-/// One run to compare with: pulse means on a grid of which every `every`-th edge is a sample.
+/// One run to compare with: pulse means on a grid with a sample at every `pulses_per_sample`-th edge.
 #[derive(Debug, Clone)]
 pub struct Experiment {
-    /// Pulse means of all signals; those of runs that differ in weights alone are the same.
+    /// Pulse means of all signals, shared by experiments that differ in weights only.
     pub record: Arc<Record>,
-    /// Pulses a sample interval.
+    /// Block pulses per sampling interval.
     pub every: usize,
     /// Point samples of each equation's output, one more than there are intervals.
     pub samples: Vec<Vec<f64>>,
-    /// Filter that simulated outputs pass before they are compared, where there is one: a series as long as the record,
-    /// and a flag for each output that passes it.
+    /// Sensor filter of the simulated outputs, if any: a series of the length of the record, and a flag per output.
     pub filter: Option<(Vec<f64>, Vec<bool>)>,
     /// 1/σ of each equation's output.
     pub weights: Vec<f64>,
-    /// What each signal is at the samples, for terms that feed through at once; empty: nothing but the pulse means.
+    /// Value of each signal at the sample times, for direct feedthrough; empty if only pulse means are known.
     pub instants: Vec<Instant>,
-    /// Share of its weight with which each compared sample of each output counts, 0 for one that was not read; empty: all
-    /// count alike.
+    /// Relative weight of each compared sample of each output, 0 for a missing sample; empty for unit weights.
     pub shares: Vec<Vec<f64>>,
-    /// When the samples were read, where that is not at every `every`-th edge.
+    /// Nonuniform sample times; None for uniform samples on the grid.
     pub own: Option<OwnTimes>,
-    /// Whether the signals of the record passed the filter already, and with them whatever follows from these.
+    /// True if the signals of the record, and thus the simulated outputs, have already passed the filter.
     passed: bool,
 }
 
-/// Samples at times of their own, all of which are compared.
+/// Nonuniform sample times, all of which are compared.
 #[derive(Debug, Clone, PartialEq)]
 pub struct OwnTimes {
-    /// When they were read.
+    /// Sample times.
     pub readings: Readings,
-    /// Jumps of each signal of the record that holds in between, near them.
+    /// Jumps near the samples of each zero-order-hold signal of the record; None for other signals.
     pub jumps: Vec<Option<Jumps>>,
 }
 
-/// A signal at the instants of the samples.
+/// Values of a signal at the sample times.
 #[derive(Debug, Clone, Default, PartialEq)]
 pub struct Instant {
-    /// Its values at the samples, after it changed; none: the mean of the pulses on either side.
+    /// Values at the samples, after a jump; None for the mean of the adjacent pulses.
     pub values: Option<Vec<f64>>,
-    /// Whether it holds in between, which decides what it is once it acts.
+    /// True for a zero-order hold between samples.
     pub held: bool,
 }
 
 impl Experiment {
-    /// An experiment without a filter.
+    /// Experiment without a filter.
     ///
     /// # Errors
     /// As [`Experiment::check`].
@@ -61,7 +59,7 @@ impl Experiment {
         Ok(experiment)
     }
 
-    /// An experiment whose samples were read at times of their own.
+    /// Experiment with nonuniform sample times.
     ///
     /// # Errors
     /// As [`Experiment::check`].
@@ -76,7 +74,7 @@ impl Experiment {
         Self { record: Arc::new(record), every, samples, filter, weights, instants, shares, own, passed: false }
     }
 
-    /// The same experiment, some of its compared samples counting less.
+    /// Set relative weights of the compared samples.
     ///
     /// # Errors
     /// As [`Experiment::check`].
@@ -86,7 +84,7 @@ impl Experiment {
         Ok(self)
     }
 
-    /// The same experiment, its outputs compared behind a filter.
+    /// Set the sensor filter of the simulated outputs.
     ///
     /// # Errors
     /// As [`Experiment::check`].
@@ -96,7 +94,7 @@ impl Experiment {
         Ok(self)
     }
 
-    /// The same experiment, with what each signal of the record is at the samples.
+    /// Set the values of the signals at the sample times.
     ///
     /// # Errors
     /// As [`Experiment::check`].
@@ -106,10 +104,11 @@ impl Experiment {
         Ok(self)
     }
 
-    /// Refuses what cannot be compared.
+    /// Check lengths and values.
     ///
     /// # Errors
-    /// [`Error::Structure`] where the pulses are no multiple of `every`, [`Error::Length`], [`Error::NotFinite`].
+    /// [`Error::Structure`] if the pulses are no multiple of `pulses_per_sample`, [`Error::Length`],
+    /// [`Error::NotFinite`].
     pub fn check(&self) -> Result<()> {
         let (m, every) = (self.record.m(), self.every);
         if every == 0 || m % every != 0 {
@@ -146,8 +145,9 @@ impl Experiment {
         check_length("weights", self.samples.len(), self.weights.len())
     }
 
-    /// The same experiment with its signals behind the filter, where all outputs pass it: equations and filter commute, and
-    /// what drives passes it once, what answers as often as it is asked for. None where that is not so.
+    /// Experiment with prefiltered signals, if all outputs pass the filter; None otherwise.
+    ///
+    /// Equations and filter commute, so that filtering the inputs once replaces filtering every simulated output.
     ///
     /// # Errors
     /// As [`Record::through`].
@@ -162,17 +162,17 @@ impl Experiment {
         }
     }
 
-    /// Whether an initial term of this exponent moves nothing but the filter of the output that is this signal.
+    /// True if an initial term of this exponent affects only the sensor filter of this output.
     pub(crate) fn moves_filter(&self, output: usize, exponent: f64) -> bool {
         is_impulse(exponent) && (self.passed || !self.record.is_filtered() || self.record.is_held(output))
     }
 
-    /// Whether an output passes a filter before it is compared, by itself or with all of its equation.
+    /// True if an output passes a sensor filter, alone or with its whole equation.
     pub(crate) fn behind_filter(&self, output: usize) -> bool {
         self.record.is_filtered() || self.filter.as_ref().is_some_and(|(_, applies)| applies[output])
     }
 
-    /// Samples that are compared: all that have a pulse on either side, or all that were read at times of their own.
+    /// Number of compared samples: those with a pulse on either side, or all nonuniform samples.
     pub(crate) fn compared(&self) -> usize {
         match &self.own {
             Some(own) => own.readings.len(),
@@ -180,19 +180,19 @@ impl Experiment {
         }
     }
 
-    /// The compared ones of values at the samples.
+    /// Part of the values at the samples that is compared.
     fn inner<'a>(&self, values: &'a [f64]) -> &'a [f64] {
         let first = usize::from(self.own.is_none());
         &values[first..first + self.compared()]
     }
 
-    /// Weights of an output's compared samples.
+    /// Weights of the compared samples of an output.
     pub(crate) fn weights_of(&self, output: usize) -> impl Iterator<Item = f64> + '_ {
         let (weight, shares) = (self.weights[output], self.shares.get(output));
         (0..self.compared()).map(move |k| weight * shares.map_or(1.0, |shares| shares[k]))
     }
 
-    /// Weighted compared samples as measured, all outputs after one another.
+    /// Weights times measured samples, for the compared samples, outputs concatenated.
     pub(crate) fn measured(&self) -> Vec<f64> {
         let weighted = |(i, values): (usize, &Vec<f64>)| -> Vec<f64> {
             self.weights_of(i).zip(self.inner(values)).map(|(w, v)| w * v).collect()
@@ -200,12 +200,12 @@ impl Experiment {
         self.samples.iter().enumerate().flat_map(weighted).collect()
     }
 
-    /// Pulses on either side of each compared sample.
+    /// Pulse means on either side of each compared sample.
     fn sides<'a>(&'a self, means: &'a [f64]) -> impl Iterator<Item = (f64, f64)> + 'a {
         (1..=self.compared()).map(move |k| (means[k * self.every - 1], means[k * self.every]))
     }
 
-    /// A signal at each compared sample as its pulse means tell it.
+    /// Values of a signal at the compared samples, from its pulse means.
     fn told(&self, means: &[f64]) -> Vec<f64> {
         match &self.own {
             Some(own) => own.readings.read(means),
@@ -213,7 +213,7 @@ impl Experiment {
         }
     }
 
-    /// A signal at each compared sample less what the pulses on either side tell.
+    /// Deviation of a signal at the compared samples from the value given by its pulse means.
     pub(crate) fn lacking(&self, signal: usize) -> Vec<f64> {
         match self.instants.get(signal).and_then(|instant| instant.values.as_ref()) {
             Some(values) => {
@@ -223,14 +223,14 @@ impl Experiment {
         }
     }
 
-    /// The same of an input with a free number, from its means and their slope: half the jump of one that holds.
+    /// Deviation of an input with a free parameter, and its derivative: half the jump of a zero-order hold.
     pub(crate) fn lacking_behind(&self, signal: usize, acted: &(Vec<f64>, Vec<f64>)) -> (Vec<f64>, Vec<f64>) {
         let half = if self.instants.get(signal).is_some_and(|instant| instant.held) { 0.5 } else { 0.0 };
         let jump = |means: &[f64]| self.sides(means).map(|(a, b)| half * (b - a)).collect();
         (jump(&acted.0), jump(&acted.1))
     }
 
-    /// Weighted samples of pulse means, all outputs after one another.
+    /// Samples of pulse means, weighted, outputs concatenated.
     pub(crate) fn sampled(&self, response: &[Vec<f64>]) -> Vec<f64> {
         let mut samples = Vec::with_capacity(response.len() * self.compared());
         for (i, means) in response.iter().enumerate() {
@@ -247,7 +247,7 @@ impl Experiment {
         samples
     }
 
-    /// Weighted, as the samples are, what pulse means do not tell of each output; nothing of what passes the filter.
+    /// Weights times corrections of the samples of each output; zero for filtered outputs.
     pub(crate) fn weighted(&self, values: &[Vec<f64>]) -> Vec<f64> {
         let mut out = Vec::with_capacity(values.len() * self.compared());
         for (i, row) in values.iter().enumerate() {

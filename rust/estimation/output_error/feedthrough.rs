@@ -1,8 +1,9 @@
-//! Direct feed-through: what a term of its equation's own order adds to an output at once.
+//! Direct feedthrough: the instantaneous effect of a term whose order equals that of its equation.
 //!
-//! A sample is read after the inputs of its instant act: y(t⁺) = y'(t) + G s(t⁺), where y' is the output without what
-//! feeds through. The mean of the pulses on either side of t holds G times the mean of s on either side, so it lacks G δ
-//! with δ = s(t⁺) less that mean: half a jump of a held signal, a quarter of the second difference of a linear one.
+//! A sample is taken after its input acts: y(t⁺) = y'(t) + G s(t⁺), where y' is the output without feedthrough. The
+//! mean of the pulses on either side of t contains G times the mean of s on either side. The correction is G δ, with δ
+//! the difference of s(t⁺) and that mean: half a jump of a zero-order hold, a quarter of the second difference of a
+//! linearly interpolated signal.
 
 use super::experiment::Experiment;
 use super::parameterization::{FreeModel, Point};
@@ -11,26 +12,26 @@ use crate::error::Result;
 use crate::fractional::kernels::first;
 use crate::linalg::small;
 
-/// Orders closer than this are the same: the term integrates nothing.
+/// Difference of the orders of term and equation below which a term has direct feedthrough.
 pub(crate) const AT_ONCE: f64 = 1e-9;
 
-/// What feeds through in one experiment.
+/// Direct feedthrough of one experiment.
 pub(crate) struct Direct {
-    /// (I − C)⁻¹ with C the gains between simulated outputs, row by row; none where outputs do not drive each other at once.
+    /// (I − C)⁻¹ with C the feedthrough gains between outputs, row-major; None without such gains.
     between: Option<Vec<f64>>,
-    /// δ of each signal that drives an output at once, and its derivative with respect to its free number.
+    /// δ of each input with feedthrough, and its derivative with respect to its free parameter.
     lacking: Vec<Option<(Vec<f64>, Vec<f64>)>>,
-    /// Whether each term of each equation feeds through.
+    /// True for terms with feedthrough, by equation.
     terms: Vec<Vec<bool>>,
     /// (I − C)⁻¹ B δ by output and sample, unweighted.
     values: Vec<Vec<f64>>,
 }
 
 impl Direct {
-    /// What feeds through at a point; none where no term does.
+    /// Feedthrough at a point; None without such terms.
     ///
     /// # Errors
-    /// [`crate::error::Error::LeadingZero`] where the equations contradict each other at once.
+    /// [`crate::error::Error::LeadingZero`] if the algebraic loop between the outputs is singular.
     pub(crate) fn of(
         model: &FreeModel,
         experiment: &Experiment,
@@ -70,7 +71,7 @@ impl Direct {
         Ok(Some(direct))
     }
 
-    /// Adds weighted δ of what drives each equation at once.
+    /// Add the weighted δ of the feedthrough inputs of each equation.
     fn add_driven<'a>(
         &'a self,
         model: &FreeModel,
@@ -94,7 +95,7 @@ impl Direct {
         }
     }
 
-    /// (I − C)⁻¹ times what drives each equation.
+    /// Multiply the feedthrough inputs of the equations by (I − C)⁻¹.
     pub(crate) fn through(&self, driven: Vec<Vec<f64>>) -> Vec<Vec<f64>> {
         let Some(between) = &self.between else { return driven };
         let gains = between.chunks_exact(driven.len());
@@ -108,13 +109,13 @@ impl Direct {
         gains.map(mixed).collect()
     }
 
-    /// What the sampled means lack.
+    /// Correction of the weighted samples.
     pub(crate) fn samples(&self, experiment: &Experiment) -> Vec<f64> {
         experiment.weighted(&self.values)
     }
 }
 
-/// Adds to the derivative of the sampled means that of what feeds through.
+/// Add the derivative of the feedthrough to that of the samples.
 pub(crate) fn add_slope(
     model: &FreeModel,
     experiment: &Experiment,
@@ -146,28 +147,29 @@ pub(crate) fn add_slope(
     column.iter_mut().zip(experiment.weighted(&direct.through(driven))).for_each(|(v, s)| *v += s);
 }
 
-/// Pulses see a jump of a held signal, or a corner of a linear one, at a sample too early: the mean of the pulses on
-/// either side holds half of what the first pulse after it answers, of which only the direct gain is there at the sample.
-/// Without this a first-order equation is off by a share of the step, and one that differentiates what drives it by 0.6
-/// by the step to the power of 0.4.
+/// Correction of the response to jumps and kinks of the inputs, which pulse means show half a pulse too early.
+///
+/// The mean of the pulses on either side of a sample contains half of the response of the first pulse after it, of
+/// which only the direct gain is present at the sample. Without the correction a first-order equation has an error
+/// proportional to the step. An equation with an input derivative of order 0.6 has one of order step^0.4.
 pub(crate) struct Early {
-    /// Half of what the mean of the first pulse after each compared sample has of the jump or corner of each signal there,
-    /// and its derivative with respect to its free number.
+    /// Half of the effect of the jump or kink of each signal at each compared sample on the mean of the next pulse, and
+    /// its derivative with respect to the free parameter.
     jumps: Vec<Option<(Vec<f64>, Vec<f64>)>>,
 }
 
-/// Central differences of gains, which are smooth in all parameters: their error is 1e−10.
+/// Relative step of the central differences of the gains, which have an error of 1e−10.
 const SHIFT: f64 = 1e-5;
 
 impl Early {
-    /// The jumps of what holds in between, and the corners of what is linear there.
+    /// Jumps of zero-order-hold signals, and kinks of linearly interpolated ones.
     pub(crate) fn of(model: &FreeModel, experiment: &Experiment, acted: &[(Vec<f64>, Vec<f64>)]) -> Self {
         let jumps = (0..experiment.record.len())
             .map(|signal| {
-                // Corners of samples at times of their own are known one by one.
+                // Nonuniform samples have an exact kink correction instead.
                 let instant = experiment.instants.get(signal).filter(|_| experiment.own.is_none())?;
                 if !instant.held {
-                    // What lies behind an actuator with a free number has none that are known.
+                    // The kinks behind a free input nonlinearity are unknown.
                     instant.values.as_ref().filter(|_| model.law_of(signal).is_none())?;
                     return Some((experiment.lacking(signal).iter().map(|v| -v).collect(), Vec::new()));
                 }
@@ -183,7 +185,7 @@ impl Early {
         Self { jumps }
     }
 
-    /// Answer of the first pulse less the direct gain: outputs by signals, row by row.
+    /// Response of the first pulse minus the direct gain: outputs by signals, row-major.
     fn gains(model: &FreeModel, step: f64, signals: usize, at_once: &[Vec<bool>], point: &Point) -> Result<Vec<f64>> {
         let structures = model.structures(&point.orders);
         let n = structures.len();
@@ -214,7 +216,7 @@ impl Early {
         structures.iter().map(near).collect()
     }
 
-    /// Adds what is early, by these gains, to weighted samples that lack it the other way round.
+    /// Subtract the early response, with the given gains, from weighted samples.
     fn add(&self, experiment: &Experiment, gains: &[f64], slopes: bool, samples: &mut [f64]) {
         let (signals, compared) = (self.jumps.len(), experiment.compared());
         for (i, row) in samples.chunks_exact_mut(compared.max(1)).enumerate() {
@@ -231,10 +233,10 @@ impl Early {
         }
     }
 
-    /// Takes what is early from the weighted samples.
+    /// Correct weighted samples.
     ///
     /// # Errors
-    /// [`crate::error::Error::LeadingZero`] where the scheme has no next pulse.
+    /// [`crate::error::Error::LeadingZero`] if the scheme is singular.
     pub(crate) fn correct(
         &self,
         model: &FreeModel,
@@ -251,10 +253,10 @@ impl Early {
         Ok(())
     }
 
-    /// The same of the derivative with respect to a parameter.
+    /// Correct the derivative of weighted samples with respect to a parameter.
     ///
     /// # Errors
-    /// As [`Early::correct`].
+    /// As [`JumpCorrection::correct`].
     pub(crate) fn correct_slope(
         &self,
         model: &FreeModel,

@@ -1,4 +1,4 @@
-//! The fit: a model, its experiments and a start become a least-squares problem, and its minimum a result.
+//! Output-error fit of a model to experiments from an initial guess.
 
 use std::cell::RefCell;
 
@@ -11,45 +11,45 @@ use crate::estimation::optimization::damped_step::Problem;
 use crate::estimation::optimization::levenberg_marquardt::{minimise, Settings, Status};
 use crate::parallel::Stop;
 
-/// The optimum and what describes it.
+/// Optimum of an output-error fit.
 #[derive(Debug, Clone, PartialEq)]
 pub struct Fit {
-    /// Free orders, coefficients and numbers of inputs.
+    /// Free orders, coefficients and input parameters.
     pub point: Point,
     /// Half the weighted sum of squared residuals.
     pub cost: f64,
-    /// Weighted residuals (y − ŷ)/σ, records one after the other, outputs within.
+    /// Residuals (y − ŷ)/σ, ordered by record, then by output.
     pub residuals: Vec<f64>,
-    /// Their derivatives with respect to orders, coefficients (plain coordinates), then inputs, initial terms projected
-    /// out; none where only residuals were asked for.
+    /// Derivatives of the residuals with respect to orders, coefficients (plain coordinates) and inputs, with the
+    /// initial terms projected out; empty if only residuals were requested.
     pub jacobian: Vec<Vec<f64>>,
     /// Coefficients of the initial terms per record and equation.
     pub initial: Vec<Vec<Vec<f64>>>,
     /// Exponents of the initial terms per equation.
     pub exponents: Vec<Vec<f64>>,
-    /// Evaluations of residuals.
+    /// Number of residual evaluations.
     pub evaluations: usize,
-    /// How it ended.
+    /// Reason of termination.
     pub status: Status,
 }
 
-/// The output error of a model on its experiments, as a problem of least squares.
+/// Nonlinear least-squares problem of the output error of a model.
 struct OutputError<'a> {
     model: &'a FreeModel,
     experiments: &'a [Experiment],
-    /// Where the coefficients start, in the unit of time of the clock.
+    /// Initial coefficients, in the unit of time.
     start: Vec<f64>,
-    /// The unit of time in which coefficients are moved.
+    /// Unit of time in which the coefficients are stepped.
     clock: Clock,
-    /// Whether a free run that grows is no place to go.
+    /// True if a stable model must not become unstable.
     steady: bool,
-    /// Whether all coefficients keep their own coordinates, as where an optimum is followed and not looked for.
+    /// True to allow extrapolation along valleys: all coefficients have plain coordinates, as near an optimum.
     plain: bool,
-    /// Coefficients that are solved for at every point.
+    /// Coefficients that are eliminated at every point.
     linear: Vec<usize>,
-    /// What evaluations share, by experiment.
+    /// Caches of the evaluations, by experiment.
     shelves: RefCell<Vec<Shelf>>,
-    /// What ends the search between two computations.
+    /// Cancellation flag.
     stop: &'a Stop,
 }
 
@@ -90,7 +90,7 @@ impl Problem for OutputError<'_> {
         })
     }
 
-    /// With an order move the coefficients whose numbers stay in the unit of time.
+    /// Derivatives of the coefficients with respect to an order, at constant values in the unit of time.
     fn carried(&self, point: &Point, parameter: usize) -> Vec<(usize, f64)> {
         if parameter >= point.orders.len() {
             return Vec::new();
@@ -101,7 +101,7 @@ impl Problem for OutputError<'_> {
             .collect()
     }
 
-    /// Distance of orders and of inputs' numbers from their bounds; coefficients have none but 0 where they keep a sign.
+    /// Distance of a parameter from its bounds. Coefficients are bounded only if they keep their sign.
     fn room(&self, point: &Point, parameter: usize) -> (f64, f64) {
         let behind = point.orders.len() + point.coefficients.len();
         let (value, (low, high)) = match (point.orders.get(parameter), parameter.checked_sub(behind)) {
@@ -117,8 +117,7 @@ impl Problem for OutputError<'_> {
         (value - low, high - value)
     }
 
-    /// The response is linear in a delay between whole numbers of steps, and in a limit between values of the input; there
-    /// its slope jumps.
+    /// True for input parameters: the response is piecewise linear in delays and limits.
     fn kinked(&self, point: &Point, parameter: usize) -> bool {
         parameter >= point.orders.len() + point.coefficients.len()
     }
@@ -127,7 +126,7 @@ impl Problem for OutputError<'_> {
         evaluation.size
     }
 
-    /// Where the grids see all of each equation: a fit would follow noise with what they do not see.
+    /// True if the grids resolve the dynamics of each equation. Unresolved modes would fit noise.
     fn trusted(&self, point: &Point) -> bool {
         self.model.resolved(self.experiments, point) && !(self.steady && self.model.grows(point))
     }
@@ -137,8 +136,10 @@ impl Problem for OutputError<'_> {
     }
 }
 
-/// A point moved by steps in its coordinates, within bounds, and how far: orders as they are, coefficients as a share
-/// of themselves in the clock's unit, numbers of inputs as a share of their interval.
+/// Move a point by steps in its coordinates, within bounds; return it and the largest change.
+///
+/// Changes of orders are absolute. Those of coefficients are relative in the unit of time, those of input parameters
+/// relative to their interval.
 fn stepped(model: &FreeModel, clock: &Clock, point: &Point, deltas: &[f64]) -> (Point, f64) {
     let mut next = point.clone();
     let mut moved: f64 = 0.0;
@@ -164,14 +165,14 @@ fn stepped(model: &FreeModel, clock: &Clock, point: &Point, deltas: &[f64]) -> (
     (next, moved)
 }
 
-/// Weighted least squares on the output error from a start, by Levenberg–Marquardt with columns scaled by the Jacobian.
+/// Fit a model to experiments by output error from an initial guess, by Levenberg–Marquardt.
 ///
-/// Coefficients of what drives from outside are solved for at every point, so where they start does not matter, nor with
-/// which sign; a single evaluation is of the start as it is.
+/// The coefficients of external inputs are eliminated at every point, so their initial values and signs do not matter.
+/// With a single evaluation, the initial guess is evaluated as given.
 ///
 /// # Errors
-/// A start whose free run is not finite ([`Error::Diverged`]), or that lies outside its coordinates; a model that names
-/// what is not there, experiments that do not fit it ([`FreeModel::check`]).
+/// An initial guess whose simulation is not finite ([`Error::Diverged`]), or which is out of the range of its
+/// coordinates; a model that does not match the experiments ([`FreeModel::check`]).
 ///
 /// ```
 /// # fn main() -> ftlm::error::Result<()> {
@@ -210,10 +211,10 @@ pub fn fit(model: &FreeModel, experiments: &[Experiment], start: &Point, setting
     fit_until(model, experiments, start, settings, false, &Stop::default())
 }
 
-/// The same, but from a start whose free run does not grow no step leads to one that does.
+/// Fit a model as [`fit`], but never step from a stable model to an unstable one.
 ///
-/// With initial terms that are estimated, a growing mode costs nothing: they take it away until the end of the run, and
-/// what is left depends on what the inputs will be. Equations that drive each other as simulated are not looked at.
+/// Free initial terms can cancel an unstable mode up to the end of the run, which makes the response depend on future
+/// inputs. The stability of coupled equations is not checked.
 ///
 /// # Errors
 /// As [`fit`].
@@ -221,7 +222,7 @@ pub fn fit_steady(model: &FreeModel, experiments: &[Experiment], start: &Point, 
     fit_until(model, experiments, start, settings, true, &Stop::default())
 }
 
-/// [`fit`], or where `steady` [`fit_steady`], until it is told to stop.
+/// Fit a model as [`fit`], or as [`fit_stable`] if `steady`, with a cancellation flag.
 ///
 /// # Errors
 /// As [`fit`]; [`Error::Interrupted`].
@@ -241,13 +242,13 @@ pub fn fit_until(
     let mut point = start.clone();
     point.orders.iter_mut().zip(&model.order_bounds).for_each(|(o, &(low, high))| *o = o.clamp(low, high));
     point.inputs.iter_mut().zip(&model.inputs).for_each(|(t, d)| *t = t.clamp(d.bounds.0, d.bounds.1));
-    // A single evaluation is of the start as it is.
+    // With a single evaluation nothing is eliminated.
     let linear = if settings.evaluations > 1 { model.linear() } else { Vec::new() };
     let plain = !model.coordinates.iter().any(|c| matches!(c, Coordinate::Logarithm | Coordinate::ExcessLogarithm));
     let mut model = model.clone();
-    // Solved for, they need no coordinate that keeps a sign.
+    // Logarithmic coordinates are not needed for eliminated coefficients.
     linear.iter().for_each(|&j| model.coordinates[j] = Coordinate::Plain);
-    // With free inputs, what drives is no signal of the record.
+    // With free input parameters the inputs of the equations are not signals of the record.
     let passed: Option<Vec<Experiment>> = match settings.evaluations > 1 && model.inputs.is_empty() {
         true => experiments.iter().map(Experiment::passed_first).collect::<Result<_>>()?,
         false => None,
@@ -270,7 +271,7 @@ pub fn fit_until(
     })
 }
 
-/// Refuses a start that its coordinates cannot move, or that is no number.
+/// Check that an initial guess is finite and in the range of its coordinates.
 fn check_start(model: &FreeModel, start: &Point) -> Result<()> {
     for (i, (&c, coordinate)) in start.coefficients.iter().zip(&model.coordinates).enumerate() {
         if !coordinate.holds(c) {

@@ -1,4 +1,4 @@
-//! Derivatives of the residuals: A⁻¹(∂b − ∂A y) as products of three spectra, one inverse transform a parameter and output.
+//! Derivatives of the residuals: A⁻¹(∂b − ∂A y) as products of three spectra, one inverse FFT per parameter and output.
 
 use std::borrow::Cow;
 use std::rc::Rc;
@@ -13,8 +13,9 @@ use crate::linalg::orthogonal::project_out;
 use crate::series::Kernel;
 
 impl FreeModel {
-    /// Derivatives of the residuals at an evaluated point with respect to orders, coefficients (plain coordinates),
-    /// then inputs' numbers, initial terms projected out; those of linear coefficients are there already.
+    /// Derivatives of the residuals with respect to orders, coefficients (plain coordinates) and input parameters.
+    ///
+    /// Initial terms are projected out. The columns of the linear coefficients are taken from the evaluation.
     pub(crate) fn jacobian(
         &self,
         experiments: &[Experiment],
@@ -34,7 +35,7 @@ impl FreeModel {
         Ok(jacobian)
     }
 
-    /// One experiment's rows of the Jacobian: A⁻¹(∂b − ∂A y) as products of three spectra.
+    /// Rows of the Jacobian of one experiment.
     #[allow(clippy::too_many_arguments)]
     fn sensitivities(
         &self,
@@ -104,7 +105,7 @@ impl FreeModel {
                 None => out.extend(std::iter::repeat_n(0.0, n * experiment.compared())),
                 Some(mut column) => {
                     project_out(&part.basis, &mut column);
-                    // Residuals fall where the response rises.
+                    // Residuals are measured minus simulated samples.
                     out.extend(column.iter().map(|v| -v));
                 }
             }
@@ -112,13 +113,15 @@ impl FreeModel {
         Ok(())
     }
 
-    /// How a parameter moves the right-hand side by term k of equation i: the weight of the term's operator, of its
-    /// derivative for an order, of the slope of what drives for a number of an input.
+    /// Weight of term k of equation i in the derivative of the right-hand side with respect to a parameter.
+    ///
+    /// It multiplies the operator for a coefficient, its derivative for an order, and the derivative of the input for
+    /// an input parameter.
     fn pull(&self, (i, k): (usize, usize), point: &Point, parameter: usize) -> f64 {
         let (equation, (orders, coefficients)) = (&self.equations[i], (&point.orders, &point.coefficients));
         let (signal, order, monomial) = &equation.terms[k];
         if let Some(input) = parameter.checked_sub(orders.len() + coefficients.len()) {
-            // It moves only what it drives: kernel and coefficient stay.
+            // An input parameter does not change kernels and coefficients.
             return if self.inputs[input].signal == *signal { monomial.at(coefficients) } else { 0.0 };
         }
         match parameter.checked_sub(orders.len()) {
@@ -131,8 +134,9 @@ impl FreeModel {
     }
 }
 
-/// How the initial terms of equation i move with a free order, weighted by their coefficients, before the filter; none if
-/// they do not.
+/// Derivative of the weighted initial terms of equation i with respect to a free order, before the filter.
+///
+/// None if they do not depend on the order.
 fn initial_slope(
     model: &FreeModel,
     (i, parameter): (usize, usize),
@@ -140,7 +144,7 @@ fn initial_slope(
     values: &[f64],
     (experiment, shelf): (&Experiment, &Shelf),
 ) -> Result<Option<Vec<f64>>> {
-    // Exponents are sums of orders: any shift tells how they follow them.
+    // Exponents are linear in the orders, so any shift gives their derivative.
     const SHIFT: f64 = 1e-4;
     if values.is_empty() || !model.initial.follows_orders() {
         return Ok(None);
@@ -152,7 +156,7 @@ fn initial_slope(
     };
     let (below, here, above) = (exponents(-SHIFT), exponents(0.0), exponents(SHIFT));
     if [&below, &here, &above].iter().any(|list| list.len() != values.len()) {
-        // An exponent appears or merges here: the projection follows it in the next evaluation.
+        // The set of exponents changes here; the projection adapts in the next evaluation.
         return Ok(None);
     }
     let mut out = Vec::new();

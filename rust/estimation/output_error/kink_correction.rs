@@ -1,21 +1,22 @@
-//! What samples at times of their own see of the corners that jumps of held inputs leave, and their pulse means do not.
+//! Kink correction: slope discontinuities of the output near input jumps, at nonuniform sample times.
 //!
-//! The leading corners of an output are those of the terms that drive its equation, Σ c I^{α−ν} s, and what its own terms
-//! make of these, once. Made twice they are smoother still, and what is left falls with the step.
+//! Block-pulse means smooth out the kinks after jumps of zero-order-hold inputs. The leading kinks of an output come
+//! from the input terms of its equation, Σ c I^{α−ν} s, and from these passed once through the autoregressive terms.
+//! Higher repetitions are smoother, and their error decreases with the step.
 
 use super::experiment::{Experiment, OwnTimes};
 use super::feedthrough::{Direct, AT_ONCE};
 use super::parameterization::{FreeModel, Point};
 use crate::equation::Structure;
 
-/// Corners are smooth in an order: the error of a central difference is 1e−10.
+/// Step of the central difference in an order, which has an error of 1e−10.
 const SHIFT: f64 = 1e-5;
 
-/// Orders of integration from which on a corner is as smooth as the pulses around a sample follow.
+/// Integration order above which block pulses represent a kink accurately.
 const SMOOTH: f64 = 2.0;
 
-/// A term whose signal jumps near samples, by itself or through a term of the output's own: what the samples lack for
-/// coefficients of 1, and the derivative of that with respect to the order of integration.
+/// Kink of one input term, alone or passed through an autoregressive term: correction of the samples for coefficients
+/// of 1, and its derivative with respect to the integration order.
 struct Corner {
     equation: usize,
     terms: Vec<usize>,
@@ -23,13 +24,13 @@ struct Corner {
     slopes: Vec<f64>,
 }
 
-/// Corners of one experiment.
+/// Kink correction of one experiment.
 pub(crate) struct Corners {
     all: Vec<Corner>,
 }
 
 impl Corners {
-    /// Those of all terms that drive an equation by what holds in between; none where samples keep to the grid.
+    /// Kinks of all zero-order-hold input terms; None for uniform samples.
     pub(crate) fn of(model: &FreeModel, experiment: &Experiment, structures: &[Structure]) -> Option<Self> {
         let OwnTimes { readings, jumps } = experiment.own.as_ref()?;
         let step = experiment.record.step();
@@ -46,7 +47,7 @@ impl Corners {
                 }
                 for terms in std::iter::once(vec![term]).chain(own.iter().map(|&k| vec![term, k])) {
                     let eta: f64 = terms.iter().map(|&k| integration(k)).sum();
-                    // What feeds through at once is counted as that.
+                    // Direct feedthrough has its own correction.
                     if eta < AT_ONCE || (terms.len() > 1 && eta >= SMOOTH) {
                         continue;
                     }
@@ -61,7 +62,7 @@ impl Corners {
         Some(Self { all })
     }
 
-    /// Weighted, what the samples lack of an initial term t^e in one equation; nothing where they keep to the grid.
+    /// Correction of the weighted samples for an initial term t^e of one equation; zero for uniform samples.
     pub(crate) fn of_power(experiment: &Experiment, equation: usize, exponent: f64) -> Vec<f64> {
         let mut rows = vec![vec![0.0; experiment.compared()]; experiment.samples.len()];
         if let Some(own) = experiment.own.as_ref().filter(|_| exponent.fract() != 0.0) {
@@ -71,7 +72,7 @@ impl Corners {
         experiment.weighted(&rows)
     }
 
-    /// Adds corners with weights for their values and for their slopes.
+    /// Sum of the kinks, with weights for their values and derivatives, in weighted samples.
     fn driven(
         &self,
         model: &FreeModel,
@@ -91,7 +92,7 @@ impl Corners {
         })
     }
 
-    /// Weighted, what the samples lack.
+    /// Correction of the weighted samples.
     pub(crate) fn samples(
         &self,
         model: &FreeModel,
@@ -106,7 +107,7 @@ impl Corners {
         self.driven(model, experiment, direct, weight)
     }
 
-    /// Adds the derivative of that with respect to a parameter; through what feeds through it is not followed.
+    /// Add the derivative of the correction with respect to a parameter, at constant feedthrough gains.
     pub(crate) fn add_slope(
         &self,
         model: &FreeModel,

@@ -1,11 +1,8 @@
-//! The free run of a model at a point, its residuals on every experiment, and the initial terms that are projected out.
+//! Simulation and residuals of a model on every experiment, with linear coefficients and initial terms eliminated.
 //!
-//! Coefficients in which the residuals are linear: those of what drives, once everything else is given.
-//!
-//! They are solved for at every point of the search (variable projection, Golub & Pereyra, doi:10.1137/0710036), so that
-//! only own terms, orders and inputs' numbers are searched: no sign to guess, no valley between what drives alike.
-//!
-//! What a free run leaves behind for the derivatives of its residuals.
+//! Linear coefficients and initial terms are solved for at every point (Golub & Pereyra, doi:10.1137/0710036), so that
+//! only autoregressive coefficients, orders and input parameters are iterated. No sign has to be guessed, and collinear
+//! inputs cause no valley.
 
 use std::borrow::Cow;
 use std::rc::Rc;
@@ -26,33 +23,34 @@ use crate::linalg::small::back_substitute;
 use crate::regressors::Record;
 use crate::series::{Buffers, Recursion, SumOfProducts};
 
-/// Own-output orders closer to α than this make the equation say that the output equals itself.
+/// Smallest difference of α and the order of an autoregressive term; at 0 the equation would be an identity.
 const LEAST_INTEGRATION: f64 = 1e-3;
 
-/// An initial term whose response lies in the span of the others up to this share adds nothing to the projection.
+/// Relative norm of the response to an initial term outside the span of the others below which it is dependent.
 const SPANNED: f64 = 1e-12;
 
-/// Residuals at a point, and what their derivatives there are made of.
+/// Residuals at a point, and intermediates for their derivatives.
 pub(crate) struct Evaluation {
-    /// The point, with the best values of what the residuals are linear in.
+    /// The point, with optimal values of the linear coefficients.
     pub(crate) point: Point,
     pub(crate) residuals: Vec<f64>,
-    /// Norm of the weighted samples, of which the residuals are differences.
+    /// Norm of the weighted measured samples.
     pub(crate) size: f64,
     pub(crate) initial: Vec<Vec<Vec<f64>>>,
     pub(crate) exponents: Vec<Vec<f64>>,
     pub(crate) parts: Vec<Part>,
 }
 
-/// Response of an experiment to an initial term: its equation, weighted samples, pulse means; none of what moves nothing
-/// but the filter of an output.
+/// Response of an experiment to an initial term: equation, weighted samples, pulse means.
+///
+/// The pulse means are empty for a term that affects only the sensor filter.
 struct Free {
     equation: usize,
     samples: Vec<f64>,
     means: Rc<Means>,
 }
 
-/// An experiment's free run before its initial terms are added.
+/// Simulation of an experiment from rest, before the initial terms are added.
 struct Answer {
     part: Part,
     residuals: Vec<f64>,
@@ -60,8 +58,7 @@ struct Answer {
 }
 
 impl FreeModel {
-    /// Residuals at a point, the coefficients that are named, in which they are linear, at their best (variable
-    /// projection, doi:10.1137/0710036).
+    /// Residuals at a point, with the `linear` coefficients eliminated (variable projection, doi:10.1137/0710036).
     pub(crate) fn evaluate(
         &self,
         experiments: &[Experiment],
@@ -167,7 +164,7 @@ impl FreeModel {
         Ok(Answer { part, residuals, free })
     }
 
-    /// The integral of each term of each equation.
+    /// Integral operators of the terms of each equation.
     fn operators(
         &self,
         experiment: &Experiment,
@@ -189,7 +186,7 @@ impl FreeModel {
                     LEAST_INTEGRATION - MAX_EXCESS
                 };
                 if eta < least {
-                    // Reported like a step too far, so that the search shortens it.
+                    // This is reported as divergence, so that the optimization shortens its step.
                     return Err(Error::Diverged { what: "order of a term above alpha; the free run".into(), index: 0 });
                 }
                 row.push(shelf.operator((i, k), eta, self.turns(i, k)));
@@ -199,7 +196,7 @@ impl FreeModel {
         Ok(operators)
     }
 
-    /// Pulse means of the free run from rest, and what solves the equations.
+    /// Pulse means of the simulation from rest, and the inverse of the equations.
     fn response(
         &self,
         experiment: &Experiment,
@@ -285,8 +282,7 @@ impl FreeModel {
         Ok((response, solved))
     }
 
-    /// Pulse means of what drives a term that is integrated by `eta`: a signal of the record, or what an actuator makes of
-    /// it.
+    /// Pulse means of the input of a term of integration order `eta`, after the input nonlinearity.
     pub(crate) fn drives<'a>(
         &self,
         record: &'a Record,
@@ -296,7 +292,7 @@ impl FreeModel {
         self.law_of(signal).map_or_else(|| record.driver(signal, eta), |law| &acted[law].0)
     }
 
-    /// Initial terms: the projection of the residuals on their responses.
+    /// Add the initial terms by projection of the residuals on their responses.
     fn add_initial(answer: Answer, equations: usize, out: &mut Evaluation) -> Result<()> {
         let Answer { mut part, mut residuals, free } = answer;
         let mut initial: Vec<Vec<f64>> = vec![Vec::new(); equations];
@@ -318,7 +314,7 @@ impl FreeModel {
         Ok(())
     }
 
-    /// Whether a free order moves the order by which a term is integrated.
+    /// True if the integration order of a term depends on a free order.
     fn turns(&self, equation: usize, term: usize) -> bool {
         let item = &self.equations[equation];
         let of = |weights: &[f64], k: usize| weights.get(k).copied().unwrap_or(0.0);
@@ -326,7 +322,7 @@ impl FreeModel {
     }
 }
 
-/// The first m pulses of every unknown.
+/// First m pulses of every output.
 fn cut(means: &Means, m: usize) -> Cow<'_, [Vec<f64>]> {
     match means.iter().all(|row| row.len() == m) {
         true => Cow::Borrowed(means),
@@ -334,11 +330,12 @@ fn cut(means: &Means, m: usize) -> Cow<'_, [Vec<f64>]> {
     }
 }
 
-/// What is not told from the rest by this share of its column stays where it was: there rounding is as large.
+/// Damping of the unit columns: a coefficient that is identifiable only at this level, that of rounding, is not
+/// changed.
 const UNTOLD: f64 = 1e-7;
 
 impl FreeModel {
-    /// Coefficients that stand alone, once, and before nothing but what drives from outside.
+    /// Indices of the coefficients that occur alone and only in terms of external inputs.
     pub(crate) fn linear(&self) -> Vec<usize> {
         let stands = |j: usize| {
             let mut found = false;
@@ -358,7 +355,7 @@ impl FreeModel {
         (0..self.coordinates.len()).filter(|&j| moves(j) && stands(j)).collect()
     }
 
-    /// What one more of each coefficient does that stands before what drives.
+    /// Effects of the given input coefficients on an experiment.
     pub(crate) fn driven_by(
         &self,
         experiment: &Experiment,
@@ -405,8 +402,9 @@ impl FreeModel {
     }
 }
 
-/// How far linear coefficients move to where the residuals of all experiments are least, each experiment's initial terms
-/// projected out.
+/// Solve for the steps of the linear coefficients that minimize the residuals of all experiments.
+///
+/// The initial terms of each experiment are projected out.
 pub(crate) fn best_moves(sides: &[(&[f64], &Part)]) -> Result<Vec<f64>> {
     let count = sides.first().map_or(0, |(_, part)| part.driven.len());
     let mut columns: Vec<Vec<f64>> = vec![Vec::new(); count + 1];
@@ -441,31 +439,32 @@ pub(crate) fn best_moves(sides: &[(&[f64], &Part)]) -> Result<Vec<f64>> {
     }
 }
 
-/// What one experiment leaves behind for its sensitivities.
+/// Intermediates of one experiment for its sensitivities.
 pub(crate) struct Part {
-    /// What solves the equations.
+    /// Inverse of the equations.
     pub(crate) solved: Rc<Solved>,
-    /// Of each term of each equation.
+    /// Operators of the terms, by equation.
     pub(crate) operators: Vec<Vec<Rc<Operator>>>,
-    /// Simulated pulse means, initial terms included.
+    /// Pulse means of the simulated outputs, including the initial terms.
     pub(crate) response: Vec<Vec<f64>>,
     /// Orthonormal basis of the sampled responses to the initial terms.
     pub(crate) basis: Vec<Vec<f64>>,
-    /// What each coefficient does that the residuals are linear in.
+    /// Effects of the linear coefficients.
     pub(crate) driven: Vec<Driven>,
-    /// Pulse means of each input with a free number once it acts, and their derivative with respect to it.
+    /// Pulse means of each input after its free nonlinearity, and their derivative with respect to its parameter.
     pub(crate) acted: Vec<(Vec<f64>, Vec<f64>)>,
-    /// What feeds through at once.
+    /// Direct feedthrough.
     pub(crate) direct: Option<Direct>,
-    /// What pulses see too early.
+    /// Correction for jumps of the inputs at the samples.
     pub(crate) early: Early,
-    /// Corners near samples that were read at times of their own.
+    /// Kink correction at nonuniform samples.
     pub(crate) corners: Option<Corners>,
 }
 
 impl Part {
-    /// What one more of a parameter does to weighted samples, from what it does to pulse means. Orders come first among
-    /// the parameters, coefficients next, numbers of inputs last.
+    /// Effect of a parameter on the weighted samples, from its effect on the pulse means.
+    ///
+    /// Parameters are ordered: orders, coefficients, input parameters.
     pub(crate) fn moved_by(
         &self,
         parameter: usize,
@@ -484,16 +483,16 @@ impl Part {
     }
 }
 
-/// What a coefficient of 1 more does to an experiment.
+/// Effect of a unit change of a parameter on an experiment.
 pub(crate) struct Driven {
-    /// To its weighted samples.
+    /// Change of the weighted samples.
     pub(crate) samples: Vec<f64>,
-    /// To the pulse means of each output; empty once it was moved.
+    /// Change of the pulse means of each output; empty after [`ParameterEffect::apply`].
     pub(crate) means: Vec<Vec<f64>>,
 }
 
 impl Driven {
-    /// Moves the coefficient: residuals and pulse means follow.
+    /// Apply a change of the coefficient to residuals and pulse means.
     pub(crate) fn moved(&mut self, by: f64, residuals: &mut [f64], response: &mut [Vec<f64>]) {
         if by != 0.0 {
             residuals.iter_mut().zip(&self.samples).for_each(|(e, v)| *e -= by * v);

@@ -1,30 +1,30 @@
-//! Whether an equation's own terms give it a free run that grows.
+//! Stability of the homogeneous part of an equation.
 
 use std::f64::consts::PI;
 
-/// Beyond the frequencies looked at, one power of s exceeds all others together by this factor.
+/// Ratio by which one power of s exceeds the sum of all others outside the range of frequencies.
 const ALONE: f64 = 1e3;
-/// Widest step along ln ω, and the narrowest: a pole nearer to the axis lies on it.
+/// Largest step in ln ω; a pole closer to the axis than [`MIN_LOG_FREQUENCY_STEP`] lies on it.
 const WIDEST: f64 = 0.25;
 const NARROWEST: f64 = 1e-12;
-/// Largest turn of the curve [rad] between two points.
+/// Largest change of the angle of the curve \[rad\] between two points.
 const TURN: f64 = 0.5;
-/// Powers of s nearer to each other than this are told apart beyond ω = e^1000 alone.
+/// Difference below which two exponents of s are merged: they are distinguishable only beyond ω = e^1000.
 const SAME: f64 = 1e-3;
-/// Zeros to the right, counted by the argument, from which there is one: half of one that lies on the axis counts.
+/// Count of zeros in the right half-plane, by the argument, above which there is one; a zero on the axis counts half.
 const ONE: f64 = 0.25;
 
-/// Whether s^α − Σ c s^ν, the own terms (c, ν) of an equation of order α, has a zero with a positive real part, or on the
-/// imaginary axis but for the origin.
+/// Return true if an equation of order α with autoregressive terms (c, ν) is unstable.
 ///
-/// By the argument principle on the principal sheet: of powers p of s the curve over ω from 0 to ∞ turns by
-/// (p_high − p_low − 2Z)·π/2 where Z zeros lie to the right.
+/// It is unstable if s^α − Σ c s^ν has a zero in the right half-plane, or on the imaginary axis except the origin.
+/// Zeros are counted by the argument principle on the principal sheet: the angle of the curve over ω from 0 to ∞
+/// changes by (p_high − p_low − 2Z)·π/2 for exponents p and Z zeros in the right half-plane.
 ///
 /// ```
-/// use ftlm::estimation::output_error::stability::grows;
-/// // D²y = −4 y − 0.1 Dy dies away; with the sign of the damping turned it grows.
-/// assert!(!grows(2.0, &[(-4.0, 0.0), (-0.1, 1.0)]));
-/// assert!(grows(2.0, &[(-4.0, 0.0), (0.1, 1.0)]));
+/// use ftlm::estimation::output_error::stability::is_unstable;
+/// // D²y = −4 y − 0.1 Dy is stable; with negative damping it is unstable.
+/// assert!(!is_unstable(2.0, &[(-4.0, 0.0), (-0.1, 1.0)]));
+/// assert!(is_unstable(2.0, &[(-4.0, 0.0), (0.1, 1.0)]));
 /// ```
 #[must_use]
 pub fn grows(alpha: f64, own: &[(f64, f64)]) -> bool {
@@ -37,7 +37,7 @@ pub fn grows(alpha: f64, own: &[(f64, f64)]) -> bool {
         return false;
     }
     let share = (ALONE * powers.len() as f64).ln();
-    // ln ω at which another power, of a higher or a lower order, is as small as that beside the one at the end.
+    // ln ω at which another power is smaller than the dominant one by the dominance ratio.
     let apart = |end: (f64, f64), &(c, p): &(f64, f64)| (end.0.abs().ln() - c.abs().ln() - share) / (p - end.1);
     let ends = |end: (f64, f64)| powers.iter().filter(move |(_, p)| *p != end.1).map(move |power| apart(end, power));
     let (first, last) = (ends(low).fold(f64::INFINITY, f64::min), ends(high).fold(f64::NEG_INFINITY, f64::max));
@@ -53,7 +53,7 @@ pub fn grows(alpha: f64, own: &[(f64, f64)]) -> bool {
     0.5 * (high.1 - low.1) - turned / PI > ONE
 }
 
-/// Powers that differ: those nearer to each other than [`SAME`] are one at all frequencies that anything is measured at.
+/// Merge powers with exponents closer than [`EXPONENT_TOLERANCE`], which no measurable frequency distinguishes.
 fn distinct(mut powers: Vec<(f64, f64)>) -> Vec<(f64, f64)> {
     powers.sort_by(|a, b| a.1.total_cmp(&b.1));
     let mut out: Vec<(f64, f64)> = Vec::with_capacity(powers.len());
@@ -67,7 +67,7 @@ fn distinct(mut powers: Vec<(f64, f64)>) -> Vec<(f64, f64)> {
     out
 }
 
-/// The curve at ω, in units of its largest power.
+/// Point of the curve at ω, relative to its largest power.
 fn curve(powers: &[(f64, f64)], log_omega: f64) -> (f64, f64) {
     let logs = || powers.iter().map(|(c, p)| c.abs().ln() + p * log_omega);
     let largest = logs().fold(f64::NEG_INFINITY, f64::max);
@@ -77,7 +77,7 @@ fn curve(powers: &[(f64, f64)], log_omega: f64) -> (f64, f64) {
     })
 }
 
-/// By how much the curve turns between two frequencies, finely enough not to lose a turn.
+/// Change of the angle of the curve between two frequencies, by bisection.
 fn turn(powers: &[(f64, f64)], from: (f64, (f64, f64)), to: (f64, (f64, f64))) -> f64 {
     let ((a, (x, y)), (b, (u, v))) = (from, to);
     let angle = (x * v - y * u).atan2(x * u + y * v);
@@ -85,9 +85,9 @@ fn turn(powers: &[(f64, f64)], from: (f64, (f64, f64)), to: (f64, (f64, f64))) -
     if angle.abs() <= TURN {
         return angle;
     }
-    // Far out neighbouring numbers are wider apart than the narrowest step, and beyond all of them the curve is no number.
+    // At extreme frequencies the spacing of floating-point numbers exceeds the smallest step, or the curve is NaN.
     if b - a < NARROWEST || !(middle > a && middle < b) || angle.is_nan() {
-        // The curve passes through 0, to either side by rounding: a zero lies on the axis, and whatever turns, grows.
+        // The curve passes through 0, so a zero lies on the axis: return a value that counts as unstable.
         return f64::NEG_INFINITY;
     }
     let there = (middle, curve(powers, middle));
@@ -127,7 +127,7 @@ mod tests {
 
     #[test]
     fn powers_and_coefficients_at_the_ends_of_all_numbers_end() {
-        // Once without end: to come back is what is asked.
+        // Regression test of infinite recursion; only termination is checked.
         for (alpha, own) in [
             (1e-9, [(-0.954, 0.0), (5e-324, 0.5)]),
             (0.0, [(1e308, 0.0), (-0.468, 0.5)]),
@@ -140,10 +140,10 @@ mod tests {
 
     #[test]
     fn powers_that_nearly_agree_end() {
-        // What a fit of a real link came to: two own terms beside the highest, whose small differences are all there is.
+        // Example from a fit of a real link: two autoregressive terms with nearly the highest order.
         for c in [1.0, 0.999_999, -1.0, 1e-9, 1e9] {
             for gap in [1e-15, 1e-12, 1e-9, 1e-6] {
-                // (1 − c) s² + c, which may lie on the axis: to end is what is asked.
+                // (1 − c) s² + c can have zeros on the axis; only termination is checked.
                 std::hint::black_box(grows(2.0, &[(c, 2.0 - gap), (-c, gap)]));
                 // s² − 1.
                 assert!(grows(2.0, &[(c, 2.0 - gap), (-c, 2.0 - 2.0 * gap), (1.0, 0.0)]), "{c} {gap}");

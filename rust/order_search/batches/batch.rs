@@ -1,4 +1,4 @@
-//! Some rounds at work: screens their candidates, follows the open ones, accounts for all.
+//! Evaluation of one batch: screen, simulate the candidates that no bound excludes, count every outcome.
 
 use std::sync::atomic::Ordering;
 
@@ -14,31 +14,31 @@ use crate::order_search::result::{Failure, Kept, Part, Row, Verdict, LISTED};
 use crate::order_search::screening::{by_guess, screen, Open};
 use crate::parallel::PerThread;
 
-/// Pulses of all candidates followed between two checkpoints: a tenth of a second or so of one core.
+/// Pulses simulated between two checkpoints, about 0.1 s on one core.
 const PIECE: usize = 1 << 21;
-/// Candidates that a thread screens at a time: those that the Gram matrix alone ranks cost a nanosecond or so.
+/// Candidates that a task screens. Ranking by the Gram matrix alone costs about one nanosecond per candidate.
 const CHUNK: u64 = 512;
 const CHUNK_PLAIN: u64 = 1 << 13;
-/// Slabs of which boxes are tried where candidates are hard to exclude, and one in how many of their candidates boxes must
-/// exclude to pay: where they exclude none a search takes half as long again.
+/// Slices on which boxes are tried if candidates are hard to exclude. Boxes are worthwhile if they exclude at least one
+/// in so many candidates. Useless boxes make a search half as long again.
 const SLABS: u64 = 32;
 const PAYING: u64 = 8;
-/// First and largest number of candidates followed between two looks at the kept scores.
+/// First and largest number of candidates simulated between two updates of the limit.
 const FOLLOWED: (u64, u64) = (256, 16_384);
-/// First and largest number of refined candidates followed between two looks at the kept scores: each takes about a
-/// millisecond, and a lower score excludes many.
+/// First and largest number of refined candidates between two updates of the limit. Each takes about one millisecond,
+/// and a lower score excludes many.
 const REFINED: (u64, u64) = (32, 1024);
 
-/// Some rounds of a search at work.
+/// Evaluation of a range of batches.
 pub(super) struct Hunt<'a> {
     pub(super) catalogue: &'a Catalogue<'a>,
     boxes: Option<&'a Boxes>,
     pub(super) pool: &'a rayon::ThreadPool,
     control: &'a Control,
     scratches: PerThread<Scratch>,
-    /// Of the rounds done, and of the candidates done in this one but for its rows.
+    /// Result of the completed batches, and of the candidates evaluated in the current batch, without its rows.
     pub(super) part: Part,
-    /// Whether the next checkpoint is the first one of a stretch begun at its start.
+    /// Whether the next checkpoint is the first one since the range was started.
     pub(super) anew: bool,
 }
 
@@ -60,8 +60,8 @@ impl<'a> Hunt<'a> {
         self.control.check_stop()
     }
 
-    /// Screens a round and follows what is open, from a place on: its rows. False where the place lies in a round that
-    /// visits its candidates in another order, as one of another kind of processor may.
+    /// Screen a batch and simulate its open candidates, starting at a position. Return `false` if the position belongs
+    /// to another evaluation order, as on another kind of processor.
     pub(super) fn round(&mut self, bounds: (u64, u64), kept: &mut Kept, mut place: Place) -> Result<bool> {
         let (start, end) = bounds;
         let (limit, resumed) = (kept.limit, place.end > 0);
@@ -115,7 +115,7 @@ impl<'a> Hunt<'a> {
         self.follow(&open, kept, place, true).map(|()| true)
     }
 
-    /// Whether boxes exclude more than one in [`PAYING`] of some candidates all over the lattice at this limit.
+    /// Whether boxes exclude more than one in [`MAX_CANDIDATES_PER_EXCLUSION`] candidates on trial slices.
     pub(super) fn boxes_exclude(&self, limit: f64) -> Result<bool> {
         let Some(boxes) = self.boxes else { return Ok(false) };
         let (catalogue, control) = (self.catalogue, self.control);
@@ -138,10 +138,10 @@ impl<'a> Hunt<'a> {
         Ok(boxed * PAYING > all)
     }
 
-    /// The candidates of a round in chunks: those of a large slab together, others a few at a time.
+    /// Split the candidates of a batch into chunks: a large slice as a whole, others in small numbers.
     fn chunks(&self, start: u64, end: u64, limit: f64) -> Vec<(u64, u64, Option<Slab>)> {
         let mut chunks = Vec::new();
-        // Beside boxes a chunk must not reach far into the next slab.
+        // With boxes, a chunk must not extend far into the next slice.
         let plain = self.catalogue.problem.squares.is_some() && self.boxes.is_none();
         let chunk = if plain { CHUNK_PLAIN } else { CHUNK };
         let mut at = start;
@@ -162,15 +162,15 @@ impl<'a> Hunt<'a> {
         chunks
     }
 
-    /// Follows open candidates in this order from a place on; what is learnt goes to `kept`, and to the counts and
-    /// checkpoints if `counted`.
+    /// Simulate open candidates in this order, starting at a position. Rows are added to `kept`, and counts and
+    /// checkpoints are updated if `counted`.
     pub(super) fn follow(&mut self, open: &[Open], kept: &mut Kept, mut place: Place, counted: bool) -> Result<()> {
         if open.is_empty() {
             return Ok(());
         }
         let Catalogue { problem, options, .. } = self.catalogue;
         let saving = counted && self.control.saving.load(Ordering::Relaxed);
-        // A refinement costs about ten times a free run.
+        // A refinement costs about ten times a simulation.
         let pulses = if problem.refines() { PIECE / 8 } else { PIECE };
         let piece = if saving { (pulses / problem.samples().max(1)).max(4 * self.scratches.len()) } else { usize::MAX };
         let (first, largest) = if problem.refines() { REFINED } else { FOLLOWED };
@@ -210,7 +210,7 @@ impl<'a> Hunt<'a> {
         }
     }
 
-    /// Follows these candidates up to a limit: the rows they make.
+    /// Simulate these candidates up to a limit. Return the rows below it.
     fn follow_some(&mut self, open: &[Open], limit: f64, counted: bool) -> Result<Vec<Row>> {
         let (catalogue, control, scratches) = (self.catalogue, self.control, &self.scratches);
         let problem = &catalogue.problem;
@@ -238,7 +238,7 @@ impl<'a> Hunt<'a> {
                 };
                 scratch.positions = positions;
                 scratch.initial = initial;
-                // One that is bounded is counted as done with the other bounded ones.
+                // Candidates excluded by a bound are counted as processed elsewhere.
                 if counted && !matches!(verdict, Verdict::Bounded(_)) {
                     control.count(1, u64::from(matches!(verdict, Verdict::Stopped(_))));
                 }
@@ -277,7 +277,7 @@ impl<'a> Hunt<'a> {
     }
 }
 
-/// Digest of the order in which candidates are visited, below 2^63 and never 0 (64-bit FNV-1a over their indices).
+/// Digest of the evaluation order of candidates, below 2^63 and never 0 (64-bit FNV-1a over their indices).
 fn digest(open: &[Open]) -> u64 {
     let bytes = open.iter().flat_map(|candidate| candidate.index.to_le_bytes());
     let whole =

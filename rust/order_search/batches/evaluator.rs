@@ -1,15 +1,15 @@
-//! Evaluates the candidates of an order search: in parallel, ordered, stoppable, every one accounted for.
+//! Evaluator of an order search: parallel, reproducible, stoppable, with every candidate counted.
 //!
-//! Candidates stream by in rounds. All of a round get coefficients, several side by side, and those that a proved lower
-//! bound excludes are done; the others are followed, likely ones first, each until its partial sum passes the worst
-//! score kept: what is left out cannot be among the kept ones, so the table is that of brute force, ties by index.
+//! Candidates are processed in batches. All candidates of a batch get coefficients in parallel lanes, and a lower
+//! bound excludes most of them. The others are simulated in the order of their score estimates. Each simulation stops
+//! once its partial sum exceeds the worst score in the table. An excluded candidate cannot enter the table, so the
+//! table equals that of brute force, ties by index.
 //!
-//! How a search is cut into rounds, and its rounds into waves.
-//!
-//! Rounds form waves of 1, 2, 4, … A round knows the rows kept before its wave and what it finds itself, nothing else,
-//! so it comes to the same bits, counts too, whenever it is done on processors of one kind: on any number of threads, on
-//! another machine with the same vector instructions, or continued from a checkpoint. On another kind of processor the
-//! last digits may differ: the dense products and the transforms choose their kernels by the instructions they find.
+//! Generations hold 1, 2, 4, … batches. A batch depends only on the rows found before its generation and on its own.
+//! Its result and counts are therefore bitwise reproducible on processors of one kind: with any number of threads, on
+//! another machine with the same vector instructions, or after resuming from a checkpoint. On another kind of
+//! processor the last digits may differ, because dense products and transforms select their kernels by instruction
+//! set.
 
 use std::borrow::Cow;
 use std::sync::atomic::Ordering;
@@ -28,13 +28,15 @@ use crate::order_search::result::{Counts, Kept, Outcome, Part, Row};
 use crate::parallel::pool;
 use crate::regressors::Record;
 
-/// Searches a lattice over one equation on one or several records.
+/// Search an order grid for one equation on one or several records.
 ///
-/// `fixed` gives known coefficients, one place a term. The table is that of brute force for any number of threads.
+/// The slice `fixed` holds the fixed coefficients, one entry per term. The table equals that of brute force for any
+/// number of threads.
 ///
 /// # Errors
-/// A setting out of range, records without the signals of the equation, fixed coefficients that are not one a term, a
-/// bank beyond the memory limit, threads that do not start, [`crate::error::Error::Interrupted`].
+/// An option out of range, records without the signals of the equation, a number of fixed coefficients unlike the
+/// number of terms, regressors beyond the memory limit, threads that do not start,
+/// [`crate::error::Error::Interrupted`].
 ///
 /// ```
 /// # use ftlm::order_search::control::Control;
@@ -47,7 +49,7 @@ use crate::regressors::Record;
 /// // y is the integral of order 0.8 of u: D^0.8 y = u.
 /// let record = Record::new(0.1, vec![output, input], None)?;
 /// let order = TermAxis { signal: 1, values: vec![0.0], interchangeable: false };
-/// let lattice = Lattice::new(0, &[0.6, 0.7, 0.8, 0.9], &[order], |signal| signal == 1)?;
+/// let lattice = OrderGrid::new(0, &[0.6, 0.7, 0.8, 0.9], &[order], |signal| signal == 1)?;
 /// let found = search(&[record], &lattice, &[None], &Options::default(), &Control::default())?;
 /// assert_eq!(lattice.structure(found.rows[0].index).order, 0.8);
 /// assert!((found.rows[0].coefficients[0] - 1.0).abs() < 1e-9);
@@ -72,17 +74,17 @@ pub fn search(
     Ok(all.outcome(options.norm, ready.catalogue.problem.samples()))
 }
 
-/// A search over a lattice, ready for its rounds.
+/// Evaluator of an order search, prepared for its batches.
 pub struct Search<'a> {
     catalogue: Catalogue<'a>,
-    /// Where whole boxes of candidates are excluded at once.
+    /// Branch and bound, if it excludes whole boxes of candidates.
     boxes: Option<Boxes>,
-    /// No candidate above this raw score can be kept, as far as scouts can tell.
+    /// Raw score above which no candidate can enter the table, from the initial sample.
     limit: f64,
 }
 
 impl<'a> Search<'a> {
-    /// Builds what all rounds share: regressors, their products, test vectors and a first limit from scouts.
+    /// Build the data shared by all batches: regressors, their products, test vectors and an initial limit.
     ///
     /// # Errors
     /// As [`search`].
@@ -99,7 +101,7 @@ impl<'a> Search<'a> {
         control.total.store(count, Ordering::Relaxed);
         control.check_stop()?;
         let problem = &catalogue.problem;
-        // Scouts of a few candidates, each refined, would cost as much as the search.
+        // An initial sample of few refined candidates would cost as much as the search.
         let few = problem.refines() && count <= FEW;
         if few || (problem.bound.is_none() && problem.squares.is_none()) {
             return Ok(Self { catalogue, boxes: None, limit: f64::INFINITY });
@@ -112,7 +114,7 @@ impl<'a> Search<'a> {
             let problem = &mut catalogue.problem;
             problem.bound = problem.bound.take().map(|bound| bound.chosen(&which));
         }
-        // Of equation errors in squares the Gram matrix says all.
+        // The Gram matrix determines squared equation errors completely.
         if pay && catalogue.problem.squares.is_none() && kept.limit < f64::INFINITY {
             let (adapted, bytes) = catalogue.problem.no_adapted();
             catalogue.problem.adapted = Some(adapted);
@@ -124,7 +126,7 @@ impl<'a> Search<'a> {
                 if let Some(adapted) = &mut catalogue.problem.adapted {
                     adapted.each.extend(vectors);
                 }
-                // What no vector excludes is likely to be good.
+                // Candidates that no vector excludes are likely to be good.
                 Hunt::new(&catalogue, None, pool, control).on_from(&left, &mut kept, &mut tried)?;
                 if !again {
                     break;
@@ -143,7 +145,7 @@ impl<'a> Search<'a> {
         }
         let mut boxes = pool.install(|| if pay { Boxes::new(&catalogue) } else { None });
         control.check_stop()?;
-        // What scouts leave open boxes may leave open, too, and test vectors made for candidates with them.
+        // Boxes, and tailored test vectors with them, may fail on the candidates that are open in the initial sample.
         if hard && boxes.is_some() && !Hunt::new(&catalogue, boxes.as_ref(), pool, control).boxes_exclude(limit)? {
             boxes = None;
             catalogue.problem.adapted = None;
@@ -151,14 +153,14 @@ impl<'a> Search<'a> {
         Ok(Self { catalogue, boxes, limit })
     }
 
-    /// Does rounds `first … last − 1` of one wave.
+    /// Evaluate batches `first … last − 1` of one generation.
     ///
-    /// `seed` gives index and raw score of the rows kept before the wave. `from` goes on from a checkpoint of the same
-    /// stretch and seed that holds all rows found since its start; where it stands in a round that visits its candidates
-    /// in another order here (it may on another kind of processor), the stretch is begun again.
+    /// `seed` holds index and raw score of the rows found before the generation. `from` resumes a checkpoint of the
+    /// same range and seed that holds all rows found since its start. The range is restarted if the checkpoint belongs
+    /// to another evaluation order, as on another kind of processor.
     ///
     /// # Errors
-    /// [`crate::error::Error::Interrupted`], or rounds, seed or checkpoint that do not fit this search.
+    /// [`crate::error::Error::Interrupted`], or batches, seed or checkpoint of another search.
     ///
     /// ```
     /// # use std::borrow::Cow;
@@ -166,20 +168,20 @@ impl<'a> Search<'a> {
     /// # use ftlm::order_search::grid::{Lattice, TermAxis};
     /// # use ftlm::order_search::options::Options;
     /// # use ftlm::order_search::result::Part;
-    /// # use ftlm::order_search::batches::evaluator::{rounds, waves, Search};
+    /// # use ftlm::order_search::batches::evaluator::{batch_count, generation_ends, BatchEvaluator};
     /// # use ftlm::parallel::pool;
     /// # use ftlm::regressors::Record;
     /// # let input: Vec<f64> = (0..64).map(|k| if k % 16 < 8 { 1.0 } else { -1.0 }).collect();
     /// # let output = Record::new(0.1, vec![input.clone()], None)?.integral(0, 0.8);
     /// # let record = Record::new(0.1, vec![output, input], None)?;
     /// # let order = TermAxis { signal: 1, values: vec![0.0], interchangeable: false };
-    /// # let lattice = Lattice::new(0, &[0.6, 0.7, 0.8, 0.9], &[order], |signal| signal == 1)?;
+    /// # let lattice = OrderGrid::new(0, &[0.6, 0.7, 0.8, 0.9], &[order], |signal| signal == 1)?;
     /// let (options, control, pool) = (Options::default(), Control::default(), pool(1)?);
-    /// let ready = Search::new(&[record], Cow::Borrowed(&lattice), &[None], &options, &pool, &control)?;
+    /// let evaluator = BatchEvaluator::new(&[record], Cow::Borrowed(&lattice), &[None], &options, &pool, &control)?;
     /// let (mut all, mut first) = (Part::default(), 0);
-    /// for last in waves(rounds(lattice.count(), &options)) {
+    /// for last in generation_ends(batch_count(lattice.count(), &options)) {
     ///     let seed = all.seed();
-    ///     all.join(ready.rounds(first, last, &seed, None, &pool, &control)?, options.keep);
+    ///     all.join(evaluator.evaluate_batches(first, last, &seed, None, &pool, &control)?, options.top);
     ///     first = last;
     /// }
     /// assert_eq!(all.counts.candidates, 4);
@@ -213,7 +215,8 @@ impl<'a> Search<'a> {
             return Err(another(format!("a row of score {score} has index {index} among {count} candidates")));
         }
         self.check(&from.part)?;
-        // Rounds are spread over the lattice, so that early waves see all of it and later ones get a good limit.
+        // Batches are distributed over the grid, so that early generations sample all of it and later ones start with a
+        // good limit.
         let order = visit(all);
         let mut hunt = Hunt::new(&self.catalogue, self.boxes.as_ref(), pool, control);
         let Checkpoint { mut place, part, .. } = from;
@@ -233,7 +236,7 @@ impl<'a> Search<'a> {
             kept.take(hunt.part.rows.iter().filter(|row| own(row)).cloned());
             hunt.part.rows.retain(|row| !own(row));
             if !hunt.round(bounds, &mut kept, place)? {
-                // Its candidates would be followed twice or never: what it came to elsewhere is of no use here.
+                // Its candidates would be evaluated twice or never, so the foreign result is discarded.
                 control.done.fetch_sub(known, Ordering::Relaxed);
                 (hunt.part, hunt.anew, place) = (Part::default(), true, Place::start(first));
                 continue;
@@ -249,7 +252,7 @@ impl<'a> Search<'a> {
         Ok(hunt.part)
     }
 
-    /// Refuses what another search came to.
+    /// Raise an error for a partial result of another search.
     fn check(&self, part: &Part) -> Result<()> {
         let (count, width) = (self.catalogue.lattice.count(), self.catalogue.lattice.width());
         let other = |row: &Row| row.coefficients.len() != width || row.index >= count || strange(row.score);
@@ -268,28 +271,27 @@ impl<'a> Search<'a> {
     }
 }
 
-/// Whether this is no raw sum of errors.
+/// Whether a value cannot be a raw sum of errors.
 fn strange(score: f64) -> bool {
     score.is_nan() || score < 0.0
 }
 
-/// Candidates of one round where the Gram matrix alone ranks (16 ns each), where bounds screen (a microsecond or so), and
-/// where every candidate is followed: a round is long enough to be worth sending away, and short enough to be lost.
+/// Candidates per batch: ranked by the Gram matrix alone (16 ns each), screened by bounds (about 1 µs), all simulated.
+/// A batch is long enough to be sent to another machine, and short enough to be lost.
 const ROUND_PLAIN: u64 = 1 << 18;
 const ROUND_BOUNDED: u64 = 1 << 16;
 const ROUND_FOLLOWED: u64 = 1 << 12;
-/// Candidates from which on boxes may screen ([`crate::order_search::branch_and_bound`]), in rounds that grow with the
-/// lattice up to the longest: the tables of boxes that two rounds share are made twice.
+/// Minimum candidates for branch and bound, and maximum batch size. Batches grow with the grid because the tables of
+/// boxes shared by two batches are computed twice.
 pub(super) const BOXED: u64 = 1 << 25;
 const ROUND_LONGEST: u64 = 1 << 22;
-/// Candidates from which on those that are ranked by free runs are proved closely: by the zeros of their divisors and by
-/// test vectors that follow coefficients ([`crate::order_search::batches`]). A smaller search is done before these are
-/// made.
+/// Minimum candidates for close bounds if simulation ranks: unstable zeros and linearized test vectors. A smaller
+/// search ends before these are built.
 const PROVED: u64 = 1 << 18;
-/// Refined candidates that are followed without scouts, one round of them.
+/// Maximum refined candidates that are evaluated without an initial sample, one batch.
 pub(super) const FEW: u64 = ROUND_FOLLOWED;
 
-/// Number of the algorithm by which the rounds of a search over so many candidates are cut and done.
+/// Version of the algorithm that divides and evaluates a search over this many candidates.
 #[must_use]
 pub fn algorithm(candidates: u64, options: &Options) -> u64 {
     let bounded = options.criterion == Criterion::OutputError || (candidates >= BOXED && !options.refines());
@@ -300,12 +302,12 @@ pub fn algorithm(candidates: u64, options: &Options) -> u64 {
     }
 }
 
-/// Whether so many candidates are proved closely.
+/// Whether a search over this many candidates uses close bounds.
 pub(super) fn proved_closely(candidates: u64, options: &Options) -> bool {
     candidates >= PROVED && options.scored_by_free_runs()
 }
 
-/// Candidates in a round of a search over so many, by this algorithm.
+/// Number of candidates per batch of a search, for this version of the algorithm.
 pub(super) fn round_length(candidates: u64, options: &Options, algorithm: u64) -> u64 {
     if options.refines() || !options.early_stopping {
         ROUND_FOLLOWED
@@ -318,25 +320,25 @@ pub(super) fn round_length(candidates: u64, options: &Options, algorithm: u64) -
     }
 }
 
-/// Rounds of a search over so many candidates.
+/// Number of batches of a search over this many candidates.
 #[must_use]
 pub fn rounds(candidates: u64, options: &Options) -> u64 {
     rounds_by(algorithm(candidates, options), candidates, options)
 }
 
-/// The same by an earlier algorithm, whose finished rounds are still to be read.
+/// Number of batches for an earlier version of the algorithm, whose completed batches must be read.
 #[must_use]
 pub fn rounds_by(algorithm: u64, candidates: u64, options: &Options) -> u64 {
     candidates.div_ceil(round_length(candidates, options, algorithm))
 }
 
-/// Where each wave of so many rounds ends: 1, 3, 7, …
+/// End of each generation for this number of batches: 1, 3, 7, …
 ///
 /// ```
 /// # use ftlm::order_search::options::Options;
 /// # use ftlm::order_search::batches::evaluator::{rounds, waves};
-/// let rounds = rounds(400_000, &Options::default());
-/// assert_eq!((rounds, waves(rounds)), (7, vec![1, 3, 7]));
+/// let batches = batch_count(400_000, &Options::default());
+/// assert_eq!((batches, generation_ends(batches)), (7, vec![1, 3, 7]));
 /// ```
 #[must_use]
 pub fn waves(rounds: u64) -> Vec<u64> {

@@ -1,6 +1,6 @@
-//! Scouts: candidates tried beforehand, all over the lattice, which give a first good score and choose the test vectors.
+//! Incumbent of a search from an initial sample of the grid and a local refinement.
 //!
-//! What is learnt around the best of the scouts: a limit that is all but the last one.
+//! The sample also selects the test vectors.
 
 use std::collections::HashSet;
 
@@ -16,32 +16,34 @@ use crate::order_search::grid::traversal::{visit, Cursor};
 use crate::order_search::result::Kept;
 use crate::order_search::screening::{by_guess, screen, Open};
 
-/// Candidates tried beforehand, spread over the lattice: they choose the test vectors and give the first good score.
+/// Candidates of the initial sample, distributed over the grid. They select the test vectors and give the first
+/// incumbent.
 const SCOUTS: u64 = 2048;
-/// Test vectors that a search works with.
+/// Maximum test vectors used in a search.
 const VECTORS: usize = 16;
-/// Candidates among which the most likely ones are refined beforehand: guesses are cheap, and what is kept of a good
-/// part of the lattice excludes most of it.
+/// Candidates among which the most promising are refined first. Estimates are cheap, and rows from a large part of the
+/// grid exclude most of it.
 const GUESSED: u64 = 1 << 18;
 
-/// Where test vectors leave fewer than one of so many scouts open at the best score that scouts found, closer proofs do
-/// not pay: they left 0.3 to 2 % (and 9 % at twice the noise) where a true equation is near, 53 to 100 % where a search
-/// takes seconds because none is.
+/// Inverse of the minimum open fraction of the sample for close bounds. Below it they are not worthwhile. Measured: 0.3
+/// to 2 % open (9 % at twice the noise) near a true equation, 53 to 100 % in searches that take seconds because there
+/// is none.
 const EASY: usize = 8;
 
-/// What scouts came to.
+/// Incumbent found by the initial sample.
 pub(super) struct Scouted {
-    /// The rows that give a first limit, and what else has been followed.
+    /// Rows that give the initial limit, and the candidates evaluated for them.
     pub(super) kept: Kept,
     pub(super) tried: HashSet<u64>,
-    /// Whether test vectors leave so many open at it that candidates are to be proved closely.
+    /// Whether so many candidates remain open at this limit that close bounds are worthwhile.
     pub(super) hard: bool,
-    /// The test vectors to work with, the best first.
+    /// Indices of the selected test vectors, the best first.
     pub(super) which: Option<Vec<usize>>,
 }
 
 impl Hunt<'_> {
-    /// A first limit and test vectors; the neighbours of the best are followed where `thorough` is true. Whether candidates are hard to exclude is asked if `closely`.
+    /// Find an initial incumbent and select test vectors. `thorough` also evaluates the neighbors of the best rows.
+    /// `closely` also tests whether close bounds are worthwhile.
     pub(super) fn scout(&mut self, thorough: bool, closely: bool) -> Result<Scouted> {
         let catalogue = self.catalogue;
         let (lattice, problem) = (&*catalogue.lattice, &catalogue.problem);
@@ -102,12 +104,12 @@ impl Hunt<'_> {
             self.nearby(&mut kept, &mut tried)?;
             hard = closely && many(kept.limit);
         } else if closely && kept.rows.first().is_some_and(|best| many(best.score)) {
-            // The best score of so few is near the last limit, which the worst of those kept is far from.
+            // In a small sample the best score is near the final limit. The worst row of the table is not.
             self.nearby(&mut kept, &mut tried)?;
             hard = many(kept.limit);
         }
         let limit = kept.limit;
-        // Where no coefficients are known yet all test vectors count.
+        // Without initial coefficients all test vectors are used.
         let which = problem.bound.as_ref().filter(|_| !refined).map(|bound| {
             let each: Vec<Vec<f64>> = found.into_iter().map(|(_, each)| each).collect();
             choose(&each, VECTORS.min(bound.len()), limit)
@@ -116,11 +118,11 @@ impl Hunt<'_> {
     }
 }
 
-/// The test vectors that together exclude most of a sample, those that exclude most by themselves first.
+/// Select the test vectors that together exclude most of a sample, in greedy order.
 fn choose(each: &[Vec<f64>], wanted: usize, limit: f64) -> Vec<usize> {
     let mut open: Vec<bool> = vec![true; each.len()];
     let mut chosen: Vec<usize> = Vec::new();
-    // Where one excludes no more than another the smaller threshold tells: how near it comes.
+    // Among vectors with equal exclusions, the one with the larger bounds is preferred.
     let gain = |j: usize, open: &[bool]| -> (usize, f64) {
         let values = each.iter().zip(open).filter(|(_, open)| **open).map(|(e, _)| e[j]);
         values.fold((0, 0.0), |(n, sum), v| (n + usize::from(v > limit), sum + v / (v + limit).max(f64::MIN_POSITIVE)))
@@ -138,33 +140,33 @@ fn choose(each: &[Vec<f64>], wanted: usize, limit: f64) -> Vec<usize> {
     chosen
 }
 
-/// Rows whose neighbours are followed.
+/// Rows whose neighbors are evaluated.
 const BEST: usize = 64;
-/// Most candidates followed around the best ones.
+/// Maximum neighbors evaluated around the best rows.
 const FOLLOWED: usize = 1 << 14;
-/// Most directions in which neighbours are looked for: all of up to five orders, else pairs of orders.
+/// Maximum directions of neighbors: all combinations of up to five orders, else pairs of orders.
 const DIRECTIONS: usize = 243;
-/// Stretches of candidates, and their length, among which the hard ones are looked for.
+/// Number of sampled blocks of candidates, and their length.
 const SAMPLED: (u64, u64) = (2048, 64);
-/// Most hard candidates that are followed.
+/// Maximum open candidates that are evaluated.
 const HARD: usize = 512;
 
 impl Hunt<'_> {
-    /// Goes down from the best rows, and from what is found all over the lattice by the limit that they give.
+    /// Refine the incumbent from the best rows, and from open candidates sampled over the whole grid.
     pub(super) fn nearby(&mut self, kept: &mut Kept, tried: &mut HashSet<u64>) -> Result<()> {
         self.neighbours(kept, tried)?;
         let hard = self.hard(kept)?;
         self.on_from(&hard, kept, tried)
     }
 
-    /// Follows these and goes down from the best.
+    /// Evaluate these candidates, then search around the best rows.
     pub(super) fn on_from(&mut self, open: &[Open], kept: &mut Kept, tried: &mut HashSet<u64>) -> Result<()> {
         let anew: Vec<Open> = open.iter().filter(|open| tried.insert(open.index)).copied().collect();
         self.follow(&anew, kept, Place::start(0), false)?;
         self.neighbours(kept, tried)
     }
 
-    /// Follows neighbours of the best rows, far ones first, until none is better.
+    /// Evaluate neighbors of the best rows, distant ones first, until none improves them.
     pub(super) fn neighbours(&mut self, kept: &mut Kept, tried: &mut HashSet<u64>) -> Result<()> {
         let lattice = &*self.catalogue.lattice;
         let longest = lattice.groups().iter().flat_map(|group| &group.axes).map(Vec::len);
@@ -188,7 +190,7 @@ impl Hunt<'_> {
         Ok(())
     }
 
-    /// Neighbours of a candidate at this distance in any of its orders that vary.
+    /// Neighbors of a candidate at this distance in any of its varying orders.
     fn around(&self, index: u64, stride: usize) -> Vec<u64> {
         let lattice = &*self.catalogue.lattice;
         let cursor = Cursor::at(lattice, index);
@@ -198,7 +200,7 @@ impl Hunt<'_> {
         for group in lattice.groups() {
             group.terms.iter().zip(&group.axes).for_each(|(&term, axis)| lengths[term] = axis.len());
         }
-        // The order of the equation itself comes last.
+        // The order of the equation comes last.
         here.push(cursor.block());
         lengths.push(lattice.blocks().len());
         let vary: Vec<usize> = (0..here.len()).filter(|&i| lengths[i] > 1).collect();
@@ -232,7 +234,7 @@ impl Hunt<'_> {
         moves.into_iter().filter_map(there).collect()
     }
 
-    /// Some candidates all over the lattice that no bound excludes, the most likely first.
+    /// Sample of candidates that no bound excludes, the most promising first.
     fn hard(&mut self, kept: &Kept) -> Result<Vec<Open>> {
         let catalogue = self.catalogue;
         if catalogue.problem.squares.is_none() {

@@ -1,4 +1,4 @@
-//! A search over a lattice, round by round.
+//! Batch evaluation of an order search over one equation.
 
 mod batch;
 mod evaluator;

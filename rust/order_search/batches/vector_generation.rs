@@ -1,6 +1,6 @@
-//! Test vectors made for candidates that no other one excludes, then for those that these leave, as long as it pays.
+//! Generation of tailored and linearized test vectors while they are worthwhile.
 //!
-//! Test vectors that follow coefficients, made where a sample of the lattice says that many candidates wait for them.
+//! Vectors are built for candidates that no other vector excludes, in a sample of the grid.
 
 use std::collections::BTreeMap;
 
@@ -14,40 +14,41 @@ use crate::order_search::dual_bound::tailored_vectors::Fitted;
 use crate::order_search::grid::traversal::{visit, Cursor};
 use crate::order_search::screening::{by_guess, screen, Open};
 
-/// Candidates among which open ones are looked for, in stretches of so many (those of one stretch are open together or
-/// not at all): at first, and the share of a large lattice later on, when few are open and it takes many to see enough.
+/// Sample in which open candidates are searched, and its block length. Candidates of one block are open together or not
+/// at all. The first pass takes the minimum sample. Later passes take a fraction of a large grid, since few candidates
+/// remain open.
 const SAMPLED: u64 = 1 << 17;
 const SHARE: u64 = 512;
 const STRETCH: u64 = 16;
 const BATCH: u64 = 1 << 11;
-/// Enough of them, and as many as are followed or as test vectors are held against.
+/// Number of open candidates at which sampling stops.
 const HARD: usize = 512;
-/// Most test vectors that are tried at a time, and most that are kept of these.
+/// Maximum vectors tried per pass, and maximum vectors selected from them.
 const TRIED: usize = 32;
 const MADE: usize = 12;
-/// Most times.
+/// Maximum passes.
 const TIMES: u64 = 4;
-/// Candidates that must be left open in all for another time to pay, and that a vector must exclude: trying some takes as
-/// long as running so many.
+/// Open candidates that make another pass worthwhile, and exclusions that make a vector worthwhile. One pass costs as
+/// much as simulating so many candidates.
 const WORTH: f64 = 16_384.0;
 const ENOUGH: f64 = 512.0;
 const BIASED: usize = 4;
-/// Most bytes of test vectors, tried ones too.
+/// Maximum memory of test vectors, including those on trial [bytes].
 const MOST: u64 = 256 << 20;
 
-/// What came of making some.
+/// Result of one pass of vector generation.
 #[derive(Default)]
 pub(super) struct Made {
     pub(super) vectors: Vec<Fitted>,
-    /// What is open to them in the sample.
+    /// Candidates of the sample that the vectors leave open.
     pub(super) left: Vec<Open>,
-    /// Whether another time may pay.
+    /// Whether another pass may be worthwhile.
     pub(super) again: bool,
 }
 
 impl Hunt<'_> {
-    /// Some candidates all over the lattice that no bound excludes at this limit, the most likely first, and how many of
-    /// the lattice each stands for; other ones each time.
+    /// Sample of candidates that no bound excludes at this limit, the most promising first. Also returns the number of
+    /// candidates that each represents. Each pass draws another sample.
     pub(super) fn waiting(&self, limit: f64, time: u64) -> Result<(Vec<Open>, f64)> {
         let catalogue = self.catalogue;
         let count = catalogue.lattice.count();
@@ -74,9 +75,8 @@ impl Hunt<'_> {
         Ok((open, each))
     }
 
-    /// Test vectors that together exclude most of what is open at this limit, each of them much, and what they leave: the
-    /// first time for the best row too, for what is near it. None where they would not pay, or where there is no memory
-    /// for them.
+    /// Generate test vectors that together exclude most open candidates at this limit. The first pass includes a vector
+    /// for the best row and its neighbors. Empty if the vectors are not worthwhile or memory is lacking.
     pub(super) fn made(&self, limit: f64, time: u64, best: Option<u64>) -> Result<Made> {
         let catalogue = self.catalogue;
         let (lattice, problem) = (&*catalogue.lattice, &catalogue.problem);
@@ -126,34 +126,34 @@ impl Hunt<'_> {
             left.iter_mut().zip(&out).for_each(|(left, out)| *left &= !out);
         }
         let left: Vec<Open> = open.into_iter().zip(left).filter_map(|(open, left)| left.then_some(open)).collect();
-        // They were chosen to exclude these very candidates: of others they leave more.
+        // The vectors were selected on this sample, so they leave more of other candidates open.
         let again = time + 1 < TIMES && !made.is_empty() && all(BIASED * left.len()) >= WORTH;
         Ok(Made { vectors: made, left, again })
     }
 }
 
-/// At most so many of these, evenly.
+/// Subsample at most `most` candidates, evenly spaced.
 pub(super) fn thinned(all: &[Open], most: usize) -> Vec<Open> {
     let count = all.len().min(most);
     (0..count).map(|i| all[i * all.len() / count]).collect()
 }
 
-/// Candidates of the sample, in stretches of so many: one in eight of a small lattice.
+/// Maximum candidates of the sample, and its block length. A small grid is sampled by one in eight.
 const MAX_LINEARIZED_SAMPLE: u64 = 1 << 19;
 const LINEARIZED_SAMPLE_RATIO: u64 = 8;
 const LINEARIZED_SAMPLE_BLOCK: u64 = 8;
-/// Candidates that a vector must exclude, or that must be left where one more is tried: making one costs as much as ten
-/// to twenty free runs.
+/// Minimum exclusions per vector, and minimum open candidates for another vector. Building one costs as much as ten to
+/// twenty simulations.
 const MIN_LINEARIZED_EXCLUSIONS: f64 = 32.0;
-/// Most vectors for the same own orders, and most candidates tried in vain.
+/// Maximum vectors for the same own orders, and maximum unsuccessful trials.
 const MAX_LINEARIZED_VECTORS: usize = 24;
 const VAIN: usize = 6;
-/// Most bytes of all.
+/// Maximum memory of all vectors [bytes].
 const MAX_LINEARIZED_BYTES: u64 = 1 << 30;
 
 impl Hunt<'_> {
-    /// For each tuple of own orders, vectors that exclude what a sample left open at this limit; none where there are
-    /// none to make, or no memory for them.
+    /// Generate vectors for each tuple of own orders that exclude the open candidates of a sample. `None` if no vector
+    /// is worthwhile or memory is lacking.
     pub(super) fn along(&self, limit: f64) -> Result<Option<Tangents>> {
         let problem = &self.catalogue.problem;
         let mut tangents = problem.no_tangents();
@@ -197,7 +197,7 @@ impl Hunt<'_> {
         Ok((tangents.len() > 0).then_some(tangents))
     }
 
-    /// What a sample of the lattice leaves open at this limit, and how many candidates each stands for.
+    /// Open candidates in a sample of the grid at this limit, and the number of candidates that each represents.
     #[allow(clippy::cast_precision_loss)]
     fn sample(&self, limit: f64) -> Result<(Vec<Known>, f64)> {
         let catalogue = self.catalogue;
@@ -232,8 +232,8 @@ impl Hunt<'_> {
         Ok((open, count as f64 / (wanted * LINEARIZED_SAMPLE_BLOCK) as f64))
     }
 
-    /// Vectors for candidates of the same own columns: one for the middle of what is open along the first coefficient,
-    /// and again on both sides of it.
+    /// Generate vectors for candidates with the same own columns. The first is built at the median of the first
+    /// coefficient, then both halves are processed likewise.
     fn cover(
         &self,
         tangents: &Tangents,

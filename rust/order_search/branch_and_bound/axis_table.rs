@@ -1,8 +1,9 @@
-//! One order of a slab: what its values make of everything that the bound asks for, and how far from straight that runs.
+//! Axis tables of one order of a slice: projections, coefficients and deviations from linearity.
 //!
-//! Column x of each value is taken to û, what the slab's other columns leave of it, of unit size. Over a stretch of
-//! values any quantity is its straight line between the ends, within an eighth of the stretch's length squared times
-//! the largest second difference between: f_i − l_i = −Σ_j G_ij Δ²f_j with 0 ≤ G and Σ_j G_ij = (i − lo)(hi − i)/2.
+//! û is the column x of a value after projection on the slice's remaining columns, scaled to unit norm. Over an
+//! interval any quantity deviates from linear interpolation between the ends by at most one eighth of the squared
+//! length times the largest second difference: f_i − l_i = −Σ_j G_ij Δ²f_j with 0 ≤ G and Σ_j G_ij = (i − lo)(hi −
+//! i)/2.
 
 use crate::order_search::candidate::normal_equations::Normal;
 use crate::order_search::dual_bound::test_vectors::{Probes, NONE};
@@ -15,46 +16,46 @@ pub(super) const ZERO: Wide = [0.0; WIDTH];
 /// ⟨t, x⟩ and g‖t‖, real and imaginary parts.
 pub(super) type Seen = [Wide; 4];
 
-/// Of a stretch of 2^l values: what its inner ones differ from straight by, and its largest values.
+/// Second differences and largest values over an interval of 2^l values.
 #[derive(Debug, Clone, Copy)]
 pub(super) struct Node {
-    /// Largest second differences of ⟨t, û⟩ and of g‖t‖, largest ‖Fᵀt − g t‖ and way from that of the partner.
+    /// Largest second differences of ⟨t, û⟩ and g‖t‖, largest ‖Fᵀt − g t‖, and its distance from that of the partner.
     pub(super) bent: [Wide; 4],
 }
 
-/// The same of numbers that no test vector enters.
+/// Largest sums of coefficients over an interval, independent of the test vectors.
 #[derive(Debug, Clone, Copy, Default)]
 pub(super) struct Plain {
     /// Largest sum of the moduli of û's coefficients.
     pub(super) sum: f64,
 }
 
-/// Stretches of one length.
+/// Intervals of one length.
 pub(super) struct Level {
     pub(super) plain: Vec<Plain>,
-    /// Largest second differences of the coefficients of û on the other columns, k a stretch.
+    /// Largest second differences of û's coefficients on the remaining columns, k per interval.
     pub(super) mixed: Vec<f64>,
-    /// Groups of test vectors within stretches.
+    /// Groups of test vectors within intervals.
     pub(super) nodes: Vec<Node>,
 }
 
-/// The other columns of a slab.
+/// Columns of a slice whose orders do not vary.
 pub(super) struct Others<'a> {
     pub(super) normal: &'a Normal,
     pub(super) probes: &'a [Probes],
-    /// Their columns and the inverse of their correlations.
+    /// Remaining columns and the inverse of their correlation matrix.
     pub(super) columns: &'a [usize],
     pub(super) inverse: &'a [f64],
-    /// Sum of its diagonal.
+    /// Trace of that inverse.
     pub(super) trace: f64,
-    /// What rounding may add to a product of unit columns.
+    /// Rounding-error bound of a product of unit columns.
     pub(super) rounding: f64,
-    /// One of the columns that is the output's own, whose coefficient that of an own one of the sides may cancel.
+    /// Remaining column of the output itself. Its coefficient may cancel that of an own column of the sides.
     pub(super) partner: Option<usize>,
 }
 
 impl Others<'_> {
-    /// Coefficients on the other columns of the column with these products.
+    /// Solve for the coefficients of a column on the remaining columns, given its products with them.
     pub(super) fn solve(&self, products: &[f64], out: &mut [f64]) {
         let k = self.columns.len();
         for (i, out) in out.iter_mut().enumerate() {
@@ -62,7 +63,8 @@ impl Others<'_> {
         }
     }
 
-    /// How far an own column's Fᵀt − g t is from the partner's at most; nothing of another column, or without a partner.
+    /// Upper bound of the distance of an own column's Fᵀt − g t from the partner's. Zero for any other column or
+    /// without a partner.
     #[inline(always)]
     fn way(&self, record: usize, group: usize, column: usize) -> Wide {
         let probes = &self.probes[record];
@@ -77,7 +79,7 @@ impl Others<'_> {
         way
     }
 
-    /// ⟨t, x⟩ and g‖t‖ of a column of unit size, and its ‖Fᵀt − g t‖.
+    /// ⟨t, x⟩ and g‖t‖ of a unit column, and its ‖Fᵀt − g t‖.
     #[inline(always)]
     pub(super) fn seen(&self, record: usize, group: usize, column: usize) -> (Seen, Wide) {
         let probes = &self.probes[record];
@@ -101,17 +103,17 @@ impl Others<'_> {
     }
 }
 
-/// One order of a slab, over these values.
+/// Tables along one order of a slice.
 pub(super) struct Side {
     pub(super) columns: Vec<usize>,
-    /// 1/‖x − its part along the others‖, and û·y.
+    /// 1/‖x − its projection on the remaining columns‖, and û·y.
     pub(super) scale: Vec<f64>,
     pub(super) target: Vec<f64>,
-    /// Products with the other columns, and û's coefficients on them (to be subtracted), k a value.
+    /// Products with the remaining columns, and û's coefficients on them (to be subtracted), k per value.
     pub(super) shared: Vec<f64>,
     pub(super) mixed: Vec<f64>,
-    /// What is to be subtracted for û from the coefficient on the partner and that on the order's own column together,
-    /// as if both were the partner; nothing where there is none.
+    /// Coefficient of û on the partner plus that on the own column, as if both were the partner. Empty without a
+    /// partner.
     pub(super) paired: Vec<f64>,
     /// Groups of test vectors within values.
     pub(super) seen: Vec<Seen>,
@@ -119,7 +121,7 @@ pub(super) struct Side {
 }
 
 impl Side {
-    /// Over these columns; none where one of them is all but a combination of the others.
+    /// Build the tables for these columns. `None` if a column is nearly a combination of the remaining columns.
     #[inline(always)]
     pub(super) fn new(others: &Others<'_>, columns: Vec<usize>) -> Option<Self> {
         let (k, n, normal) = (others.columns.len(), columns.len(), others.normal);
@@ -133,7 +135,7 @@ impl Side {
             others.solve(shared, raw);
             let left = 1.0 - shared.iter().zip(raw.iter()).map(|(g, a)| g * a).sum::<f64>();
             let sum = 1.0 + raw.iter().map(|a| a.abs()).sum::<f64>();
-            // What is not a number ends here too.
+            // This also rejects NaN.
             if left.is_nan() || left <= 1e3 * others.rounding * others.trace * sum * sum {
                 return None;
             }
@@ -188,7 +190,7 @@ impl Side {
                 rests.push([rest, way]);
             }
         }
-        // What is not a number, or none that anything follows from, ends here: no multiple of it is 0.
+        // Reject NaN and infinity, whose multiple by 0 is NaN.
         if sound.iter().any(|v| v.is_nan()) {
             return None;
         }
@@ -197,7 +199,7 @@ impl Side {
         Some(side)
     }
 
-    /// Stretches of 1, 2, 4, … values.
+    /// Build the levels with intervals of 1, 2, 4, … values.
     #[inline(always)]
     fn build(&mut self, k: usize, groups: usize, rests: &[[Wide; 2]]) {
         let n = self.columns.len();
@@ -245,7 +247,8 @@ impl Side {
                 let start = level.mixed.len();
                 level.mixed.extend_from_slice(&below.mixed[left * k..(left + 1) * k]);
                 if right < halves {
-                    // The last of the left half and the first of the right one are now within, unless it is the end.
+                    // The last value of the left half and the first of the right half become inner values, except at
+                    // the end.
                     let joint = right * length;
                     let inner = |i: usize| i > left * length && i + 1 < n.min((right + 1) * length);
                     all.sum = all.sum.max(below.plain[right].sum);
@@ -288,7 +291,7 @@ impl Side {
     }
 }
 
-/// All groups of test vectors: record and number.
+/// All groups of test vectors: record and group number.
 pub(super) fn each_group(probes: &[Probes]) -> impl Iterator<Item = (usize, usize)> + '_ {
     probes.iter().enumerate().flat_map(|(r, probes)| (0..probes.groups).map(move |g| (r, g)))
 }

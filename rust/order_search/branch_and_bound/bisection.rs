@@ -1,4 +1,4 @@
-//! The candidates of a slab that no box excludes: boxes are halved until they are excluded or small.
+//! Bisection of the boxes of a slice until they are excluded or small, and screening of the remaining candidates.
 
 use std::borrow::Cow;
 use std::ops::Range;
@@ -19,22 +19,22 @@ use crate::parallel::{pool, Stop};
 use crate::regressors::Record;
 use crate::simd::{self, WIDTH};
 
-/// Fewest candidates of a slab for which its tables pay.
+/// Minimum number of candidates of a slice for which its tables are worthwhile.
 pub(crate) const LEAST: u64 = 4096;
-/// Levels that a box begins with: stretches of 32 values.
+/// Initial level of a box: intervals of 32 values.
 const COARSE: usize = 5;
-/// Levels, of both orders together, below which candidates are screened one by one.
+/// Sum of both levels at or below which candidates are screened individually.
 const FINE: usize = 4;
 
-/// What all boxes of a search share.
+/// Constants of branch and bound, shared by all boxes of a search.
 pub(crate) struct Boxes {
     common: Common,
     rounding: f64,
 }
 
 impl Boxes {
-    /// Whether boxes can be had for a search and pay: it ranks by free runs at rest or by squared equation errors, its
-    /// coefficients are all least squares', and some slab is large.
+    /// Whether branch and bound applies to a search and is worthwhile. It needs ranking by simulation with zero initial
+    /// conditions or by squared equation error, least-squares coefficients, and a large slice.
     pub(crate) fn pay(catalogue: &Catalogue<'_>) -> bool {
         let (options, lattice) = (&catalogue.options, &*catalogue.lattice);
         options.early_stopping
@@ -48,8 +48,7 @@ impl Boxes {
                 .any(|block| lattice.slab(block.start).is_some_and(|slab| lattice.largest(&slab) >= LEAST))
     }
 
-    /// What they share; none where there is no bound, or where it would need too much memory. Runs on the current thread
-    /// pool.
+    /// Compute the shared constants. `None` without a dual bound. Runs on the current thread pool.
     pub(crate) fn new(catalogue: &Catalogue<'_>) -> Option<Self> {
         let problem = &catalogue.problem;
         let (probes, normal) = (probes(problem)?, problem.equations.whole()?);
@@ -75,7 +74,7 @@ impl Boxes {
     }
 }
 
-/// The test vectors of a search, which has none where squared equation errors rank; none at all where nothing is proved.
+/// Test vectors of a search. Empty if squared equation errors rank, `None` if no bound exists.
 fn probes(problem: &Problem) -> Option<&[Probes]> {
     match (&problem.squares, &problem.bound) {
         (Some(_), _) => Some(&[]),
@@ -83,8 +82,8 @@ fn probes(problem: &Problem) -> Option<&[Probes]> {
     }
 }
 
-/// Screens candidates `lo … hi − 1` of a slab against a limit: the open ones, and the singular ones among those that no
-/// box excludes; how many are in boxes that are excluded whole. None where boxes prove nothing here.
+/// Screen candidates `lo … hi − 1` of a slice against a limit. Return the candidates not excluded, the singular ones
+/// outside excluded boxes, and the number of candidates in excluded boxes. `None` if boxes prove nothing in this slice.
 pub(crate) fn screen_slab(
     catalogue: &Catalogue<'_>,
     boxes: &Boxes,
@@ -95,7 +94,7 @@ pub(crate) fn screen_slab(
     simd::widest(Walk { catalogue, boxes, slab, lo, hi, limit })
 }
 
-/// [`screen_slab`] as a kernel.
+/// Kernel form of [`screen_slice`].
 struct Walk<'a> {
     catalogue: &'a Catalogue<'a>,
     boxes: &'a Boxes,
@@ -174,13 +173,13 @@ impl simd::Kernel for Walk<'_> {
     }
 }
 
-/// Column of every term at the first candidate of a slab.
+/// Column of every term at the first candidate of a slice.
 #[inline(always)]
 fn columns(catalogue: &Catalogue<'_>, slab: &traversal::Slab) -> Vec<usize> {
     slab.digits.iter().enumerate().map(|(term, &digit)| catalogue.columns(slab.block, term)[digit]).collect()
 }
 
-/// Columns of the terms whose orders do not vary, and the inverse of their correlations.
+/// Columns of the terms whose orders do not vary, and the inverse of their correlation matrix.
 #[inline(always)]
 fn others(catalogue: &Catalogue<'_>, slab: &traversal::Slab, columns: &[usize]) -> Option<(Vec<usize>, Vec<f64>)> {
     let others: Vec<usize> =
@@ -190,7 +189,7 @@ fn others(catalogue: &Catalogue<'_>, slab: &traversal::Slab, columns: &[usize]) 
     Some((others, inverse))
 }
 
-/// The tables of some rows of a slab.
+/// Build the tables of some rows of a slice.
 #[inline(always)]
 fn ready<'a>(
     catalogue: &Catalogue<'_>,
@@ -206,7 +205,7 @@ fn ready<'a>(
     Some(Slab::new(others, &boxes.common, sides))
 }
 
-/// Inverse of the correlations of some columns.
+/// Inverse of the correlation matrix of some columns.
 fn inverse(columns: &[usize], product: impl Fn(usize, usize) -> f64) -> Result<Vec<f64>> {
     if columns.is_empty() {
         return Ok(Vec::new());
@@ -216,7 +215,7 @@ fn inverse(columns: &[usize], product: impl Fn(usize, usize) -> f64) -> Result<V
     small::inverse(&matrix, columns.len())
 }
 
-/// What is proved of a box of candidates.
+/// Lower bound of the errors of all candidates of a box.
 #[derive(Debug, Clone, Copy, PartialEq)]
 pub struct Boxed {
     /// The candidates `first + i·stride + j`, i below `rows` and j below `values`.
@@ -227,15 +226,16 @@ pub struct Boxed {
     pub values: u64,
     /// See `first`.
     pub stride: u64,
-    /// No candidate's raw error at rest, Σ|e| or Σe² with least-squares coefficients, is below this.
+    /// Lower bound of the raw errors Σ|e| or Σe² of all candidates. Coefficients are least-squares estimates, initial
+    /// conditions are zero.
     pub bound: f64,
 }
 
-/// What is proved of every box of the slab that holds a candidate: the boxes of all sizes, down to single candidates, of
-/// output errors in either norm or of equation errors in squares.
+/// Lower bound of every box of the slice that contains a candidate. Boxes of all sizes down to single candidates are
+/// returned, for output errors in either norm or for squared equation errors.
 ///
-/// Empty where the lattice has no slabs (its fastest signal has several terms, or no other has orders to vary) or where
-/// nothing is proved of this one.
+/// Empty if the grid has no slices, which is so if its fastest signal has several terms or no other order varies. Also
+/// empty if nothing is proved of this slice.
 ///
 /// # Errors
 /// As [`crate::order_search::batches::search`].
@@ -249,7 +249,7 @@ pub struct Boxed {
 /// # let output = Record::new(0.1, vec![input.clone()], None)?.integral(0, 0.8);
 /// let record = Record::new(0.1, vec![output, input], None)?;
 /// let axis = |signal, values: &[f64]| TermAxis { signal, values: values.to_vec(), interchangeable: false };
-/// let lattice = Lattice::new(0, &[1.6], &[axis(0, &[0.1, 0.3, 0.5]), axis(1, &[0.0, 0.4])], |s| s == 1)?;
+/// let lattice = OrderGrid::new(0, &[1.6], &[axis(0, &[0.1, 0.3, 0.5]), axis(1, &[0.0, 0.4])], |s| s == 1)?;
 /// let boxes = box_bounds(&[record], &lattice, Criterion::OutputError, Norm::L1, 0)?;
 /// assert!(boxes.iter().any(|b| b.rows * b.values == 6) && boxes.iter().any(|b| b.rows * b.values == 1));
 /// # Ok::<(), ftlm::error::Error>(())
@@ -291,8 +291,8 @@ pub fn box_bounds(
     })
 }
 
-/// The candidates `lo … hi − 1` of the slab that holds `index` that no box excludes and no bound of their own: among them
-/// are all whose raw error at rest is at most `limit`. Empty where [`box_bounds`] is.
+/// Candidates `lo … hi − 1` of the slice containing `index` that no bound excludes. They include all whose raw error is
+/// at most `limit`. Empty if [`box_bounds`] is empty.
 ///
 /// # Errors
 /// As [`crate::order_search::batches::search`].
@@ -312,7 +312,7 @@ pub fn left_open(
     })
 }
 
-/// What comes of the slab that holds a candidate, with all test vectors; nothing where it has no boxes.
+/// Apply a function to the slice that contains a candidate, with all test vectors. Empty if the slice has no boxes.
 fn with_slab<T>(
     records: &[Record],
     lattice: &Lattice,
@@ -351,7 +351,7 @@ mod tests {
     use crate::order_search::dual_bound::test_vectors::Probes;
     use crate::order_search::grid::TermAxis;
 
-    /// Two hubs and a link under steps, on which orders near one another and far apart are tried.
+    /// Two joint angles and a link deflection under steps, with closely and widely spaced orders.
     fn problem(case: u32) -> Result<(Record, Lattice)> {
         let m = 150;
         let time = |k: i32| f64::from(k) * 0.03;
@@ -372,14 +372,14 @@ mod tests {
         Ok((Record::new(0.03, signals, None)?, Lattice::new(0, &[1.7], &axes, |s| s == 2)?))
     }
 
-    /// The bilinear function of these corners at −1 ≤ s, t ≤ 1.
+    /// Bilinear function with these corner values at −1 ≤ s, t ≤ 1.
     fn between(corners: [f64; 4], (s, t): (f64, f64)) -> f64 {
         let shares = [(1.0 - s) * (1.0 - t), (1.0 + s) * (1.0 - t), (1.0 - s) * (1.0 + t), (1.0 + s) * (1.0 + t)];
         corners.iter().zip(shares).map(|(c, share)| 0.25 * c * share).sum()
     }
 
-    /// How far a candidate's ⟨t, w⟩, and its divisor with what is added to it, are from what a box has there, each over
-    /// what the box allows: [`WIDTH`] test vectors.
+    /// Deviations of a candidate's ⟨t, w⟩ and divisor from the box values, relative to their bounds. One value for each
+    /// of [`WIDTH`] test vectors.
     fn far(whole: &Held, one: &Held, place: (f64, f64)) -> [Wide; 2] {
         let corners = |of: &dyn Fn(usize) -> f64| between(std::array::from_fn(of), place);
         let apart = |part: usize, n: usize| one.values[0][part][n] - corners(&|c| whole.values[c][part][n]);
@@ -431,7 +431,7 @@ mod tests {
                                 };
                                 let far = far(&whole, &one, (place(i, ends[0]), place(j, ends[1])));
                                 for (nearest, far) in nearest.iter_mut().zip(far) {
-                                    // What is no number is no proof.
+                                    // NaN counts as a failed bound.
                                     let far = far.map(|v| if v.is_nan() { f64::INFINITY } else { v });
                                     *nearest = far.into_iter().fold(*nearest, f64::max);
                                 }

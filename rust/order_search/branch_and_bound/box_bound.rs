@@ -1,15 +1,12 @@
-//! A lower bound of the errors of all candidates of a box.
+//! Lower bound of the errors of all candidates in a box of two orders.
 //!
-//! With û and v̂ the two columns that vary (of unit size, less their parts along the others) a candidate's coefficients on
-//! them solve p + B q = û·y, B p + q = v̂·y, B = û·v̂, so (p ± q)/2 = (û·y ± v̂·y)/(2(1 ± B)): they are made for all
-//! candidates ([`Strip`]), and how far they run from bilinear over a box is looked up. Over a box, −1 ≤ s, t ≤ 1, every
-//! other quantity is its straight line between the ends and a remainder
-//! ([`crate::order_search::branch_and_bound::axis_table`]). ⟨t, w⟩, 1 − Σ c g and coefficients are then bilinear in s
-//! and t but for remainders of second order, and what follows of bilinear functions at the corners follows over the
-//! box: |⟨t, w⟩| is at least its part along one direction, which is bilinear, less λ times moduli of bilinear
-//! functions, which is concave in s and in t, so least at a corner.
-//!
-//! Coefficients on the two varying columns of all candidates of some rows of a slab.
+//! û and v̂ are the two varying columns after projection on the remaining ones, scaled to unit norm. The coefficients
+//! on them solve p + B q = û·y, B p + q = v̂·y with B = û·v̂, so (p ± q)/2 = (û·y ± v̂·y)/(2(1 ± B)). They are
+//! computed for all candidates, and their deviation from bilinear functions over a box is exact. Over a box, −1 ≤ s,
+//! t ≤ 1, every other quantity is a linear interpolation between the ends plus a remainder. ⟨t, w⟩, 1 − Σ c g and the
+//! coefficients are then bilinear in s and t up to remainders of second order. A bound of bilinear functions at the
+//! corners holds over the box: |⟨t, w⟩| is at least its projection on one direction, which is bilinear. Subtracting λ
+//! times moduli of bilinear functions gives a function that is concave in s and in t, with its minimum at a corner.
 
 use std::ops::Range;
 
@@ -18,28 +15,28 @@ use crate::order_search::dual_bound::test_vectors::NONE;
 use crate::order_search::options::Norm;
 use crate::simd::WIDTH;
 
-/// What rounding may change in coefficients, in units of ε and the sum of the diagonal of an inverse correlation
-/// matrix: sixteen times the square of the number of terms, far above what elimination loses.
+/// Rounding error of coefficients, in units of the trace of an inverse correlation matrix. It is sixteen times ε and
+/// the square of the number of terms, far above the error of the elimination.
 const ELIMINATED: f64 = 16.0 * f64::EPSILON;
 
-/// Where 1 − B² is no more than this, û and v̂ are one column as far as rounding tells.
+/// Value of 1 − B² at or below which û and v̂ are numerically collinear.
 const NOTHING: f64 = 1e-12;
 
-/// Most other columns of a slab.
+/// Maximum remaining columns of a slice.
 pub(super) const MOST_OTHERS: usize = 16;
 
-/// What the boxes of all slabs share.
+/// Constants shared by the boxes of all slices.
 pub(super) struct Common {
     pub(super) norm: Norm,
     /// Whether candidates are ranked by their squared equation error.
     pub(super) squares: bool,
-    /// Largest moduli over all columns of unit size of ⟨t, x⟩ and of g‖t‖, by group of test vectors.
+    /// Largest moduli of ⟨t, x⟩ and g‖t‖ over all unit columns, by group of test vectors.
     pub(super) tops: Vec<[Wide; 2]>,
-    /// Largest rounding of a column of unit size, by record.
+    /// Largest rounding-error bound of a unit column, by record.
     pub(super) rounding: Vec<f64>,
-    /// Size of the output over all records.
+    /// Norm of the output over all records.
     pub(super) size: f64,
-    /// Largest over smallest inverse size of two columns.
+    /// Ratio of the largest to the smallest inverse norm of the columns.
     pub(super) ratio: f64,
 }
 
@@ -61,7 +58,7 @@ impl Common {
             })
             .collect();
         let sizes = || others.normal.inverse().iter().copied().filter(|&i| i > 0.0);
-        // What rounding leaves of one coefficient counts as so much of another, and of itself.
+        // A rounding error in one coefficient also counts for another one and for itself.
         let ratio = 1.0 + sizes().fold(0.0, f64::max) / sizes().fold(f64::INFINITY, f64::min);
         let most = |rounding: &[f64]| -> f64 {
             rounding.iter().zip(others.normal.inverse()).map(|(r, i)| r * i).fold(0.0, f64::max)
@@ -70,7 +67,7 @@ impl Common {
     }
 }
 
-/// A stretch of values of one order: node `at` of a level.
+/// Interval of values of one order: node `at` of a level of the bisection tree.
 #[derive(Debug, Clone, Copy)]
 pub(super) struct Stretch {
     pub(super) level: usize,
@@ -78,14 +75,14 @@ pub(super) struct Stretch {
 }
 
 impl Stretch {
-    /// Its first and last value of so many.
+    /// First and last value of the interval, out of n values.
     #[inline(always)]
     pub(super) fn ends(self, n: usize) -> (usize, usize) {
         (self.at << self.level, n.min((self.at + 1) << self.level) - 1)
     }
 }
 
-/// Middle, slope and remainder of a quantity over a stretch.
+/// Linear approximation over an interval: midpoint, slope and remainder.
 #[derive(Debug, Clone, Copy)]
 pub(super) struct Line {
     pub(super) middle: f64,
@@ -106,29 +103,30 @@ fn bilinear([a, b, c, d]: [f64; 4]) -> [f64; 4] {
     [(a + b + c + d) / 4.0, ((b + d) - (a + c)) / 4.0, ((c + d) - (a + b)) / 4.0, ((a + d) - (b + c)) / 4.0]
 }
 
-/// What the candidates of a box have in common.
+/// Quantities shared by all candidates of a box.
 pub(super) struct Cell {
-    /// Rows and values at the corners.
+    /// Row and value index of the corners.
     pub(super) at: [(usize, usize); 4],
-    /// Eighths of the squares of the sides' lengths.
+    /// One eighth of the squared side lengths.
     pub(super) wide: [f64; 2],
-    /// p and q at the corners and the largest over the box.
+    /// p and q at the corners, and their largest moduli over the box.
     pub(super) ps: [f64; 4],
     pub(super) qs: [f64; 4],
     pub(super) most: [f64; 2],
-    /// How far from bilinear (p + q)/2 and (p − q)/2 run.
+    /// Deviation of (p + q)/2 and (p − q)/2 from bilinear functions.
     pub(super) off: [f64; 2],
-    /// Of p the coefficients of s and st, of q those of t and st, in moduli: what bends a product with a line in s or t.
+    /// Moduli of the coefficients of s and st in p, and of t and st in q. They bound the curvature of a product with a
+    /// linear function of s or t.
     pub(super) bends: [f64; 2],
-    /// Largest part of ‖y‖² that û and v̂ explain, where that ranks.
+    /// Largest part of ‖y‖² explained by û and v̂, if the equation error ranks.
     pub(super) explained: f64,
-    /// Size of the output and of all coefficients, and what rounding may change in one of these.
+    /// Sum of the moduli of output and coefficients, and the rounding-error bound of one coefficient.
     pub(super) all: f64,
     pub(super) lost: f64,
 }
 
 impl Cell {
-    /// How far p times the first of these quantities along the sides and q times the second run from bilinear.
+    /// Deviation from bilinear of p times the first plus q times the second quantity, both linear along their sides.
     #[inline(always)]
     pub(super) fn rest(&self, [a, b]: [Line; 2]) -> f64 {
         let bent = self.bends[0] * a.slope.abs() + self.bends[1] * b.slope.abs();
@@ -141,41 +139,40 @@ impl Cell {
     }
 }
 
-/// Moduli of the coefficients on the other columns at the corners of a box, and how far from bilinear what they are
-/// moduli of runs.
+/// Moduli of the remaining columns' coefficients at the corners of a box, and their deviation from bilinear.
 pub(super) struct Moduli {
     others: [[f64; 4]; MOST_OTHERS],
     rests: [f64; MOST_OTHERS],
-    /// Of the coefficients on the partner and on the own column of a side the sum, whose moduli may cancel.
+    /// Sum of the coefficients on the partner and on the own column of a side. Their moduli may cancel.
     sums: [f64; 4],
     sums_rest: f64,
 }
 
-/// What a group of test vectors holds against the candidates of a box.
+/// Products of a group of test vectors at the corners of a box, with remainders.
 pub(super) struct Held {
     /// ⟨t, w⟩ and the divisor ‖t‖(1 − Σ c g) at the corners: real and imaginary part of each.
     pub(super) values: [[Wide; 4]; 4],
-    /// What is added to the divisor at the corners: Σ|c|‖Fᵀt − g t‖.
+    /// Slack of the divisor at the corners: Σ|c|‖Fᵀt − g t‖.
     pub(super) slack: [Wide; 4],
-    /// How far the first of these, and the other two together, run from bilinear.
+    /// Deviation from bilinear of ⟨t, w⟩, and of divisor and slack together.
     pub(super) rough: [Wide; 2],
 }
 
-/// A slab, ready for its boxes.
+/// Tables of one slice from which its boxes are bounded.
 pub(super) struct Slab<'a> {
     pub(super) others: &'a Others<'a>,
     pub(super) common: &'a Common,
-    /// The order that changes from row to row, and the one that runs along rows.
+    /// The order that changes from row to row, and the order along a row.
     pub(super) sides: [Side; 2],
-    /// Which of them is one of the output's own signal.
+    /// Index of the side that belongs to the output's own signal.
     own: Option<usize>,
-    /// Coefficients of the output on the other columns.
+    /// Coefficients of the output on the remaining columns.
     pub(super) along: Vec<f64>,
-    /// Squared size of the output less its part along the others.
+    /// Sum of squares of the output's residual after projection on the remaining columns.
     unexplained: f64,
-    /// Of the output less its part along the others: ⟨t, y⟩ and ‖t‖, by group.
+    /// ⟨t, y⟩ and ‖t‖ of that residual, by group.
     base: Vec<Seen>,
-    /// ‖Fᵀt − g t‖ of the other columns, k a group.
+    /// ‖Fᵀt − g t‖ of the remaining columns, k per group.
     rests: Vec<Wide>,
 }
 
@@ -207,7 +204,7 @@ impl<'a> Slab<'a> {
         Self { others, common, sides, own, along, unexplained: common.size * common.size - explained, base, rests }
     }
 
-    /// The coefficients of all candidates of some rows.
+    /// Compute the coefficients of all candidates of some rows.
     #[inline(always)]
     pub(super) fn lay(&self, strip: &mut Strip, rows: Range<usize>) {
         let (k, len) = (self.others.columns.len(), self.sides[1].columns.len());
@@ -250,7 +247,7 @@ impl<'a> Slab<'a> {
         }
     }
 
-    /// What the candidates of a box have in common; none where nothing is proved of it.
+    /// Quantities shared by all candidates of a box. `None` if no bound can be proved.
     #[inline(always)]
     pub(super) fn cell(&self, strip: &Strip, [su, sv]: [Stretch; 2]) -> Option<Cell> {
         let [u, v] = &self.sides;
@@ -274,7 +271,7 @@ impl<'a> Slab<'a> {
             (off, left, 0.0)
         };
         let left = left - 2.0 * self.others.rounding * self.others.trace * sums * sums;
-        // What is not a number proves nothing.
+        // NaN proves nothing.
         if left.is_nan() || left <= 0.0 {
             return None;
         }
@@ -282,7 +279,7 @@ impl<'a> Slab<'a> {
         let both = off[0] + off[1];
         let (p, q, p_most, q_most) = (bilinear(ps), bilinear(qs), largest(&ps) + both, largest(&qs) + both);
 
-        // Sizes of coefficients, and what rounding may change in them.
+        // Moduli of the coefficients and their rounding-error bounds.
         let trace = self.others.trace + sums * sums / left;
         let all =
             self.common.size + self.along.iter().map(|c| c.abs()).sum::<f64>() + p_most * pu.sum + q_most * pv.sum;
@@ -292,7 +289,7 @@ impl<'a> Slab<'a> {
         Some(Cell { at, wide: [wu, wv], ps, qs, most: [p_most, q_most], off, bends, explained, all, lost })
     }
 
-    /// Lower bound of the raw scores of all candidates of a box; ends as soon as it exceeds the limit.
+    /// Lower bound of the raw scores of all candidates of a box. The sum stops once it exceeds the limit.
     #[inline(always)]
     pub(super) fn bound(&self, both: [Stretch; 2], cell: &Cell, limit: f64) -> f64 {
         if self.common.squares {
@@ -302,7 +299,7 @@ impl<'a> Slab<'a> {
         }
     }
 
-    /// Lower bound of their squared equation errors.
+    /// Lower bound of the squared equation errors.
     #[inline(always)]
     fn squares(&self, cell: &Cell) -> f64 {
         let rounding = self.others.rounding * cell.all + count(self.others.columns.len() + 2) * cell.lost;
@@ -315,7 +312,7 @@ impl<'a> Slab<'a> {
         }
     }
 
-    /// Lower bound of their output errors.
+    /// Lower bound of the output errors.
     #[inline(always)]
     fn errors(&self, both: [Stretch; 2], cell: &Cell, limit: f64) -> f64 {
         let moduli = self.moduli(both, cell);
@@ -325,7 +322,7 @@ impl<'a> Slab<'a> {
             for group in first..first + probes.groups {
                 let together = self.together(both, cell, &moduli, group);
                 let Held { values, slack, rough } = self.held(both, cell, &moduli, (r, group), together);
-                // All are looked at along the middle's direction.
+                // All corners are projected on the direction of the midpoint.
                 let mut along = [ZERO; 2];
                 for n in 0..WIDTH {
                     let re = values[0][0][n] + values[1][0][n] + values[2][0][n] + values[3][0][n];
@@ -362,7 +359,7 @@ impl<'a> Slab<'a> {
         sum
     }
 
-    /// Moduli of the coefficients on the other columns over a box.
+    /// Moduli of the remaining columns' coefficients over a box.
     #[inline(always)]
     pub(super) fn moduli(&self, [su, sv]: [Stretch; 2], cell: &Cell) -> Moduli {
         let k = self.others.columns.len();
@@ -396,13 +393,13 @@ impl<'a> Slab<'a> {
         Moduli { others, rests, sums, sums_rest }
     }
 
-    /// The other column whose coefficient may cancel against that of a side's own column.
+    /// The remaining column whose coefficient may cancel that of a side's own column.
     #[inline(always)]
     fn partner(&self) -> Option<usize> {
         self.others.partner.filter(|_| self.own.is_some())
     }
 
-    /// The partner, where a group of test vectors proves more with its column and the own one looked at together.
+    /// The partner, if its column and the own column together give a group of test vectors a tighter bound.
     #[inline(always)]
     pub(super) fn together(&self, [su, sv]: [Stretch; 2], cell: &Cell, moduli: &Moduli, group: usize) -> Option<usize> {
         let partner = self.partner()?;
@@ -420,7 +417,7 @@ impl<'a> Slab<'a> {
         (joint < apart).then_some(partner)
     }
 
-    /// What a group of test vectors, of a record, holds against the candidates of a box.
+    /// Products of a group of test vectors of one record at the corners of a box.
     #[inline(always)]
     pub(super) fn held(
         &self,
@@ -463,7 +460,7 @@ impl<'a> Slab<'a> {
         }
         let rounding = self.others.probes[record].target_rounding + (all + lost) * self.common.rounding[record];
         rough[0].iter_mut().for_each(|rough| *rough += rounding);
-        // Of the varying columns (a scale is at least 1), then of the others.
+        // Slack of the varying columns (their scale is at least 1), then of the remaining ones.
         let mut slack = [ZERO; 4];
         let part = if together.is_some() { 3 } else { 2 };
         for n in 0..WIDTH {
@@ -505,28 +502,28 @@ impl<'a> Slab<'a> {
     }
 }
 
-/// An eighth of a length squared.
+/// One eighth of a squared length.
 #[inline(always)]
 fn eighth(length: usize) -> f64 {
     let length = count(length);
     length * length / 8.0
 }
-/// Candidates of a row that are looked at side by side.
+/// Candidates of a row that are processed in parallel lanes.
 const LANES: usize = 4;
 const PLACES: [f64; LANES] = [0.0, 1.0, 2.0, 3.0];
 
-/// Coefficients on û and v̂ of all candidates of some rows of a slab.
+/// Coefficients on û and v̂ of all candidates of some rows of a slice.
 #[derive(Default)]
 pub(super) struct Strip {
-    /// Their first row, and how many values a row has.
+    /// First row, and number of values in a row.
     pub(super) start: usize,
     /// See `start`.
     pub(super) len: usize,
-    /// (p + q)/2, (p − q)/2 and 1 − B²; all of them 0 where that is next to nothing, or no number.
+    /// (p + q)/2, (p − q)/2 and 1 − B². All are 0 if 1 − B² is negligible or NaN.
     pub(super) plus: Vec<f64>,
     pub(super) minus: Vec<f64>,
     pub(super) left: Vec<f64>,
-    /// B, and products with the other columns one after the other, of a row.
+    /// B, and products with the remaining columns one after the other, of a row.
     pub(super) product: Vec<f64>,
 }
 
@@ -536,7 +533,7 @@ impl Strip {
         (row - self.start) * self.len + value
     }
 
-    /// How far from bilinear functions (p + q)/2 and (p − q)/2 run over a box, and the least 1 − B².
+    /// Deviation of (p + q)/2 and (p − q)/2 from bilinear functions over a box, and the smallest 1 − B².
     #[inline(always)]
     pub(super) fn off(
         &self,
@@ -578,7 +575,7 @@ impl Strip {
         ([most(far[0]), most(far[1])], left.into_iter().fold(f64::INFINITY, f64::min))
     }
 
-    /// The least 1 − B² over a box, and the most of ‖y‖² that û and v̂ explain.
+    /// Smallest 1 − B² over a box, and the largest part of ‖y‖² explained by û and v̂.
     #[inline(always)]
     pub(super) fn explained(&self, [(u0, u1), (v0, v1)]: [(usize, usize); 2], [y, z]: [&[f64]; 2]) -> (f64, f64) {
         let (mut left, mut most) = ([f64::INFINITY; LANES], [f64::NEG_INFINITY; LANES]);
@@ -602,7 +599,7 @@ impl Strip {
     }
 }
 
-/// So many, to reckon with.
+/// A count as a floating-point number.
 #[inline(always)]
 #[allow(clippy::cast_precision_loss)]
 pub(super) fn count(n: usize) -> f64 {

@@ -1,6 +1,4 @@
-//! The regressors that the candidates of a search need, each once.
-//!
-//! Columns of a bank that several candidates name side by side.
+//! Regressors required by the candidates of a search, and columns that several candidates share in parallel lanes.
 
 use std::collections::HashSet;
 
@@ -8,7 +6,7 @@ use crate::equation::{grains, Initial, ORDER_GRAIN};
 use crate::regressors::{Index, Key};
 use crate::simd::Lanes;
 
-/// Collects the regressors of candidates from their orders.
+/// Set of the regressors that candidates require, from their orders.
 pub(crate) struct Needed<'a> {
     initial: &'a Initial,
     index: Index,
@@ -21,7 +19,7 @@ impl<'a> Needed<'a> {
         Self { initial, index: Index::default(), alphas: HashSet::new(), orders: HashSet::new() }
     }
 
-    /// Adds the initial terms that every structure of this α needs.
+    /// Add the initial terms that every structure of this α requires.
     pub(crate) fn alpha(&mut self, alpha: f64) {
         if !self.alphas.insert(grains(alpha)) {
             return;
@@ -38,7 +36,7 @@ impl<'a> Needed<'a> {
         }
     }
 
-    /// Adds all regressors that a term of this order needs under this α.
+    /// Add all regressors that a term of this order requires under this α.
     pub(crate) fn term(&mut self, alpha: f64, signal: usize, order: f64) {
         if self.orders.insert((grains(alpha), signal, grains(order))) {
             self.index.insert(Key::integral(signal, alpha - order));
@@ -48,7 +46,7 @@ impl<'a> Needed<'a> {
         }
     }
 
-    /// Adds t^{from + i} for i = 0, 1, … below an order.
+    /// Add t^{from + i} for i = 0, 1, … below an order.
     fn powers(&mut self, from: f64, order: f64) {
         let mut i = 0.0;
         while i < order - ORDER_GRAIN {
@@ -57,18 +55,18 @@ impl<'a> Needed<'a> {
         }
     }
 
-    /// All of them, neighbours on a lattice beside each other.
+    /// Return all regressors. Neighbors on the order grid are adjacent.
     pub(crate) fn index(mut self) -> Index {
         self.index.sort();
         self.index
     }
 }
 
-/// Columns of one term of L candidates.
+/// Columns of one term for L candidates.
 #[derive(Debug, Clone, Copy)]
 pub(crate) struct Columns<const L: usize> {
     pub(crate) at: [usize; L],
-    /// Whether they are all one, and whether each is the next one.
+    /// Whether all columns are equal, and whether they are consecutive.
     same: bool,
     run: bool,
 }
@@ -78,13 +76,13 @@ impl<const L: usize> Columns<L> {
         Self { at, same: L == 1, run: false }
     }
 
-    /// One column for all candidates.
+    /// Return one column for all candidates.
     #[inline(always)]
     pub(crate) fn one(at: usize) -> Self {
         Self { at: [at; L], same: true, run: false }
     }
 
-    /// Columns that ascend.
+    /// Return columns given in ascending order.
     #[inline(always)]
     pub(super) fn ascending(at: [usize; L]) -> Self {
         Self { at, same: L == 1, run: at[L - 1] - at[0] == L - 1 }
@@ -111,7 +109,7 @@ impl<const L: usize> Columns<L> {
         }
     }
 
-    /// Elements of a symmetric matrix (row-major) at these columns and those rows.
+    /// Elements of a symmetric matrix (row-major) at these columns and the given rows.
     #[inline(always)]
     pub(super) fn with(&self, rows: &Self, matrix: &[f64], stride: usize) -> Lanes<L> {
         if rows.same {

@@ -1,5 +1,6 @@
-//! The coefficient step of an order search by refined instrumental variables: spectra of every regressor, made once for
-//! all candidates.
+//! Coefficient step of an order search by refined instrumental variables.
+//!
+//! The spectra of all regressors are computed once for all candidates.
 
 use crate::error::{Error, Result};
 use crate::estimation::instrumental_variables::{low_pass, power_frequency, refine, Scratch, Settings, Source};
@@ -8,10 +9,10 @@ use crate::parallel::{self, Stop};
 use crate::regressors::{Bank, Index, Record};
 use crate::series::Kernel;
 
-/// Low-pass behind which the first coefficients are estimated, in units of the output's own band.
+/// Cutoff of the low-pass filter for the initial coefficients, relative to the output's bandwidth.
 const START_BAND: f64 = 2.0;
 
-/// What the refinement of any candidate reads of one record.
+/// Spectra of one record that the refinement of every candidate reads.
 struct Shelf {
     /// Spectrum of each column of the bank.
     columns: Vec<Kernel>,
@@ -20,14 +21,15 @@ struct Shelf {
     target: Kernel,
 }
 
-/// Refines the coefficients of candidates.
+/// Refinement of coefficients by instrumental variables.
 pub(crate) struct Refiner {
     shelves: Vec<Shelf>,
     settings: Settings,
 }
 
 impl Refiner {
-    /// Spectra of the columns of `banks`, which are those of the records' clean signals; of no use once it was told to stop.
+    /// Compute the spectra of the columns of `banks`, which belong to the records' noise-free signals. Unusable after a
+    /// stop request.
     pub(crate) fn new(records: &[Record], output: usize, banks: &[Bank], settings: Settings, stop: &Stop) -> Self {
         let shelves = records
             .iter()
@@ -49,8 +51,8 @@ impl Refiner {
         Self { shelves, settings }
     }
 
-    /// Refines coefficients in place: of the terms, then of the initial terms record by record. What it comes to once it was
-    /// told to stop is of no use.
+    /// Refine coefficients in place: those of the terms, then those of the initial terms by record. The result is
+    /// unusable after a stop request.
     pub(crate) fn refine(
         &self,
         (banks, targets): (&[Bank], &[Vec<f64>]),
@@ -75,7 +77,7 @@ impl Refiner {
             })
             .collect();
         let start: Vec<f64> = coefficients.iter().chain(weights.iter()).copied().collect();
-        // An initial term that the start left out is a combination of others.
+        // An initial term with weight 0 in the initial guess is a combination of others.
         let n = initial.len();
         let dropped: Vec<(usize, usize)> =
             weights.iter().enumerate().filter(|(_, w)| **w == 0.0).map(|(i, _)| (i / n, i % n)).collect();
@@ -92,7 +94,7 @@ impl Refiner {
     }
 }
 
-/// Bank and target behind which the first coefficients are estimated: clean signals, low-passed.
+/// Bank and target for the initial coefficients: noise-free signals, low-pass filtered.
 ///
 /// # Errors
 /// As [`Bank::counted`].

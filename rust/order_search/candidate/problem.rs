@@ -1,4 +1,4 @@
-//! What all candidates of one equation share, and the way of one candidate through it: coefficients, bound, error.
+//! Data shared by all candidates of one equation, and the evaluation of one candidate: coefficients, bounds, error.
 
 use crate::equation::{Initial, Structure};
 use crate::error::{check_finite, Error, Result};
@@ -20,37 +20,36 @@ use crate::parallel::Stop;
 use crate::regressors::{Bank, Index, Key, Record};
 use crate::simd::{self, WIDTH};
 
-/// Transforms that following one candidate is worth; making test vectors must stay below a fraction of all that.
+/// Cost of one simulation, in transforms. Building test vectors must cost a small fraction of all simulations.
 const TRANSFORMS: u64 = 6;
-/// The same where coefficients are refined: a few steps of a division and a dozen transforms each.
+/// Cost of one refinement, in transforms: a few division steps and a dozen transforms each.
 const REFINING: u64 = 100;
 
 /// Columns and coefficients of a candidate.
 pub(crate) type Known = (Vec<usize>, Vec<f64>);
 
-/// Everything the candidates of one equation share.
+/// Data shared by all candidates of one equation.
 pub(crate) struct Problem {
     index: Index,
     banks: Vec<Bank>,
     targets: Vec<Vec<f64>>,
     pub(crate) equations: NormalEquations,
-    /// Where the equation error in squares ranks: its own Gram matrix, without weights and prior.
+    /// Gram matrix without weights and prior, if the squared equation error ranks.
     pub(crate) squares: Option<Squares>,
     pub(crate) bound: Option<Bound>,
-    /// Test vectors made for candidates of the search, where these pay.
+    /// Test vectors tailored to candidates of the search, if they are worthwhile.
     pub(crate) adapted: Option<Adapted>,
-    /// What proves that free runs explode, and test vectors that follow coefficients, where candidates are to be proved
-    /// closely.
+    /// Test for unstable zeros, and linearized test vectors, if candidates are bounded closely.
     pub(crate) roots: Option<Roots>,
     pub(crate) tangents: Option<Tangents>,
     refiner: Option<Refiner>,
-    /// Where coefficients are refined: the banks that the bound speaks of, until it is made.
+    /// Banks for the dual bound until it is built, if coefficients are refined.
     bound_banks: Vec<Bank>,
     options: Options,
     samples: usize,
 }
 
-/// [`Bound::evaluate`] as a kernel.
+/// Kernel form of [`Bound::evaluate`].
 struct Bounding<'a, F> {
     bound: &'a Bound,
     limit: f64,
@@ -69,7 +68,7 @@ where
     }
 }
 
-/// [`Bound::excludes`] as a kernel.
+/// Kernel form of [`Bound::proves_infeasible`].
 struct Excluding<'a> {
     bound: &'a Bound,
     limit: f64,
@@ -89,7 +88,7 @@ impl simd::Kernel for Excluding<'_> {
     }
 }
 
-/// [`Adapted::exclude`] as a kernel.
+/// Kernel form of the exclusion by tailored test vectors.
 struct Adapting<'a> {
     adapted: &'a Adapted,
     limit: f64,
@@ -107,7 +106,7 @@ impl simd::Kernel for Adapting<'_> {
     }
 }
 
-/// [`Tangents::exclude`] as a kernel.
+/// Kernel form of the exclusion by linearized test vectors.
 struct Following<'a> {
     tangents: &'a Tangents,
     limit: f64,
@@ -125,7 +124,7 @@ impl simd::Kernel for Following<'_> {
     }
 }
 
-/// Memory of one thread.
+/// Workspace of one thread.
 pub(crate) struct Scratch {
     memory: Memory,
     held: Held,
@@ -136,7 +135,7 @@ pub(crate) struct Scratch {
     /// Coefficients of the last candidate's terms, and of its initial terms by record.
     coefficients: Vec<f64>,
     weights: Vec<f64>,
-    /// Columns of the candidate at hand.
+    /// Columns of the current candidate.
     pub(crate) positions: Vec<usize>,
     pub(crate) initial: Vec<usize>,
 }
@@ -159,7 +158,7 @@ impl Default for Scratch {
 }
 
 impl Problem {
-    /// Builds banks and Gram matrices for the regressors in `index`, whose memory was counted.
+    /// Build banks and Gram matrices for the regressors in `index`, whose memory has been budgeted.
     pub(crate) fn new(
         records: &[Record],
         output: usize,
@@ -180,7 +179,7 @@ impl Problem {
         }
         let width = index.keys().len();
         let refined = options.refines();
-        // Noise of a measured output that drives an equation would rank like a fault of the equation.
+        // Noise of a measured output that enters as an input would be ranked like an error of the equation.
         let banks = records
             .iter()
             .map(|r| {
@@ -222,7 +221,7 @@ impl Problem {
             Estimator::InstrumentalVariables(settings) => Some(Refiner::new(records, output, &banks, settings, stop)),
             _ => None,
         };
-        // D e = w holds for integrals of the output as it was measured.
+        // D e = w holds for integrals of the measured output.
         let bound_banks = if refined && options.early_stopping && options.criterion == Criterion::OutputError {
             records
                 .iter()
@@ -250,14 +249,15 @@ impl Problem {
         })
     }
 
-    /// Makes test vectors for about this many candidates, as far as they pay; on the current thread pool.
+    /// Build test vectors for about this many candidates, as far as they are worthwhile. Runs on the current thread
+    /// pool.
     pub(crate) fn with_bound(mut self, candidates: u64, stop: &Stop) -> Self {
         let banks = std::mem::take(&mut self.bound_banks);
         let (banks, transforms) = if self.refines() { (&banks, 4 * REFINING) } else { (&self.banks, TRANSFORMS) };
         if self.options.early_stopping && self.squares.is_none() && !banks.is_empty() {
             let output_error = self.options.criterion == Criterion::OutputError;
             let own = (0..self.index.keys().len()).filter(|&p| !banks[0].kernel(p).is_empty()).count() as u64;
-            // Two transforms for each own column and test vector; the products cost as much as a transform or so.
+            // Two transforms for each own column and test vector. The products cost about one transform.
             let each = 2 * own + 4;
             #[allow(clippy::cast_possible_truncation)]
             let groups = (candidates.saturating_mul(transforms) / 4 / (each * WIDTH as u64))
@@ -275,12 +275,13 @@ impl Problem {
         self.refiner.is_some()
     }
 
-    /// No test vectors of candidates yet, and the bytes that each will take.
+    /// Return an empty set of tailored test vectors, and the memory that each needs [bytes].
     pub(crate) fn no_adapted(&self) -> (Adapted, u64) {
         (Adapted::new(&self.banks, &self.targets, self.options.norm), Adapted::bytes(&self.banks))
     }
 
-    /// The test vector of the candidate with these columns and its least-squares coefficients, at rest.
+    /// Build the tailored test vector of the candidate with these columns. Coefficients are least-squares estimates,
+    /// initial conditions are zero.
     pub(crate) fn fit(&self, adapted: &Adapted, positions: &[usize]) -> Option<Fitted> {
         let coefficients = self.alone(positions)?;
         adapted.fit(&self.banks, &self.targets, positions, &coefficients)
@@ -293,23 +294,24 @@ impl Problem {
         simd::widest(Adapting { adapted, limit, terms: positions, coefficients: &coefficients, memory: &mut memory })
     }
 
-    /// No test vectors that follow coefficients yet.
+    /// Return an empty set of linearized test vectors.
     pub(crate) fn no_tangents(&self) -> Tangents {
         Tangents::new(&self.banks, &self.targets, self.options.norm)
     }
 
-    /// The one of the candidate with these columns and coefficients, at rest.
+    /// Build the linearized test vector of the candidate with these columns and coefficients. Initial conditions are
+    /// zero.
     pub(crate) fn tangent(&self, tangents: &Tangents, terms: &[usize], c: &[f64], limit: f64) -> Option<Tangent> {
         tangents.fit((&self.banks, &self.targets), terms, c, limit)
     }
 
-    /// Those of some candidates, by columns and coefficients, that it does not exclude.
+    /// Return the candidates, by columns and coefficients, that this vector does not exclude.
     pub(crate) fn left_by(&self, tangents: &Tangents, made: &Tangent, all: &[Known], limit: f64) -> Vec<Known> {
         all.iter().filter(|(terms, c)| !tangents.excludes(made, terms, c, limit)).cloned().collect()
     }
 
-    /// Makes what proves that free runs explode, where its tables fit into so many bytes: how many they take. Runs on the
-    /// current thread pool.
+    /// Build the test for unstable zeros if its tables fit into this memory [bytes]. Return the memory used. Runs on
+    /// the current thread pool.
     pub(crate) fn with_roots(&mut self, spare: u64) -> u64 {
         let bytes = Roots::bytes(&self.banks);
         if bytes > spare || !Roots::pay(&self.targets) {
@@ -319,7 +321,8 @@ impl Problem {
         bytes
     }
 
-    /// Least-squares coefficients of the candidate with these columns, at rest; none where it is singular.
+    /// Least-squares coefficients of the candidate with these columns, with zero initial conditions. `None` if it is
+    /// singular.
     pub(crate) fn alone(&self, positions: &[usize]) -> Option<Vec<f64>> {
         let sources: Vec<Columns<1>> = positions.iter().map(|&p| Columns::new([p])).collect();
         let mut one = Solve::new();
@@ -327,12 +330,12 @@ impl Problem {
         (!singular).then(|| one.coefficients.iter().map(|c| c[0]).collect())
     }
 
-    /// Size of the output over all records.
+    /// Norm of the output over all records.
     pub(crate) fn size(&self) -> f64 {
         self.targets.iter().flatten().map(|y| y * y).sum::<f64>().sqrt()
     }
 
-    /// Samples of all records.
+    /// Number of samples of all records.
     pub(crate) fn samples(&self) -> usize {
         self.samples
     }
@@ -355,9 +358,9 @@ impl Problem {
         );
     }
 
-    /// Evaluates a structure given the positions of its terms; leaves its coefficients in the scratch.
+    /// Evaluate a structure given the positions of its terms. Its coefficients are stored in the scratch.
     ///
-    /// `bounded` tells whether the bound, where there is one, is asked first.
+    /// The flag `bounded` selects whether the dual bound, if there is one, is tried first.
     pub(crate) fn evaluate(
         &self,
         positions: &[usize],
@@ -378,7 +381,7 @@ impl Problem {
         weights.clear();
         weights.extend(one.initial.iter().map(|c| c[0]));
         if let (Some(_), Some(bound), true) = (&self.refiner, &self.bound, limit < f64::INFINITY) {
-            // The refinement may change the coefficients in any way: only what holds of all of them excludes.
+            // Refinement may change the coefficients arbitrarily, so only a bound over all coefficients excludes.
             start.clear();
             start.extend(coefficients.iter().chain(weights.iter()));
             let (terms, fixed) = (positions, self.equations.fixed());
@@ -390,7 +393,7 @@ impl Problem {
             let (data, places) = ((&self.banks[..], &self.targets[..]), (positions, initial));
             let fixed = self.equations.fixed();
             if let Err(failure) = refiner.refine(data, places, fixed, coefficients, weights, &control.stop) {
-                // What was told to stop has found nothing.
+                // A stop request invalidates the result.
                 return if control.stopped() { Verdict::Stopped(0.0) } else { Verdict::Failed(failure) };
             }
         }
@@ -435,12 +438,12 @@ impl Problem {
         Verdict::Score(raw)
     }
 
-    /// A raw sum in the norm asked for.
+    /// Score of a raw sum in the selected norm.
     pub(crate) fn score(&self, raw: f64) -> f64 {
         self.options.norm.score(raw, self.samples)
     }
 
-    /// The row of the candidate that was evaluated last, with so many initial terms a record.
+    /// Row of the last evaluated candidate, with this many initial terms per record.
     pub(crate) fn row(&self, index: u64, raw: f64, initial: usize, scratch: &Scratch) -> Row {
         Row {
             index,
@@ -450,7 +453,7 @@ impl Problem {
         }
     }
 
-    /// Evaluates a structure on its own: the row it makes.
+    /// Evaluate a structure separately and return its verdict and row.
     pub(crate) fn evaluate_structure(
         &self,
         structure: &Structure,

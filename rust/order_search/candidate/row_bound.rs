@@ -1,14 +1,15 @@
-//! Lower bounds of the squared equation error along a stretch of candidates that differ in one term: this term comes last
-//! in the factorisation of the products, and the factor of the others is shared.
+//! Lower bounds of the squared equation error for a row of candidates that differ in one term.
+//!
+//! The varying term comes last in the factorization L D Lᵀ of the products, so the factor of the others is shared.
 
 use crate::order_search::candidate::columns::{part_of, Columns};
 use crate::order_search::candidate::normal_equations::Squares;
 use crate::simd::Lanes;
 
-/// Most terms but the one that changes.
+/// Maximum number of common terms, without the term that changes.
 const MOST: usize = 7;
 
-/// The factor L D Lᵀ of the products of all terms but one, and what these alone leave of the target.
+/// Factor L D Lᵀ of the products of all common terms, and the target's residual after them.
 pub(crate) struct Shared<'a> {
     squares: &'a Squares,
     count: usize,
@@ -16,19 +17,19 @@ pub(crate) struct Shared<'a> {
     /// Rows of L below its diagonal of ones, and D⁻¹.
     lower: [[f64; MOST]; MOST],
     inverse: [f64; MOST],
-    /// Products with the target behind L⁻¹, and the coefficients of these terms alone.
+    /// Products with the target after L⁻¹, and the coefficients of the common terms alone.
     values: [f64; MOST],
     alone: [f64; MOST],
     norms: [f64; MOST],
-    /// What these terms leave of the target's squared norm.
+    /// Sum of squares of the target's residual after the common terms.
     left: f64,
-    /// Trace of the inverse of their correlation matrix, which no inverse of an eigenvalue exceeds.
+    /// Trace of the inverse of their correlation matrix, an upper bound of every inverse eigenvalue.
     trace: f64,
 }
 
 impl<'a> Shared<'a> {
-    /// Of the terms with these columns but for one of them; none where they are too many, or so nearly dependent that
-    /// nothing is proved of any candidate.
+    /// Factor the terms with these columns except one. `None` if they are too many, or so nearly dependent that nothing
+    /// can be proved.
     #[inline(always)]
     pub(crate) fn new(squares: &'a Squares, columns: &[usize], but: usize) -> Option<Self> {
         let count = columns.len().checked_sub(1).filter(|count| *count <= MOST)?;
@@ -49,11 +50,11 @@ impl<'a> Shared<'a> {
             shared.columns[i] = columns[i + usize::from(i >= but)];
             shared.extend(i);
         }
-        // Also where it is not a number.
+        // This form of the condition also rejects NaN.
         (shared.trace * squares.flat() <= 1.0).then_some(shared)
     }
 
-    /// Takes term `i` into the factor.
+    /// Add term `i` to the factor.
     #[inline(always)]
     #[allow(clippy::needless_range_loop)] // triangles, whose elements are told by their places
     fn extend(&mut self, i: usize) {
@@ -91,11 +92,11 @@ impl<'a> Shared<'a> {
         self.trace += sum * self.inverse[i];
     }
 
-    /// Appends the positions among `columns`, which ascend, of those that this bound does not exclude where they stand
+    /// Append the positions in `columns` (ascending) whose candidates this bound does not exclude. Each column stands
     /// for the term that changes.
     #[inline(always)]
     pub(crate) fn open<const L: usize>(&self, columns: &[usize], limit: f64, open: &mut Vec<usize>) {
-        // The usual sizes get loops of known length.
+        // Common sizes get loops of constant length.
         match self.count {
             0 => self.open_sized::<L>(0, columns, limit, open),
             1 => self.open_sized::<L>(1, columns, limit, open),
@@ -124,7 +125,7 @@ impl<'a> Shared<'a> {
         }
     }
 
-    /// Appends those of so many lanes, from this position on, that are not excluded.
+    /// Append the lanes, from this position on, that are not excluded.
     #[inline(always)]
     fn append<const L: usize>(
         &self,
@@ -141,7 +142,7 @@ impl<'a> Shared<'a> {
         open.extend((from..from + lanes).zip(excluded).filter(|(_, excluded)| !excluded).map(|(at, _)| at));
     }
 
-    /// Whether no coefficients at all bring the squared error of each of L candidates down to the limit.
+    /// Whether no coefficients reduce the squared error of each of L candidates to the limit.
     #[inline(always)]
     #[allow(clippy::needless_range_loop)] // triangles of lanes, whose elements are told by their places
     fn excluded<const L: usize>(&self, count: usize, changing: &Columns<L>, limit: f64) -> [bool; L] {
@@ -192,7 +193,7 @@ impl<'a> Shared<'a> {
         let (slack, flat) = (squares.slack(), squares.flat());
         let mut excluded = [false; L];
         for n in 0..L {
-            // Written so that what is not a number excludes nothing.
+            // This form of the condition lets NaN exclude nothing.
             let known = (pivot[n] > 0.0) & ((self.trace + sum[n] * inverse[n]) * flat <= 1.0);
             excluded[n] = known & (error[n] - slack * size[n] * size[n] > limit);
         }
@@ -207,7 +208,7 @@ mod tests {
     use crate::linalg::dense;
     use crate::parallel::Stop;
 
-    /// Numbers in [−1, 1), always the same ones.
+    /// Reproducible numbers in [−1, 1).
     fn noise(state: &mut u64, count: usize) -> Vec<f64> {
         let mut next = || {
             *state = state.wrapping_mul(6_364_136_223_846_793_005).wrapping_add(1_442_695_040_888_963_407);
@@ -218,7 +219,7 @@ mod tests {
         (0..count).map(|_| next()).collect()
     }
 
-    /// Columns that differ from one of their kind by this share, in units of their own.
+    /// Columns that deviate from a common one by this fraction, each in its own unit.
     fn alike(state: &mut u64, count: usize, m: usize, share: f64) -> Vec<Vec<f64>> {
         let base = noise(state, m);
         let mut one = |i: usize| {

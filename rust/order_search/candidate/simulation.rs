@@ -1,14 +1,14 @@
-//! The free run ŷ = N/D of one candidate, marched block by block beside the measurement.
+//! Blockwise simulation ŷ = N/D of one candidate, compared with the measurement block by block.
 
 use crate::order_search::control::Control;
 use crate::order_search::options::Norm;
 use crate::order_search::result::{Failure, Verdict};
 use crate::series::{Division, BLOCK};
 
-/// A column with its coefficient.
+/// Column and its coefficient.
 type Weighted<'a> = (&'a [f64], f64);
 
-/// Memory of free runs, one after the other.
+/// Workspace of simulations, reused from one candidate to the next.
 pub(crate) struct March {
     divisor: Vec<f64>,
     block: Vec<f64>,
@@ -22,10 +22,10 @@ impl Default for March {
 }
 
 impl March {
-    /// Adds the error of a free run to a raw sum, leaving as soon as this passes the limit or the caller stops.
+    /// Add the error of a simulation to a raw sum. Stops once the sum exceeds the limit or the caller requests a stop.
     ///
-    /// D = 1 − Σ c F over the kernels in `own`, N = Σ c x over the columns in `driven`; a kernel is read no further than
-    /// the division has come.
+    /// D = 1 − Σ c F over the kernels in `own`, N = Σ c x over the columns in `driven`. A kernel is read only as far as
+    /// the division has advanced.
     #[allow(clippy::too_many_arguments)]
     pub(crate) fn run<'a>(
         &mut self,
@@ -39,7 +39,7 @@ impl March {
     ) -> Verdict {
         let m = target.len();
         let Self { divisor, block, division } = self;
-        // Records may differ in length; a division is kept for one.
+        // Records may differ in length, but a division has a fixed one.
         let division = match division {
             Some(d) if d.terms() == m => {
                 d.reset();
@@ -73,7 +73,7 @@ impl March {
             if !raw.is_finite() {
                 return Verdict::Failed(Failure::Diverged);
             }
-            // Written so that the interrupted candidate is never taken for a scored one.
+            // An interrupted candidate must not be taken for a scored one.
             if raw > limit || control.stopped() {
                 return Verdict::Stopped(raw);
             }
@@ -82,7 +82,7 @@ impl March {
         Verdict::Score(raw)
     }
 
-    /// Adds the residuals y − Σ c x to a raw sum, leaving as soon as this passes the limit.
+    /// Add the residuals y − Σ c x to a raw sum. Stops once the sum exceeds the limit.
     pub(crate) fn residuals<'a>(
         &mut self,
         target: &[f64],
@@ -106,7 +106,7 @@ impl March {
     }
 }
 
-/// Σ c x over one block that begins at `lo`.
+/// Σ c x over one block that starts at `lo`.
 #[inline]
 fn combine<'a>(block: &mut [f64], lo: usize, columns: impl Iterator<Item = Weighted<'a>>) {
     block.fill(0.0);

@@ -1,4 +1,4 @@
-//! Cells are halved until each is known to hold nothing much better than the best.
+//! Bisection of the cells of a region until no cell can contain an error far below the best one found.
 
 use std::sync::atomic::Ordering;
 
@@ -12,58 +12,58 @@ use crate::order_search::control::Control;
 use crate::parallel::pool;
 use crate::regressors::Record;
 
-/// Cells that a thread bounds at a time, and those of which it is known at a time what they came to.
+/// Cells that a task bounds, and cells whose bounds are held in memory at a time.
 const CHUNK: usize = 256;
 const AT_ONCE: usize = 1 << 16;
-/// Bytes that cells take of which some are halved.
+/// Memory per cell while cells are bisected [bytes].
 const HELD: u64 = 4 * size_of::<Cell>() as u64;
 
-/// Most orders that are tried on the way down from the best.
+/// Maximum evaluations of the local search from the best orders.
 const POLISHED: usize = 400;
-/// Middles near which orders are looked for at a time.
+/// Midpoints per pass that are tried as new best orders.
 const LIKELY: usize = 4;
 
-/// How much is asked for.
+/// Options of a certificate.
 #[derive(Debug, Clone, Copy, PartialEq)]
 pub struct Asked {
-    /// No orders are to have an error below the best one found times one less this.
+    /// Relative tolerance: no orders may have an error below (1 − tolerance) times the best error found.
     pub within: f64,
-    /// How many times the size of the output the terms of an equation have together at most: Σ ‖c x‖ ≤ largest·‖y‖.
+    /// Largest sum of the terms' norms relative to the output: Σ ‖c x‖ ≤ `max_coefficient`·‖y‖.
     pub largest: f64,
-    /// Cells after which the sweep ends with what it has proved.
+    /// Maximum number of cells. The bisection ends there with the bound proved so far.
     pub cells: u64,
-    /// Threads, and bytes of memory.
+    /// Number of threads, and memory [bytes].
     pub threads: usize,
     /// See `threads`.
     pub memory: u64,
 }
 
-/// What is proved of all orders of a region.
+/// Lower bound of the equation error over all orders of a region.
 #[derive(Debug, Clone, PartialEq)]
 pub struct Certificate {
-    /// No orders, with coefficients whose terms are not larger than asked for, give a smaller root of the mean squared
-    /// equation error; 0 where nothing is proved.
+    /// Lower bound of the root mean squared equation error, 0 if nothing is proved. It holds for all orders of the
+    /// region and all admissible coefficients.
     pub at_least: f64,
-    /// The smallest found, with the order of the equation and those of its terms; infinite where none was.
+    /// Smallest error found, with the order of the equation and those of its terms. Infinite if none was found.
     pub best: f64,
     /// See `best`.
     pub order: f64,
     /// See `best`.
     pub orders: Vec<f64>,
-    /// Cells that were bounded.
+    /// Number of bounded cells.
     pub cells: u64,
-    /// Cells that are left: not far enough above the best, and too small to be halved or one too many.
+    /// Number of open cells: their bound is too small, and they cannot be bisected further.
     pub open: u64,
 }
 
-/// Proves that no orders of a region have an equation error, in squares, with coefficients that suit them best, much
-/// below the best that is found on the way; terms that cancel but for next to nothing are left out.
+/// Certify a lower bound of the squared equation error over all orders of a region. Coefficients are optimal for each
+/// order. Equations whose terms nearly cancel are not covered.
 ///
-/// The same bits for any number of threads.
+/// The result is bitwise identical for any number of threads.
 ///
 /// # Errors
-/// No region, or one that holds no orders; records without its signals, a setting out of range, too many cells, memory
-/// that is not there, [`Error::Interrupted`].
+/// No region or one without orders, records without its signals, an option out of range, too many cells, too little
+/// memory, [`Error::Interrupted`].
 ///
 /// ```
 /// # use ftlm::order_search::certificate::bisection::{certify, Asked};
@@ -79,12 +79,13 @@ pub struct Certificate {
 ///     output: 0,
 ///     alpha: (0.5, 1.5),
 ///     terms: vec![Range { signal: 1, lowest: 0.0, highest: 0.0 }],
-///     apart: 0.05,
+///     min_separation: 0.05,
 /// };
-/// let asked = Asked { within: 0.05, largest: 1e3, cells: 1_000_000, threads: 1, memory: 1 << 28 };
-/// let found = certify(&[record], &region, &asked, &Control::default())?;
-/// assert!((found.order - 0.83).abs() < 0.02 && found.open == 0);
-/// assert!(0.95 * found.best <= found.at_least && found.at_least <= found.best);
+/// let (tolerance, max_coefficient, max_cells) = (0.05, 1e3, 1_000_000);
+/// let options = CertificateOptions { tolerance, max_coefficient, max_cells, threads: 1, memory: 1 << 28 };
+/// let found = certify(&[record], &region, &options, &Control::default())?;
+/// assert!((found.order - 0.83).abs() < 0.02 && found.open_cells == 0);
+/// assert!(0.95 * found.best <= found.lower_bound && found.lower_bound <= found.best);
 /// # Ok::<(), ftlm::error::Error>(())
 /// ```
 pub fn certify(records: &[Record], region: &Region, asked: &Asked, control: &Control) -> Result<Certificate> {
@@ -113,7 +114,7 @@ pub fn certify(records: &[Record], region: &Region, asked: &Asked, control: &Con
     })
 }
 
-/// One at work.
+/// Running bisection of the cells of a region.
 struct Sweep<'a> {
     tables: Tables,
     region: &'a Region,
@@ -133,7 +134,7 @@ impl Sweep<'_> {
         let (mut proved, mut bounded, mut open) = (f64::INFINITY, 0_u64, 0_u64);
         let target = |best: f64| (1.0 - self.asked.within).powi(2) * best;
         let most = self.asked.cells.min(self.asked.memory.saturating_sub(self.tables.bytes) / HELD);
-        // What is known beforehand saves halving.
+        // A good incumbent saves bisections.
         for cells in cells.chunks(AT_ONCE) {
             let found = self.bounds(cells, 0.0)?;
             self.better(records, (cells, &found), &mut best, &mut place)?;
@@ -145,7 +146,7 @@ impl Sweep<'_> {
                 proved = cells.iter().fold(proved, |least, cell| least.min(cell.least));
                 break;
             }
-            // What is known of; halves will come.
+            // Number of cells known so far. Further halves follow.
             self.control.total.store(bounded + cells.len() as u64, Ordering::Relaxed);
             let mut next = Vec::new();
             for cells in cells.chunks(AT_ONCE) {
@@ -180,7 +181,7 @@ impl Sweep<'_> {
         Ok(Certificate { at_least, best: root(best), order, orders, cells: bounded, open })
     }
 
-    /// What is known of some cells.
+    /// Compute the bounds of some cells.
     fn bounds(&self, cells: &[Cell], goal: f64) -> Result<Vec<Bounded>> {
         let bounds = |chunk: &'_ [Cell]| -> Vec<Bounded> {
             let all = chunk.iter().take(if self.control.stopped() { 0 } else { CHUNK });
@@ -191,7 +192,7 @@ impl Sweep<'_> {
         Ok(found)
     }
 
-    /// Takes the best orders of the region near the best middles of some cells.
+    /// Update the best orders from those near the best midpoints of some cells.
     fn better(
         &self,
         records: &[Record],
@@ -211,7 +212,7 @@ impl Sweep<'_> {
         Ok(())
     }
 
-    /// What is known of a cell: by its space too where that may help.
+    /// Bound of one cell. The subspace bound is added if the first one misses the goal.
     fn bound(&self, cell: &Cell, goal: f64) -> Bounded {
         let mut found = self.tables.local(cell).bound();
         if found.least.max(cell.least) < goal {
@@ -220,18 +221,19 @@ impl Sweep<'_> {
         found
     }
 
-    /// What orders of integration leave themselves, not read off a table.
+    /// Relative squared residual at these orders of integration, computed without tables.
     fn left(&self, records: &[Record], etas: &[f64]) -> Result<f64> {
         let terms = self.region.terms.iter().zip(etas).map(|(term, eta)| (term.signal, *eta, 0.0));
         Ok(about(records, self.region.output, &terms.collect::<Vec<_>>(), &self.control.stop)?.0.bound().middle)
     }
 
-    /// Goes down from the best orders, one or two of them at a time: to edges of the region too, where no middle is.
+    /// Refine the best orders by a local search, changing one or two orders at a time. It reaches the edges of the
+    /// region, which have no midpoint.
     fn polish(&self, records: &[Record], best: &mut f64, place: &mut Vec<f64>) -> Result<()> {
         if place.is_empty() {
             return Ok(());
         }
-        // The equation's own order comes last.
+        // The order of the equation comes last.
         let k = place.len();
         let vary: Vec<usize> = (0..k)
             .filter(|&term| self.region.terms[term].lowest < self.region.terms[term].highest)
@@ -275,10 +277,10 @@ impl Sweep<'_> {
         self.region.alphas(&self.all_within(cell)).is_some()
     }
 
-    /// The largest cells that hold orders of the region.
+    /// Largest cells that contain orders of the region.
     ///
     /// # Errors
-    /// [`Error::Structure`] where they are too many.
+    /// [`Error::Structure`] if there are too many.
     fn largest(&self) -> Result<Vec<Cell>> {
         let mut cells = vec![Cell { level: [0; MOST], at: [0; MOST], least: 0.0 }];
         for term in 0..self.region.terms.len() {
@@ -310,7 +312,8 @@ impl Sweep<'_> {
         Ok(cells)
     }
 
-    /// Both halves along the order that costs most, as far as they hold orders; none where all are too short.
+    /// Both halves of a cell along the order with the largest cost, if they contain orders. `None` if all orders are at
+    /// the finest level.
     fn halved(&self, cell: &Cell, least: f64, costs: &[f64; MOST]) -> Option<[Option<Cell>; 2]> {
         let may = (0..self.region.terms.len()).filter(|&term| !self.tables.known(term) && cell.level[term] < DEEPEST);
         let term = may.max_by(|&a, &b| costs[a].total_cmp(&costs[b]).then(b.cmp(&a)))?;

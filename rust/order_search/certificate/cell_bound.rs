@@ -1,13 +1,13 @@
-//! A lower bound of the least squared equation error over a cell of orders.
+//! Lower bound of the least squared equation error over a cell of orders.
 //!
-//! With X the columns at the middle, G = XᵀX and any coefficients c₀ there, e = y − Xc₀. At other orders of the cell the
-//! columns are X + U; what of U lies in the span of X is XA, the rest P is orthogonal to X. For any coefficients c, with
-//! h = c + Ac − c₀, τ = Xᵀe and γ = Uᵀe,
+//! With X the columns at the midpoint, G = XᵀX and any coefficients c₀ there, e = y − Xc₀. At other orders of the
+//! cell the columns are X + U. The part of U in the span of X is XA, the rest P is orthogonal to X. For any
+//! coefficients c, with h = c + Ac − c₀, τ = Xᵀe and γ = Uᵀe,
 //!
 //!   ‖y − (X + U)c‖² = ‖e − Xh − Pc‖² ≥ ‖e‖² − 2τᵀh − 2(γ − Aᵀτ)ᵀc + ‖Xh‖².
 //!
-//! c = (I + A)⁻¹(c₀ + h), so with (I + Aᵀ)β = γ − Aᵀτ the least over h is ‖e‖² − 2βᵀc₀ − (β + τ)ᵀG⁻¹(β + τ). Moduli of U's
-//! products, hence of γ and A, are bounded by the series of the columns; B bounds |β| where B ≥ |γ| + |A|ᵀ(|τ| + B).
+//! c = (I + A)⁻¹(c₀ + h), so with (I + Aᵀ)β = γ − Aᵀτ the minimum over h is ‖e‖² − 2βᵀc₀ − (β + τ)ᵀG⁻¹(β + τ). The
+//! moduli of γ and A are bounded by the expansions of the columns. B bounds |β| if B ≥ |γ| + |A|ᵀ(|τ| + B).
 
 use crate::error::{check_length, Error, Result};
 use crate::linalg::dense::inner_products;
@@ -18,11 +18,11 @@ use crate::regressors::Record;
 
 type Row = [f64; MOST];
 
-/// What a bound adds to B and takes for granted of inverses: far more than rounding does to either.
+/// Relative margin of B, and of the inverse matrices. It is far above their rounding error.
 const HAIR: f64 = 1e-6;
 const SIXTEENTH: f64 = 1.0 / 16.0;
 
-/// Inner products of the columns about the middle of a cell, all of the k terms: first of unit size, as is the target.
+/// Inner products of the columns at the midpoint of a cell, for all k terms. The columns and the target have unit norm.
 #[derive(Debug, Clone, Copy)]
 pub(super) struct Local {
     pub(super) k: usize,
@@ -31,10 +31,10 @@ pub(super) struct Local {
     /// x_j⁽ᵐ⁾·y and ‖x_j⁽ᵐ⁾‖.
     pub(super) target: [Row; ALL],
     pub(super) sizes: [Row; ALL],
-    /// What the series leave out, and half the cell's widths.
+    /// Remainders of the expansions, and half widths of the cell.
     pub(super) rests: Row,
     pub(super) halves: Row,
-    /// What rounding may add to a product of two unit columns.
+    /// Rounding-error bound of a product of two unit columns.
     pub(super) rounding: f64,
 }
 
@@ -47,20 +47,20 @@ impl Local {
             sizes: [[0.0; MOST]; ALL],
             rests: [0.0; MOST],
             halves: [0.0; MOST],
-            // Products of columns that are kept as they are lose an eighth of what a chain of transforms does.
+            // Products of stored columns have an eighth of the rounding error of a chain of transforms.
             rounding: unit(samples) / 8.0,
         }
     }
 }
 
-/// What is known of a cell: shares of the squared size of the target.
+/// Bound of a cell, relative to the squared norm of the target.
 #[derive(Debug, Clone, Copy)]
 pub(super) struct Bounded {
-    /// No orders of the cell leave less; 0 where nothing is proved.
+    /// Lower bound of the relative squared residual of all orders in the cell, 0 if nothing is proved.
     pub(super) least: f64,
-    /// What the middle leaves; infinite where that is not told.
+    /// Relative squared residual at the midpoint, infinite if it cannot be computed.
     pub(super) middle: f64,
-    /// What each order costs the bound.
+    /// Loss of the bound caused by the width of each order.
     pub(super) costs: Row,
 }
 
@@ -74,7 +74,7 @@ impl Local {
         let terms = (k * k) as f64;
         let lost = self.rounding * terms;
         let elimination = 64.0 * f64::EPSILON * terms * terms * trace * trace;
-        // What is not a number ends here too.
+        // This form of the condition also rejects NaN.
         if !(trace * lost < SIXTEENTH * SIXTEENTH && elimination < SIXTEENTH * SIXTEENTH) {
             return found;
         }
@@ -86,7 +86,7 @@ impl Local {
         let along = |m: usize, j: usize| -> f64 {
             self.target[m][j] - (0..k).map(|i| c[i] * self.products[m][i][j]).sum::<f64>()
         };
-        // ‖e‖² by the form itself, right for any coefficients.
+        // ‖e‖² from the quadratic form, which is valid for any coefficients.
         let explained: f64 = (0..k).map(|i| c[i] * (self.target[0][i] + along(0, i))).sum();
         let square = 1.0 - explained;
         let error = self.rounding * all * all;
@@ -160,7 +160,7 @@ fn inverse(mut matrix: [Row; MOST], k: usize) -> Option<[Row; MOST]> {
     Some(out)
 }
 
-/// Some B with B > γ + Aᵀ(τ + B), which also shows that I + A is regular; none where it is not found.
+/// A vector B with B > γ + Aᵀ(τ + B), which proves that I + A is regular. `None` if none is found.
 fn dominating(a: &[Row; MOST], gamma: &Row, tau: &Row, k: usize) -> Option<Row> {
     let (mut matrix, mut right) = ([[0.0; MOST]; MOST], [0.0; MOST]);
     for i in 0..k {
@@ -187,20 +187,19 @@ fn dominating(a: &[Row; MOST], gamma: &Row, tau: &Row, k: usize) -> Option<Row> 
         b[i] = (right[i] - sum) / matrix[i][i];
     }
     b[..k].iter_mut().for_each(|b| *b *= 1.0 + HAIR);
-    // Believed only where it does what is asked of it.
+    // Accept the vector only if it satisfies the inequality.
     let proved = |i: usize| (wanted[i] + (0..k).map(|j| a[j][i] * b[j]).sum::<f64>()) * (1.0 + 1e-3 * HAIR) <= b[i];
     (0..k).all(proved).then_some(b)
 }
 
-/// What is proved of a cell: at least so much is Σε² of the equation errors, at rest, of every equation whose terms are
-/// integrals of these signals of orders within half widths of middles, (signal, middle, half width) by term; 0 where
-/// nothing is.
+/// Lower bounds of Σε² over a cell of orders, 0 if nothing is proved. ε is the equation error with zero initial
+/// conditions. `terms` lists (signal, midpoint, half width) of the orders of integration, one entry per term.
 ///
-/// The first holds for any coefficients; the second, which a goal is tried for, for those whose terms have together at
-/// most `largest` times the size of the output.
+/// The first bound holds for any coefficients. The second, optimized for `goal`, holds for coefficients whose terms sum
+/// up to at most `largest` times the norm of the output.
 ///
 /// # Errors
-/// No records or terms, too many of these, a signal that is not there or is zero, middles below their half widths.
+/// No records or terms, too many terms, a signal that is missing or zero, a midpoint below its half width.
 ///
 /// ```
 /// # use ftlm::order_search::certificate::cell_bound::cell_bounds;
@@ -234,7 +233,7 @@ pub fn cell_bounds(
     Ok((local.bound().least * square, span.bound(largest, goal / square) * square))
 }
 
-/// What a cell with these middles and half widths is bounded from, and the squares of the output.
+/// Inner products and subspace of a cell with these midpoints and half widths, and the squared norm of the output.
 pub(super) fn about(
     records: &[Record],
     output: usize,
@@ -269,7 +268,7 @@ pub(super) fn about(
     Ok((local, span, square))
 }
 
-/// Refuses records and signals of which nothing can be made.
+/// Raise an error for records and signals that cannot be certified.
 pub(super) fn check(records: &[Record], output: usize, signals: impl Iterator<Item = usize>) -> Result<()> {
     let Some(first) = records.first() else {
         return Err(Error::Structure { what: "no record is given".into(), remedy: "give at least one run".into() });

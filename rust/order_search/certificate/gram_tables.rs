@@ -1,6 +1,6 @@
-//! Inner products of the columns about the middles of all cells, made once.
+//! Gram tables of a certificate: region of orders, its cells, and the inner products at their midpoints.
 //!
-//! The orders that a certificate speaks of, and which cells hold some of them.
+//! The products are computed once for all cells.
 
 use std::collections::BTreeMap;
 
@@ -13,69 +13,69 @@ use crate::order_search::control::Control;
 use crate::parallel;
 use crate::regressors::Record;
 
-/// Width of the largest cells: above it a bound proves hardly ever anything.
+/// Width of the largest cells. A bound over wider cells rarely proves anything.
 const WIDEST: f64 = 0.1;
-/// How often an order's interval is halved in tables, and at all: what lies deeper is told by the series of the tables.
+/// Maximum bisection levels of an interval: with tables, and in all. Deeper cells use the expansions of the tables.
 const TABLED: u8 = 3;
 pub(super) const DEEPEST: u8 = 10;
-/// Derivatives whose products are made, by [`pair`].
+/// Pairs of derivatives with tabulated products, in the order of [`pair_position`].
 const PAIRS: [(usize, usize); ALL * (ALL + 1) / 2] =
     [(0, 0), (0, 1), (1, 1), (0, 2), (1, 2), (2, 2), (0, 3), (1, 3), (2, 3), (3, 3)];
-/// Columns whose products with all others are made at a time.
+/// Columns per task whose products with all others are computed.
 const BATCH: usize = 64;
 
-/// A cell: for each term how often its interval was halved, and the number of what is left of it.
+/// Cell of the bisection: level and position of each term's interval.
 #[derive(Debug, Clone, Copy)]
 pub(super) struct Cell {
     pub(super) level: [u8; MOST],
     pub(super) at: [u32; MOST],
-    /// What is proved of the cell that it is a part of.
+    /// Lower bound inherited from the parent cell.
     pub(super) least: f64,
 }
 
-/// Stretches of one signal's orders of integration, by level: number of the first, and the node of its middle.
+/// Intervals of one signal's orders of integration by level: number of the first, and its node.
 type Stretches = Vec<(usize, usize)>;
 
-/// What cells are bounded from.
+/// Tables from which cells are bounded.
 pub(super) struct Tables {
-    /// Of each term: none where its order of integration is known, and the node that it has then.
+    /// Intervals and node of each term. A term of fixed order has a node and no intervals.
     terms: Vec<(Option<Stretches>, usize)>,
-    /// Halvings in tables.
+    /// Highest level with tables.
     tabled: u8,
-    /// Bytes of them.
+    /// Memory of the tables [bytes].
     pub(super) bytes: u64,
     nodes: usize,
     samples: usize,
-    /// x_i⁽ⁿ⁾·x_j⁽ᵐ⁾ by [`PAIRS`] of n and m, then j, then i; x_j⁽ᵐ⁾·y by m, then j.
+    /// x_i⁽ⁿ⁾·x_j⁽ᵐ⁾ by [`DERIVATIVE_PAIRS`] of n and m, then j, then i, and x_j⁽ᵐ⁾·y by m, then j.
     products: [Vec<f64>; PAIRS.len()],
     target: [Vec<f64>; ALL],
     sizes: Vec<[f64; ALL]>,
     rests: Vec<f64>,
 }
 
-/// Share of a stretch within which orders touch it: more than rounding is.
+/// Relative distance at which orders touch an interval, above the rounding error.
 const TOUCHING: f64 = 1e-6;
 
-/// Place in [`PAIRS`] of n and m, n ≤ m.
+/// Position of n and m in [`DERIVATIVE_PAIRS`], n ≤ m.
 fn pair(n: usize, m: usize) -> usize {
     m * (m + 1) / 2 + n
 }
 
-/// A term at the middle of a cell: node, distance from its middle, half the cell's width.
+/// Term at the midpoint of a cell: node, distance from the node, half width.
 #[derive(Debug, Clone, Copy, Default)]
 struct Middle {
     node: usize,
-    /// Powers of the distance over factorials.
+    /// Powers of the distance divided by factorials.
     off: [f64; ALL],
     half: f64,
 }
 
-/// Width of a stretch.
+/// Width of an interval at this level.
 pub(super) fn width(level: u8) -> f64 {
     WIDEST / f64::from(1_u32 << level)
 }
 
-/// Stretches of a level that orders between these lie in or touch: the first and how many.
+/// Intervals of a level that contain or touch orders in this range: the first and their number.
 #[allow(clippy::cast_possible_truncation, clippy::cast_sign_loss)]
 fn stretches((low, high): (f64, f64), level: u8) -> (usize, usize) {
     let first = (low / width(level) - TOUCHING).floor().max(0.0) as usize;
@@ -83,7 +83,7 @@ fn stretches((low, high): (f64, f64), level: u8) -> (usize, usize) {
     (first, end.max(first + 1) - first)
 }
 
-/// Middle and half width of each node, by signal.
+/// Midpoint and half width of each node, by signal.
 struct Laid {
     nodes: Vec<(usize, f64, f64)>,
     terms: Vec<(Option<Stretches>, usize)>,
@@ -123,16 +123,16 @@ fn lay(region: &Region, deepest: u8) -> Laid {
     Laid { nodes, terms }
 }
 
-/// Bytes of columns and products of so many nodes.
+/// Memory of columns and products of this many nodes [bytes].
 fn bytes(nodes: usize, samples: usize) -> u64 {
     8 * nodes as u64 * (PAIRS.len() * nodes + 2 * ALL * samples) as u64
 }
 
 impl Tables {
-    /// As deep as the memory allows. Runs on the current thread pool.
+    /// Build the tables to the deepest level that the memory allows. Runs on the current thread pool.
     ///
     /// # Errors
-    /// [`Error::Memory`], [`Error::Interrupted`], as [`Curve::new`].
+    /// [`Error::Memory`], [`Error::Interrupted`], and the errors of the regressor expansion.
     pub(super) fn new(records: &[Record], region: &Region, memory: u64, control: &Control) -> Result<Self> {
         let target: Vec<f64> = records.iter().flat_map(|r| r.signal(region.output)).copied().collect();
         let samples = target.len();
@@ -185,12 +185,12 @@ impl Tables {
         })
     }
 
-    /// Whether a term's order of integration is known.
+    /// Whether a term's order of integration is fixed.
     pub(super) fn known(&self, term: usize) -> bool {
         self.terms[term].0.is_none()
     }
 
-    /// Orders of integration of a term in a cell.
+    /// Interval of a term's order of integration in a cell.
     pub(super) fn within(&self, region: &Region, cell: &Cell, term: usize) -> (f64, f64) {
         if self.known(term) {
             let (_, known) = region.integrations(term);
@@ -200,7 +200,7 @@ impl Tables {
         (at * width, (at + 1.0) * width)
     }
 
-    /// Stretches of the largest size of a term.
+    /// Intervals of a term at the coarsest level: the first and their number.
     pub(super) fn largest(&self, region: &Region, term: usize) -> (usize, usize) {
         if self.known(term) {
             (0, 1)
@@ -209,7 +209,7 @@ impl Tables {
         }
     }
 
-    /// Where the middle of a cell is.
+    /// Midpoint of a cell.
     fn middle(&self, cell: &Cell) -> [Middle; MOST] {
         let mut out = [Middle::default(); MOST];
         for (term, ((stretches, known), out)) in self.terms.iter().zip(&mut out).enumerate() {
@@ -240,7 +240,7 @@ impl Tables {
         }
     }
 
-    /// The same at middles, where columns are cubic about nodes.
+    /// Same product at midpoints, from cubic expansions about the nodes.
     fn product(&self, a: &Middle, n: usize, b: &Middle, m: usize) -> f64 {
         let mut sum = 0.0;
         for p in n..ALL {
@@ -254,7 +254,7 @@ impl Tables {
         sum
     }
 
-    /// Product of the mth derivative with the target, and the most that its size may be.
+    /// Product of the mth derivative with the target, and an upper bound of its norm.
     fn alone(&self, a: &Middle, m: usize) -> (f64, f64) {
         let all = (m..ALL).map(|q| (a.off[q - m], q));
         all.fold((0.0, 0.0), |(sum, size), (weight, q)| {
@@ -262,7 +262,7 @@ impl Tables {
         })
     }
 
-    /// What a cell is bounded from.
+    /// Inner products from which a cell is bounded.
     pub(super) fn local(&self, cell: &Cell) -> Local {
         let k = self.terms.len();
         let middles = self.middle(cell);
@@ -280,7 +280,7 @@ impl Tables {
         local
     }
 
-    /// The space that its columns and their first derivatives span.
+    /// Subspace spanned by a cell's columns and their first derivatives.
     pub(super) fn span(&self, cell: &Cell) -> Span {
         let middles = self.middle(cell);
         let mut span = Span::new(self.samples);
@@ -294,36 +294,36 @@ impl Tables {
     }
 }
 
-/// What rounding may do to an order.
+/// Rounding tolerance of an order.
 const ROUNDED: f64 = 1e-9;
 
-/// Orders of one term.
+/// Interval of orders of one term.
 #[derive(Debug, Clone, Copy, PartialEq)]
 pub struct Range {
-    /// Its signal.
+    /// Signal of the term.
     pub signal: usize,
-    /// Lowest and highest order; equal where it is known.
+    /// Lowest and highest order, equal for a fixed order.
     pub lowest: f64,
     /// See `lowest`.
     pub highest: f64,
 }
 
-/// All orders within some intervals of one equation.
+/// Orders of one equation within given intervals.
 #[derive(Debug, Clone, PartialEq)]
 pub struct Region {
-    /// The signal that the equation is of.
+    /// Output of the equation.
     pub output: usize,
-    /// Lowest and highest order of the equation itself.
+    /// Lowest and highest order of the equation.
     pub alpha: (f64, f64),
-    /// Orders of its terms, none above the equation's own.
+    /// Intervals of the terms' orders, none above the order of the equation.
     pub terms: Vec<Range>,
-    /// Orders of the output stay this far below the equation's own, and orders of one signal this far apart: where they
-    /// meet any equation is fulfilled, or its terms are one.
+    /// Minimum distance of the output's orders from the equation's order, and of two orders of one signal. At distance
+    /// 0 every equation is satisfied, or two terms coincide.
     pub apart: f64,
 }
 
 impl Region {
-    /// Refuses what is no region.
+    /// Raise an error if the intervals do not form a region.
     pub(super) fn check(&self) -> Result<()> {
         let range = |name: &str, value: f64, range: &str| Error::OutOfRange {
             name: name.into(),
@@ -346,24 +346,24 @@ impl Region {
         Ok(())
     }
 
-    /// Whether a term is of the output itself.
+    /// Whether a term belongs to the output itself.
     fn own(&self, term: usize) -> bool {
         self.terms[term].signal == self.output
     }
 
-    /// Orders of integration of a term: lowest and highest.
+    /// Lowest and highest order of integration of a term.
     pub(super) fn integrations(&self, term: usize) -> (f64, f64) {
         let least = if self.own(term) { self.apart } else { 0.0 };
         ((self.alpha.0 - self.terms[term].highest).max(least), self.alpha.1 - self.terms[term].lowest)
     }
 
-    /// Whether two terms may change places.
+    /// Whether two terms may be interchanged.
     fn alike(&self, a: usize, b: usize) -> bool {
         self.terms[a] == self.terms[b] && self.terms[a].lowest < self.terms[a].highest
     }
 
-    /// The equation's own orders with which orders of integration between these, of the first terms, may be had; none
-    /// where there are none.
+    /// Interval of the equation's order for which the first terms have orders of integration within these intervals.
+    /// `None` if it is empty.
     pub(super) fn alphas(&self, within: &[(f64, f64)]) -> Option<(f64, f64)> {
         let (mut low, mut high) = self.alpha;
         for (term, &(a, b)) in within.iter().enumerate() {
@@ -378,7 +378,7 @@ impl Region {
                 if self.terms[other].signal != self.terms[term].signal {
                     continue;
                 }
-                // Terms that may change places are told apart by their order.
+                // Interchangeable terms are ordered by their orders.
                 let ways = [d - a, if self.alike(other, term) { f64::NEG_INFINITY } else { b - c }];
                 if ways[0].max(ways[1]) < self.apart - ROUNDED {
                     return None;
@@ -388,7 +388,7 @@ impl Region {
         (low <= high + ROUNDED).then_some((low, high))
     }
 
-    /// The orders of integration as those of an equation and its terms.
+    /// Orders of the equation and of its terms for these orders of integration.
     pub(super) fn orders(&self, etas: &[f64]) -> Option<(f64, Vec<f64>)> {
         let points: Vec<(f64, f64)> = etas.iter().map(|&eta| (eta, eta)).collect();
         let (low, high) = self.alphas(&points)?;
@@ -396,7 +396,7 @@ impl Region {
         Some((alpha, etas.iter().map(|eta| alpha - eta).collect()))
     }
 
-    /// Orders of integration near these that are of the region, where a cell holds some.
+    /// Orders of integration of the region near the midpoint of a cell. `None` if the cell contains none.
     pub(super) fn near(&self, within: &[(f64, f64)]) -> Option<Vec<f64>> {
         let (low, high) = self.alphas(within)?;
         let alpha = ((low + high) / 2.0).clamp(self.alpha.0, self.alpha.1);
@@ -404,7 +404,7 @@ impl Region {
         self.of_orders(alpha, &etas.iter().map(|eta| alpha - eta).collect::<Vec<_>>())
     }
 
-    /// Orders of integration of an equation's order and those of its terms, each moved into its interval.
+    /// Orders of integration for an equation's order and its terms' orders, each clipped to its interval.
     pub(super) fn of_orders(&self, alpha: f64, orders: &[f64]) -> Option<Vec<f64>> {
         let alpha = alpha.clamp(self.alpha.0, self.alpha.1);
         let inside = |(term, order): (usize, &f64)| {

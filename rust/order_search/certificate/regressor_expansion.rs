@@ -1,36 +1,36 @@
-//! The regressor I^η s of a signal near one order: its values, its derivatives in the order, and what they leave out.
+//! Taylor expansion of the regressor I^η s in its order η, with a bound of the remainder.
 //!
-//! v_n = Δ²n^{η+1} is differentiated term by term (`crate::fractional::kernels`). Columns may be scaled as one likes,
-//! also by e^{−λ(η−η₀)}: with λ the mean logarithmic slope of the column at η₀ what is left turns, but hardly grows.
-//! Beyond the third derivative the fourth is bounded: it is a mean of d²/dt² t^{η+1}(ln t − λ)⁴ over two pulses, whose
-//! terms grow with η from t = 1 on.
+//! v_n = Δ²n^{η+1} is differentiated term by term. Columns may be scaled freely, also by e^{−λ(η−η₀)}. With λ the
+//! mean logarithmic slope of the column at η₀, the scaled column rotates but hardly changes its norm. The remainder
+//! after the third derivative follows from a bound of the fourth: it is a mean of d²/dt² t^{η+1}(ln t − λ)⁴ over two
+//! pulses, whose terms increase with η from t = 1 on.
 
 use crate::error::{Error, Result};
 use crate::parallel::Stop;
 use crate::regressors::Record;
 use crate::series::{Buffers, Kernel};
 
-/// Most terms of an equation.
+/// Maximum number of terms of an equation.
 pub(super) const MOST: usize = 6;
-/// Derivatives that are made.
+/// Highest derivative of the expansion.
 pub(super) const MADE: usize = 3;
-/// The value and these.
+/// Number of columns of the expansion: the value and its derivatives.
 pub(super) const ALL: usize = MADE + 1;
 
-/// Terms of the binomial sum below [`NEAR`] pulses' distance, where it converges slowly, and from there on: 4^−26 and
-/// 64^−10 are below the rounding error.
+/// Terms of the binomial sum at distances below [`NEAR_DISTANCE_PULSES`], where it converges slowly, and above. 4^−26
+/// and 64^−10 are below the rounding error.
 const TERMS: [usize; 2] = [26, 10];
 const NEAR: usize = 8;
 
-/// Factorials.
+/// Factorials of 0 to 4.
 const FACTORIAL: [f64; 5] = [1.0, 1.0, 2.0, 6.0, 24.0];
 
-/// The columns of one signal about one order, records one after the other, the first of unit size.
+/// Expansion of one signal's regressor about one order. Records are concatenated, and the value has unit norm.
 pub(super) struct Curve {
     pub(super) columns: [Vec<f64>; ALL],
-    /// Their sizes.
+    /// Norms of the columns.
     pub(super) sizes: [f64; ALL],
-    /// Within the half width no column is farther than this from the series that the columns make.
+    /// Remainder: largest distance of a column within the half width from its Taylor series.
     pub(super) rest: f64,
 }
 
@@ -44,7 +44,7 @@ struct Sums {
 impl Sums {
     #[allow(clippy::cast_precision_loss)]
     fn new(eta: f64, m: usize) -> Self {
-        // Derivatives of binomial coefficients, as truncated series in what is added to η.
+        // Derivatives of binomial coefficients, as truncated series in the increment of η.
         let mut coefficients = [[0.0; ALL]; TERMS[0]];
         let mut c = [0.0; ALL];
         c[0] = 1.0;
@@ -94,7 +94,7 @@ impl Sums {
     }
 }
 
-/// Σ_n of what |(∂/∂η − μ)⁴ v_n| is at most, for all orders up to `highest`.
+/// Σ_n of the upper bounds of |(∂/∂η − μ)⁴ v_n|, for all orders up to `highest`.
 #[allow(clippy::cast_precision_loss)]
 fn fourth(highest: f64, mu: f64, m: usize) -> f64 {
     let b = highest;
@@ -119,15 +119,15 @@ fn dot(a: &[f64], b: &[f64]) -> f64 {
 }
 
 impl Curve {
-    /// About I^eta of a signal, for orders of integration within `half` of it.
+    /// Expand I^eta of a signal, for orders of integration within `half` of eta.
     ///
     /// # Errors
-    /// [`Error::Structure`] where its size is no positive number, [`Error::Interrupted`].
+    /// [`Error::Structure`] if its norm is not a positive finite number, [`Error::Interrupted`].
     pub(super) fn new(records: &[Record], signal: usize, eta: f64, half: f64, stop: &Stop) -> Result<Self> {
         let mut columns: [Vec<f64>; ALL] = Default::default();
         let mut errors = [0.0; ALL];
         let mut made = Vec::with_capacity(records.len());
-        // The unit of time is the first record's pulse.
+        // The unit of time is the pulse length of the first record.
         let first = records.first().map_or(1.0, Record::step);
         for record in records {
             stop.check()?;
@@ -158,7 +158,7 @@ impl Curve {
                     column.extend(product(&kernel, spectrum, *scale, &mut buffers));
                 }
                 let size = dot(record.signal(signal), record.signal(signal)).sqrt();
-                // Derivatives are sums of terms that the logarithms of all distances enter with either sign.
+                // The summands of a derivative have either sign, depending on the logarithm of the distance.
                 let lost = unit(m) * scale * size * sums.moduli(j, mu);
                 squares += lost * lost;
                 if j == 0 {
@@ -188,7 +188,7 @@ impl Curve {
 }
 
 impl Sums {
-    /// Σ_n of the moduli of what [`Sums::derivative`] adds up.
+    /// Σ_n of the moduli of the summands of the derivative.
     fn moduli(&self, j: usize, mu: f64) -> f64 {
         let power = |x: f64| x.abs().powi(i32::try_from(j).unwrap_or(0));
         let near = power(mu) + libm::exp2(self.eta + 1.0) * power(std::f64::consts::LN_2 - mu) + 2.0 * power(mu);
@@ -204,7 +204,7 @@ impl Sums {
     }
 }
 
-/// What rounding may add to a sum of so many terms, per unit: a generous multiple.
+/// Relative rounding-error bound of a sum with this many terms, a generous multiple.
 #[allow(clippy::cast_precision_loss)]
 pub(super) fn unit(m: usize) -> f64 {
     16.0 * f64::EPSILON * (m.max(64) as f64)
@@ -217,7 +217,7 @@ fn product(kernel: &[f64], spectrum: &Kernel, scale: f64, buffers: &mut Buffers)
     out
 }
 
-/// Σ over the powers up to the third of `half`^j/j! times a number each.
+/// Taylor sum from the first to the third power: Σ `half`^j/j! times one value for each j.
 pub(super) fn series(half: f64, of: impl Fn(usize) -> f64) -> f64 {
     let mut power = 1.0;
     let mut sum = 0.0;

@@ -1,33 +1,34 @@
-//! A lower bound over a cell from the space that its columns and their first two derivatives span.
+//! Lower bound over a cell from the subspace spanned by its columns and their first two derivatives.
 //!
-//! Near orders whose columns depend on one another coefficients are told by next to nothing, and what follows from them
-//! proves nothing. There the output's distance from that space still bounds the equation error, for coefficients whose
-//! terms are not beyond all measure: what the space leaves out of the columns is of third order.
+//! Near orders with nearly dependent columns the coefficients are poorly determined, and a bound based on them proves
+//! nothing. The distance of the output from this subspace still bounds the equation error for coefficients of limited
+//! size, since the subspace omits only terms of third order from the columns.
 
 use crate::order_search::certificate::regressor_expansion::{unit, ALL, MOST};
 
-/// The value and the derivatives that are taken into the space.
+/// Number of spanning columns of a term: the value and its derivatives.
 const SPANNED: usize = 3;
 const ROWS: usize = SPANNED * MOST;
-/// What is added to squares of coefficients, which may not be as large as they like: as a share of what is to be proved,
-/// all of them taken together, and so much at least that columns that depend on one another do no harm.
+/// Ridge on the squared coefficients, relative to the goal for all of them together, and its minimum. The ridge keeps
+/// nearly dependent columns harmless.
 const SHARE: f64 = 0.05;
 const RIDGE: f64 = 1e-11;
-/// A hair more, for the rounding of what is put together here.
+/// Relative margin for the rounding of the bound.
 const HAIR: f64 = 1e-9;
 
-/// Columns in units in which their coefficients are at most those of the values: x, ωx′, ω²x″/2.
+/// Subspace spanned by the scaled columns x, ωx′, ω²x″/2. In this scaling no derivative has larger coefficients than
+/// the value.
 pub(super) struct Span {
-    /// Term, derivative and unit of each row.
+    /// Term, derivative and scale of each row.
     rows: [((usize, usize), f64); ROWS],
     count: usize,
     terms: usize,
     matrix: [[f64; ROWS]; ROWS],
     target: [f64; ROWS],
-    /// What is left out of a unit column at most, and the least size of one.
+    /// Largest norm omitted from a unit column, and smallest norm of a unit column within the cell.
     beyond: f64,
     least: f64,
-    /// What rounding may add to a product of two unit columns.
+    /// Rounding-error bound of a product of two unit columns.
     rounding: f64,
 }
 
@@ -45,7 +46,7 @@ impl Span {
         }
     }
 
-    /// The next term: half its width, the sizes of its columns and what their series leaves out.
+    /// Add a term: half its width, the norms of its columns and the remainder of its expansion.
     pub(super) fn add(&mut self, half: f64, sizes: [f64; ALL], rest: f64) {
         let units = [1.0, half, half * half / 2.0, half * half * half / 6.0];
         for (derivative, unit) in units.into_iter().enumerate().take(if half > 0.0 { SPANNED } else { 1 }) {
@@ -58,7 +59,7 @@ impl Span {
         self.least = self.least.min(1.0 - off(1));
     }
 
-    /// Takes products of the columns of terms and derivatives, and with the target.
+    /// Fill in the products of the columns of terms and derivatives, and those with the target.
     pub(super) fn fill(
         &mut self,
         product: impl Fn((usize, usize), (usize, usize)) -> f64,
@@ -75,8 +76,8 @@ impl Span {
         }
     }
 
-    /// No orders of the cell, with coefficients whose terms have together at most `largest` times the size of the output,
-    /// leave a smaller share of its square; 0 where nothing is proved. To prove this goal is what is tried.
+    /// Lower bound of the relative squared residual over the cell, 0 if nothing is proved. It holds for coefficients
+    /// whose terms sum up to at most `largest` times the norm of the output. The ridge is tuned for `goal`.
     pub(super) fn bound(&self, largest: f64, goal: f64) -> f64 {
         if self.least.is_nan() || self.least <= 0.5 || goal.is_nan() {
             return 0.0;
@@ -85,8 +86,8 @@ impl Span {
         let powers = f64::from(u8::try_from(SPANNED).unwrap_or(u8::MAX));
         let added = (SHARE * goal / (powers * all * all)).clamp(RIDGE, 1.0);
         let coefficients = self.minimum(added);
-        // The least of the form with the ridge is at least its value anywhere less |gradient|²/(4·ridge); so the form of the
-        // columns themselves is asked, which has no negative squares, not the rounded one.
+        // The minimum of the form with the ridge is at least its value anywhere minus |gradient|²/(4·ridge). The bound
+        // uses the exact form of the columns, which is positive semidefinite, not the rounded one.
         let (mut value, mut gradient, mut sum) = (1.0, 0.0, 1.0);
         for i in 0..n {
             let row: f64 = (0..n).map(|j| self.matrix[i][j] * coefficients[j]).sum::<f64>() + added * coefficients[i];
@@ -99,7 +100,7 @@ impl Span {
         let (count, rounded) = (n as f64, self.rounding + 16.0 * f64::EPSILON * n as f64);
         let slope = gradient.sqrt() + 2.0 * rounded * sum * count.sqrt();
         let ridge = value - rounded * sum * sum - slope * slope / (4.0 * added);
-        // Coefficients of the values add up to `all` at most, those of each derivative too.
+        // The coefficients of the values, and those of each derivative, sum up to at most `all`.
         let square = ridge - added * powers * all * all;
         let root = square.max(0.0).sqrt() - all * self.beyond;
         let least = root * root * (1.0 - HAIR);
@@ -110,7 +111,7 @@ impl Span {
         }
     }
 
-    /// Coefficients where the form with the ridge is about least.
+    /// Approximate minimizer of the form with the ridge.
     fn minimum(&self, added: f64) -> [f64; ROWS] {
         let n = self.count;
         let mut factor = self.matrix;

@@ -1,25 +1,24 @@
-//! Proofs that no coefficients whatever bring a candidate's error within reach, for those that are yet to be refined.
+//! Infeasibility proofs: no coefficients reduce a candidate's error to the threshold.
 //!
-//! With d = 1 − Σ c g and S = Σ |c_i| ρ_i, a score of at most L needs |⟨t, w⟩|² ≤ L²(|d|‖t‖ + S)² for every test vector
-//! t ([`crate::order_search::dual_bound::lower_bound`] says why), and
+//! They serve candidates whose coefficients are not refined yet. With d = 1 − Σ c g and S = Σ |c_i| ρ_i, a score of
+//! at most L requires |⟨t, w⟩|² ≤ L²(|d|‖t‖ + S)² for every test vector t, by the dual bound, and
 //!
-//!   (a + S)² ≤ (1+κ)a² + (1+1/κ)S², S² ≤ Σ c_i²ρ_i²/p_i for any κ, p_i > 0 with Σ p_i = 1,
+//!   (a + S)² ≤ (1+κ)a² + (1+1/κ)S², S² ≤ Σ c_i²ρ_i²/p_i for any κ, p_i > 0 with Σ p_i = 1.
 //!
-//! so each condition implies that a quadratic form in (c, 1) is not positive; where a weighted sum of these forms is
-//! positive definite, no coefficients meet them all.
+//! Each condition therefore implies that a quadratic form in (c, 1) is not positive. If a weighted sum of these forms
+//! is positive definite, no coefficients satisfy all conditions.
 
 use crate::linalg::small::packed;
 use crate::order_search::dual_bound::test_vectors::{Probes, Wide, NONE};
 use crate::simd::WIDTH;
 
-/// Steps in which weights of test vectors are sought that exclude a candidate; measured on Plant A's lattice, where three
-/// do on average.
+/// Maximum steps of the search for multipliers of the test vectors. On the grid of Plant A, three suffice on average.
 const SOUGHT: usize = 12;
-/// Share of a diagonal element that rounding may have added to it and its row: a generous multiple of k² ε.
+/// Relative rounding margin of a diagonal element and its row, a generous multiple of k² ε.
 const DEFINITE: f64 = 1e-12;
 
-/// What one unknown contributes to a group of conditions: to ⟨t, w⟩ over the limit and to d‖t‖ (real and imaginary
-/// parts), and ρ.
+/// Contribution of one unknown to a group of conditions. It has a part in ⟨t, w⟩ over the limit, one in d‖t‖ (real and
+/// imaginary parts each), and ρ.
 #[derive(Debug, Clone, Copy)]
 struct Effect {
     error: [Wide; 2],
@@ -29,16 +28,16 @@ struct Effect {
 
 const NO_EFFECT: Effect = Effect { error: [[0.0; WIDTH]; 2], divisor: [[0.0; WIDTH]; 2], slack: [0.0; WIDTH] };
 
-/// One search for such a proof, and its memory.
+/// State of one infeasibility proof, reused between candidates.
 #[derive(Default)]
 pub(crate) struct Reach {
-    /// Unknowns, the constant 1 the last.
+    /// Number of unknowns. The last one is the constant 1.
     unknowns: usize,
     /// Effect of unknown i on group g at g·unknowns + i.
     effects: Vec<Effect>,
     at: Vec<f64>,
     weights: Vec<Wide>,
-    /// Lower rows of the weighted form, of its part from ⟨t, w⟩ alone, and sizes of its diagonal.
+    /// Lower rows of the weighted form, of its part from ⟨t, w⟩ alone, and moduli of its diagonal.
     form: Vec<f64>,
     errors: Vec<f64>,
     sizes: Vec<f64>,
@@ -61,7 +60,7 @@ impl Reach {
         self.unknowns = last + 1;
         self.effects.clear();
         for (r, probes) in probes.iter().enumerate() {
-            // A hair more, for the rounding of the divisor and of the score itself.
+            // Margin for the rounding of the divisor and of the score.
             let scale = 1.0 / (limit * (1.0 + probes.unit));
             for group in 0..probes.groups {
                 let first = self.effects.len();
@@ -126,8 +125,8 @@ impl Reach {
         self.at.push(1.0);
     }
 
-    /// Seeks weights whose form is positive definite: each step goes where the last form was least, and gives more
-    /// weight to the conditions that fail there. Ends where none fails.
+    /// Search multipliers whose quadratic form is positive definite. Each step moves to the minimizer of the last form
+    /// and raises the multipliers of the conditions violated there. Return `false` once no condition is violated.
     #[inline(always)]
     pub(super) fn search(&mut self) -> bool {
         let k = self.unknowns;
@@ -148,7 +147,7 @@ impl Reach {
                     worst = worst.max(q);
                 }
             }
-            // Not even here do the conditions fail.
+            // No condition is violated at this point.
             if worst <= 1.0 || worst.is_infinite() {
                 return false;
             }
@@ -178,7 +177,7 @@ impl Reach {
             if convex < k - 1 && factorise(&self.errors, k, &mut self.factor) < k - 1 {
                 return false;
             }
-            // The least point of the form, its last coordinate 1.
+            // Minimizer of the form, with last coordinate 1.
             self.at[k - 1] = 1.0;
             for i in (0..k - 1).rev() {
                 let mut value = -self.factor[packed(k - 1, i)];
@@ -191,7 +190,7 @@ impl Reach {
         false
     }
 
-    /// Of one group of conditions at the present point: how far beyond what is allowed, |d|‖t‖ and S.
+    /// Violation ratio, |d|‖t‖ and S of one group of conditions at the current point.
     #[inline(always)]
     fn state(&self, group: usize) -> [Wide; 3] {
         let zero = [0.0; WIDTH];
@@ -214,7 +213,7 @@ impl Reach {
         [ratios, size, slack]
     }
 
-    /// The weighted form; its inequalities are tight at the present point.
+    /// Assemble the weighted form. Its inequalities are tight at the current point.
     #[inline(always)]
     fn assemble(&mut self, states: &[[Wide; 3]], smallest: f64) {
         let k = self.unknowns;
@@ -271,8 +270,8 @@ impl Reach {
     }
 }
 
-/// Factors a symmetric matrix by its lower rows into L D Lᵀ, as far as its pivots are positive: how many are. The rows
-/// of L are made up to the first that is not, that row included.
+/// Factor a symmetric matrix, given by lower rows, into L D Lᵀ. Return the number of leading positive pivots. The rows
+/// of L are valid up to and including the first nonpositive pivot.
 #[inline(always)]
 fn factorise(matrix: &[f64], k: usize, factor: &mut Vec<f64>) -> usize {
     factor.clear();
@@ -287,7 +286,7 @@ fn factorise(matrix: &[f64], k: usize, factor: &mut Vec<f64>) -> usize {
             factor[packed(i, j)] = sum / factor[packed(j, j)];
             pivot -= sum * factor[packed(i, j)];
         }
-        // Written so that a pivot that is not a number is none.
+        // This form of the condition rejects a NaN pivot.
         if !(pivot > 0.0 && pivot.is_finite()) {
             return i;
         }

@@ -1,9 +1,9 @@
-//! Test vectors that follow the coefficients: each made for one candidate, corrected for others of the same own orders.
+//! Test vectors linearized in the coefficients: built for one candidate, corrected to first order for others.
 //!
-//! With divisor D₀ and output error e₀ of the candidate that it is made for, t₀ = D₀⁻ᵀ sign(e₀). A candidate of the same
-//! own orders has D = D₀ − Σ x_m G_m, with G_m combinations of its F_i, and one step of Newton's method for D⁻ᵀ sign(e₀)
-//! is t = t₀ + Σ x_m v_m, v_m = D₀⁻ᵀ G_mᵀ t₀. Then Dᵀt = D₀ᵀt₀ − Σ x_m x_n G_nᵀ v_m but for rounding: what is lost is of
-//! second order, and all of it is known from a few numbers that are made once.
+//! For the candidate with divisor D₀ and output error e₀, t₀ = D₀⁻ᵀ sign(e₀). A candidate with the same own orders
+//! has D = D₀ − Σ x_m G_m, where the G_m are combinations of its F_i. One Newton step for D⁻ᵀ sign(e₀) gives t = t₀ +
+//! Σ x_m v_m with v_m = D₀⁻ᵀ G_mᵀ t₀. Then Dᵀt = D₀ᵀt₀ − Σ x_m x_n G_nᵀ v_m up to rounding. The loss is of second
+//! order and is bounded by a few precomputed norms.
 
 use std::collections::BTreeMap;
 
@@ -16,16 +16,16 @@ use crate::regressors::{Bank, Index, Key, Record};
 use crate::series::{divide, reciprocal, Buffers, Kernel, SumOfProducts};
 use crate::simd;
 
-/// Most own terms of a candidate.
+/// Maximum own terms of a candidate.
 pub(crate) const MOST_OWN: usize = 4;
-/// A candidate whose error is this many times the limit has neighbours that are as far beyond it; what is made for it
-/// reaches none of those that are not.
+/// Largest ratio of error to limit for which a vector is built. Candidates near one with a larger error are excluded by
+/// other bounds.
 const BEYOND: f64 = 4.0;
-/// Products of numbers below this do not overflow.
+/// Magnitude below which products stay finite.
 const HUGE: f64 = 1e100;
 
-/// Whether the test vector made for one equation, corrected for another with the same orders of its output, proves that
-/// the other's output error at rest exceeds `limit`: Σ|y − ŷ| or Σ(y − ŷ)².
+/// Whether a linearized test vector proves that an equation's output error exceeds `limit`. The vector is built for
+/// `made_for` and corrected for an equation with the same orders of the output. The error is Σ|y − ŷ| or Σ(y − ŷ)².
 ///
 /// # Errors
 /// Orders or signals that make no equation, coefficients that are not one a term, other orders of the output.
@@ -42,7 +42,8 @@ const HUGE: f64 = 1e100;
 /// let structure = Structure { output: 0, order: 0.8, terms };
 /// let equation = |a: f64, b: f64| Equation { structure: structure.clone(), coefficients: vec![a, b] };
 /// // y is the integral of order 0.8 of u: D^0.8 y = u.
-/// let proved = |limit: f64| excluded_along(&record, &equation(-0.5, 2.0), &equation(-0.4, 2.1), Norm::L1, limit);
+/// let (made_for, other) = (equation(-0.5, 2.0), equation(-0.4, 2.1));
+/// let proved = |limit: f64| excluded_by_linearized_vector(&record, &made_for, &other, Norm::L1, limit);
 /// assert!(proved(1.0)? && !proved(1e3)?);
 /// # Ok::<(), ftlm::error::Error>(())
 /// ```
@@ -79,37 +80,37 @@ pub fn excluded_along(
     Ok(tangents.exclude(&positions[1], &equation.coefficients, limit, &mut Held::default()))
 }
 
-/// One test vector and its corrections, over all records.
+/// Test vector and its first-order corrections, over all records.
 pub(crate) struct Tangent {
-    /// Coefficients of the own terms of the candidate that it was made for.
+    /// Own coefficients of the candidate that the vector is built for.
     centre: Vec<f64>,
     /// F_i = G_i + Σ_{j<i} mix[i·k + j] G_j.
     mix: Vec<f64>,
-    /// Of each v_m: its largest value, and ‖D₀ᵀv_m − G_mᵀt₀‖.
+    /// Largest value of each v_m, and ‖D₀ᵀv_m − G_mᵀt₀‖.
     sizes: Vec<f64>,
     rests: Vec<f64>,
-    /// At least Σ|g_m| of the series of G_m, and of all that it is made of, times the largest norm.
+    /// Upper bound of Σ|g_m| of the series of G_m and of its components, times the largest norm.
     lengths: Vec<f64>,
     /// ‖G_nᵀv_m + G_mᵀv_n‖ for n < m and ‖G_mᵀv_m‖, packed by rows.
     bends: Vec<f64>,
     /// ‖D₀ᵀt₀‖, and (1 + Σ|c|Σ|f|) of D₀, times the largest norm.
     norm: f64,
     around: f64,
-    /// ⟨t₀, ·⟩, ⟨v_m, ·⟩ of the target, the own columns and all driven ones, k + 1 by k + 1 + all.
+    /// ⟨t₀, ·⟩, ⟨v_m, ·⟩ with the target, the own columns and all input columns, k + 1 by k + 1 + all.
     products: Vec<f64>,
 }
 
-/// Those of a search, by the own columns of the candidates that they serve.
+/// Set of linearized test vectors of a search, by the own columns of their candidates.
 pub(crate) struct Tangents {
     losses: Losses,
-    /// Number among the driven columns; [`NONE`] of an own one.
+    /// Index among the input columns, [`NO_INDEX`] for an own column.
     driven: Vec<usize>,
     width: usize,
     of: BTreeMap<Vec<usize>, (usize, usize)>,
     each: Vec<Tangent>,
 }
 
-/// What a thread remembers from one candidate to the next.
+/// Lookup state of one thread, kept from one candidate to the next.
 #[derive(Default)]
 pub(crate) struct Held {
     own: Vec<usize>,
@@ -119,7 +120,7 @@ pub(crate) struct Held {
 }
 
 impl Tangents {
-    /// None yet.
+    /// Return an empty set.
     pub(crate) fn new(banks: &[Bank], targets: &[Vec<f64>], norm: Norm) -> Self {
         let mut driven = Vec::new();
         let mut width = 0;
@@ -132,17 +133,17 @@ impl Tangents {
         Self { losses: Losses::new(banks, targets, norm), driven, width, of: BTreeMap::new(), each: Vec::new() }
     }
 
-    /// Bytes of one for candidates of so many own terms.
+    /// Memory of one vector for candidates with this many own terms [bytes].
     pub(crate) fn bytes(&self, own: usize) -> u64 {
         8 * ((own + 1) * (own + 1 + self.width) + own * (2 * own + 4) + 8) as u64
     }
 
-    /// Those of a candidate's columns that are integrals of the output.
+    /// Columns of a candidate that are integrals of the output.
     pub(crate) fn own(&self, terms: &[usize]) -> Vec<usize> {
         terms.iter().copied().filter(|&p| self.driven[p] == NONE).collect()
     }
 
-    /// Takes what was made for candidates with these own columns.
+    /// Store the vectors built for candidates with these own columns.
     pub(crate) fn add(&mut self, own: Vec<usize>, made: Vec<Tangent>) {
         let from = self.each.len();
         self.each.extend(made);
@@ -153,13 +154,13 @@ impl Tangents {
         self.each.len()
     }
 
-    /// Bytes of all.
+    /// Memory of all vectors [bytes].
     pub(crate) fn held(&self) -> u64 {
         self.of.iter().map(|(own, (from, to))| self.bytes(own.len()) * (to - from) as u64).sum()
     }
 
-    /// The one of the candidate with these columns and coefficients; none where it is far beyond the limit, or where
-    /// something leaves the range of floating point.
+    /// Build the vector of the candidate with these columns and coefficients. `None` if its error far exceeds the
+    /// limit, or on overflow.
     pub(crate) fn fit(
         &self,
         (banks, targets): (&[Bank], &[Vec<f64>]),
@@ -191,11 +192,11 @@ impl Tangents {
                 Norm::L1 => modulus(&error),
                 Norm::L2 => error.iter().map(|e| e * e).sum(),
             };
-            // Written so that what is not a number ends here too.
+            // This form of the condition also rejects NaN.
             if !(raw <= BEYOND * limit && raw < f64::MAX) {
                 return None;
             }
-            // Vectors are kept read backwards, where transposed operators are the operators themselves.
+            // In reversed time, transposed operators become the operators themselves.
             let vector = divide(&backwards(&wanted), &divisor).ok()?;
             parts.push(Part { divisor, vectors: vec![vector], steps: Vec::new(), series: Vec::new() });
         }
@@ -215,7 +216,7 @@ impl Tangents {
                 part.series.push(bank.kernel(p).to_vec());
             }
         }
-        // The steps are made orthogonal, for they are nearly the same and coefficients of opposite sign.
+        // Orthogonalize the terms. They are nearly collinear, with coefficients of opposite sign.
         for i in 0..k {
             for j in 0..i {
                 let inner = |a: usize, b: usize| -> f64 {
@@ -295,7 +296,7 @@ impl Tangents {
         false
     }
 
-    /// Whether this one does, of a candidate with its own columns.
+    /// Whether this vector proves it, for a candidate with the same own columns.
     #[inline(always)]
     pub(crate) fn excludes(&self, made: &Tangent, terms: &[usize], coefficients: &[f64], limit: f64) -> bool {
         let (losses, k) = (&self.losses, made.centre.len());
@@ -310,7 +311,7 @@ impl Tangents {
                 filled += 1;
             }
         }
-        // Along the G_m.
+        // Coordinates with respect to the G_m.
         let mut x = [0.0; MOST_OWN];
         for i in 0..k {
             let off = mine[i] - made.centre[i];
@@ -347,7 +348,7 @@ impl Tangents {
     }
 }
 
-/// What is made on one record, vectors read backwards.
+/// Intermediate vectors on one record, stored in reversed time.
 struct Part {
     divisor: Vec<f64>,
     /// t₀, then the v_m.
@@ -359,7 +360,7 @@ struct Part {
 }
 
 impl Part {
-    /// Makes the v_m, and adds up the norms that a candidate's proof asks for.
+    /// Compute the v_m, and accumulate the norms that the bound needs.
     fn correct(&mut self, made: &mut Sized, buffers: &mut Buffers) {
         let (m, k) = (self.divisor.len(), self.steps.len());
         let (divisor, inverse) = (Kernel::new(&self.divisor), Kernel::new(&reciprocal(&self.divisor)));
@@ -393,7 +394,7 @@ impl Part {
     }
 }
 
-/// Norms over all records: the largest modulus, or sums of squares until they are done.
+/// Norms over all records: the largest modulus, or sums of squares until the root is taken.
 struct Sized {
     of: Norm,
     norm: f64,
@@ -407,7 +408,7 @@ impl Sized {
     }
 
     fn more(&self, so_far: f64, values: &[f64]) -> f64 {
-        // What is not a number must not be lost.
+        // NaN must propagate.
         match self.of {
             Norm::L1 if values.iter().all(|v| v.is_finite()) => so_far.max(largest(values)),
             Norm::L1 => f64::INFINITY,
@@ -424,7 +425,7 @@ impl Sized {
     }
 }
 
-/// Inner products of some vectors with columns, added to what is there, as a kernel: vectors by columns.
+/// Kernel that adds inner products of vectors with columns to `out`, vectors by columns.
 struct Products<'a> {
     vectors: &'a [Vec<f64>],
     columns: &'a [&'a [f64]],

@@ -1,11 +1,12 @@
-//! A lower bound of a candidate's output error from a few inner products, without running the candidate.
+//! Dual lower bound of a candidate's output error from a few inner products.
 //!
-//! With D = 1 − Σ c_i F_i over the own-output terms and w = y − Σ c x the equation error, the output error obeys
-//! D e = w. For any test vector t, ⟨t, w⟩ = ⟨t, D e⟩ = ⟨Dᵀt, e⟩, so by Hölder's inequality
+//! With D = 1 − Σ c_i F_i over the own-output terms and w = y − Σ c x the equation error, the output error obeys D e
+//! = w. For any test vector t, ⟨t, w⟩ = ⟨t, D e⟩ = ⟨Dᵀt, e⟩, so by Hölder's inequality
 //!
 //!   ‖e‖ ≥ |⟨t, w⟩| / ‖Dᵀt‖ in the dual norm, and ‖Dᵀt‖ ≤ |1 − Σ c_i g_i|·‖t‖ + Σ |c_i|·‖F_iᵀt − g_i t‖
 //!
-//! for any numbers g_i. All inner products and norms are made once; a candidate costs about thirty operations a vector.
+//! for any numbers g_i. All inner products and norms are computed once. A candidate then costs about thirty
+//! operations per test vector.
 
 use crate::equation::{Equation, Structure};
 use crate::error::{check_length, Result};
@@ -17,8 +18,8 @@ use crate::parallel::Stop;
 use crate::regressors::{Bank, Index, Key, Record};
 use crate::simd::WIDTH;
 
-/// What each test vector of the pool proves of an equation's output error at rest: lower bounds of Σ|y − ŷ| or
-/// Σ(y − ŷ)².
+/// Lower bound of an equation's output error from each fixed test vector, with zero initial conditions. The error is
+/// Σ|y − ŷ| or Σ(y − ŷ)².
 ///
 /// # Errors
 /// Orders or signals that make no equation, coefficients that are not one a term.
@@ -49,8 +50,8 @@ pub fn lower_bounds(record: &Record, equation: &Equation, norm: Norm) -> Result<
     Ok(each)
 }
 
-/// Whether the pool of test vectors proves that no coefficients of this structure, but for the fixed ones, give an output
-/// error at rest of at most `limit`: Σ|y − ŷ| or Σ(y − ŷ)². The proof is sought from `start`.
+/// Whether no coefficients of this structure give an output error of at most `limit`. The error is Σ|y − ŷ| or Σ(y −
+/// ŷ)² with zero initial conditions. Fixed coefficients keep their values. The proof starts at `start`.
 ///
 /// # Errors
 /// Orders or signals that make no equation, coefficients that are not one a term.
@@ -64,9 +65,9 @@ pub fn lower_bounds(record: &Record, equation: &Equation, norm: Norm) -> Result<
 /// # let output = Record::new(0.1, vec![input.clone()], None)?.integral(0, 0.8);
 /// let record = Record::new(0.1, vec![output, input], None)?;
 /// let structure = Structure { output: 0, order: 0.8, terms: vec![Term { signal: 1, order: 0.0 }] };
-/// // y is the integral of order 0.8 of u: free coefficients reach it, a known one twice as large does not.
-/// assert!(!out_of_reach(&record, &structure, &[None], &[2.0], Norm::L1, 1e-3)?);
-/// assert!(out_of_reach(&record, &structure, &[Some(2.0)], &[2.0], Norm::L1, 1e-3)?);
+/// // y is the integral of order 0.8 of u: free coefficients fit it, a fixed one twice as large does not.
+/// assert!(!is_infeasible(&record, &structure, &[None], &[2.0], Norm::L1, 1e-3)?);
+/// assert!(is_infeasible(&record, &structure, &[Some(2.0)], &[2.0], Norm::L1, 1e-3)?);
 /// # Ok::<(), ftlm::error::Error>(())
 /// ```
 pub fn out_of_reach(
@@ -83,15 +84,15 @@ pub fn out_of_reach(
     Ok(bound.excludes(limit, &positions, fixed, &[], start, &mut Reach::default()))
 }
 
-/// Whether the test vector made for one equation proves that another's output error at rest exceeds `limit`: Σ|y − ŷ| or
-/// Σ(y − ŷ)².
+/// Whether the test vector tailored to one equation proves that another equation's output error exceeds `limit`. The
+/// error is Σ|y − ŷ| or Σ(y − ŷ)² with zero initial conditions.
 ///
 /// # Errors
-/// Orders or signals that make no equation, coefficients that are not one a term.
+/// Orders or signals that do not form an equation, or a number of coefficients unlike the number of terms.
 ///
 /// ```
 /// # use ftlm::equation::{Equation, Structure, Term};
-/// # use ftlm::order_search::dual_bound::lower_bound::excluded_by;
+/// # use ftlm::order_search::{bound::lower_bounds, options::Norm};
 /// # use ftlm::order_search::options::Norm;
 /// # use ftlm::regressors::Record;
 /// # let input: Vec<f64> = (0..64).map(|k| if k % 16 < 8 { 1.0 } else { -1.0 }).collect();
@@ -109,8 +110,8 @@ pub fn excluded_by(record: &Record, made_for: &Equation, equation: &Equation, no
     Ok(excluded_in_turn(record, made_for, std::slice::from_ref(equation), norm, limit)? == [true])
 }
 
-/// [`excluded_by`] of several equations of the same output, one after the other as a search asks them: what the
-/// vector came to for one is remembered for the next.
+/// Apply [`excluded_by`] to several equations of the same output in sequence, as a search does. Norms of the vector are
+/// cached from one equation to the next.
 ///
 /// # Errors
 /// Orders or signals that make no equation, coefficients that are not one a term.
@@ -139,7 +140,7 @@ pub fn excluded_in_turn(
     Ok(asked.map(|(terms, asked)| adapted.exclude(terms, &asked.coefficients, limit, &mut memory)).collect())
 }
 
-/// The whole pool on one record, and the columns of a structure's terms.
+/// Return the bound with all fixed test vectors on one record, and the columns of a structure's terms.
 fn pooled(record: &Record, structure: &Structure, norm: Norm) -> Result<(Bound, Vec<usize>)> {
     structure.check(record.len(), |_| true)?;
     let mut index = Index::default();
@@ -151,20 +152,20 @@ fn pooled(record: &Record, structure: &Structure, norm: Norm) -> Result<(Bound, 
     Ok((Bound::new((&[bank], &[target]), norm, true, POOL, &Stop::default()), positions))
 }
 
-/// The test vectors of a search, on every record.
+/// Dual bound from the fixed test vectors of a search, on every record.
 pub(crate) struct Bound {
     norm: Norm,
     probes: Vec<Probes>,
 }
 
 impl Bound {
-    /// Most test vectors.
+    /// Maximum number of test vectors.
     pub(crate) const POOL: usize = POOL;
 
-    /// Makes `count` test vectors (a multiple of [`WIDTH`], at most [`POOL`]) for these records.
+    /// Build `count` test vectors for these records, a multiple of [`WIDTH`] and at most [`MAX_TEST_VECTORS`].
     ///
-    /// `output_error` tells whether own-output columns act on the divisor; in the equation error D = 1. Runs on the
-    /// current thread pool; what it comes to once it was told to stop is of no use.
+    /// `output_error` selects whether own-output columns enter the divisor. For the equation error D = 1. Runs on the
+    /// current thread pool. The result is unusable after a stop request.
     pub(crate) fn new(
         (banks, targets): (&[Bank], &[Vec<f64>]),
         norm: Norm,
@@ -177,7 +178,7 @@ impl Bound {
         Self { norm, probes }
     }
 
-    /// The test vectors on every record.
+    /// Test vectors on every record.
     pub(crate) fn probes(&self) -> &[Probes] {
         &self.probes
     }
@@ -187,14 +188,14 @@ impl Bound {
         self.probes.first().map_or(0, |p| p.groups * WIDTH)
     }
 
-    /// Only these test vectors (a multiple of [`WIDTH`] of them), in this order.
+    /// Return the bound with these test vectors only, in this order. Their number is a multiple of [`WIDTH`].
     pub(crate) fn chosen(&self, which: &[usize]) -> Self {
         Self { norm: self.norm, probes: self.probes.iter().map(|p| p.chosen(which)).collect() }
     }
 
-    /// Lower bound of the raw score (Σ|e| or Σe²) of a candidate, and a guess at it by which to order visits.
+    /// Lower bound of a candidate's raw score (Σ|e| or Σe²), and an estimate of it that orders the evaluation.
     ///
-    /// `columns(r)` gives positions and coefficients on record r. Ends as soon as the bound exceeds the limit.
+    /// `columns(r)` returns positions and coefficients on record r. The sum stops once the bound exceeds the limit.
     #[inline(always)]
     pub(crate) fn evaluate<'a>(
         &self,
@@ -227,10 +228,10 @@ impl Bound {
         (bound, guess)
     }
 
-    /// Whether no coefficients whatever of these columns give a raw score of at most `limit`.
+    /// Whether no coefficients of these columns give a raw score of at most `limit`.
     ///
-    /// `fixed` are known coefficients of terms; all others, and those of the initial terms, are free. `start` says where
-    /// to begin: coefficients of the terms, then of the initial terms by record.
+    /// The slice `fixed` holds the fixed coefficients of the terms. All others, and those of the initial terms, are
+    /// free. `start` is the initial guess: coefficients of the terms, then of the initial terms by record.
     #[inline(always)]
     pub(crate) fn excludes(
         &self,
@@ -249,7 +250,7 @@ impl Bound {
         scratch.search()
     }
 
-    /// The bound of each test vector alone, summed over records.
+    /// Bound of each test vector separately, summed over records.
     pub(crate) fn each<'a>(
         &self,
         columns: impl Fn(usize) -> (&'a [usize], &'a [f64], &'a [usize], &'a [f64]),

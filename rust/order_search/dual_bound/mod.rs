@@ -1,4 +1,4 @@
-//! What is proved of a candidate's output error from a few inner products with test vectors, without running it.
+//! Lower bounds of a candidate's output error from few inner products with test vectors, without simulation.
 
 pub(crate) mod infeasibility;
 pub(crate) mod linearized_vectors;

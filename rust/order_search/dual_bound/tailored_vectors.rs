@@ -1,10 +1,9 @@
-//! Test vectors made for candidates at hand: t = D⁻ᵀ sign(e), of a candidate with divisor D and output error e.
+//! Test vectors tailored to single candidates, and rounding-error bounds of their products.
 //!
-//! For that candidate ⟨t, w⟩/‖Dᵀt‖ is its score itself; for any other one the bound holds as for every test vector. Dᵀt
-//! is formed in full here, so that neither coefficients that are huge and of opposite sign nor noise that all candidates
-//! share loosen it. Records are one vector after the other: one bound for the error on all of them.
-//!
-//! What rounding may do to inner products with test vectors made for candidates, and to their norms.
+//! A candidate with divisor D and output error e has the vector t = D⁻ᵀ sign(e). For this candidate ⟨t, w⟩/‖Dᵀt‖
+//! equals its score. For any other candidate it is a lower bound, as for every test vector. Dᵀt is computed exactly,
+//! so the bound stays tight for large coefficients of opposite sign and for noise common to all candidates. The
+//! records are concatenated, so one bound covers the error on all of them.
 
 use rayon::prelude::*;
 
@@ -16,78 +15,78 @@ use crate::regressors::Bank;
 use crate::series::{divide, Buffers, Kernel};
 use crate::simd::{self, WIDTH};
 
-/// Values that are summed before a look at the limit.
+/// Samples per block of a norm. The limit is checked after each block.
 const STRETCH: usize = 8 * WIDTH;
-/// Products and sums of numbers below this do not overflow.
+/// Magnitude below which products and sums stay finite.
 const HUGE: f64 = 1e100;
 
-/// Most own terms of candidates of which it is remembered what a vector came to, and how much is remembered.
+/// Maximum own terms of a candidate whose norms are cached, and number of cache entries.
 const PAIR: usize = 2;
 const REMEMBERED: usize = 256;
 
-/// A column's row in [`Fitted::acted`] with a coefficient.
+/// Row of an own column in the transposed products, and its coefficient.
 type Weighted = (usize, f64);
 
-/// One test vector over all records: what it makes of each column.
+/// Test vector over all records and its products with every column.
 pub(crate) struct Fitted {
-    /// The vector, no value larger than 1, filled up with zeros to a multiple of [`STRETCH`].
+    /// Values of the vector, at most 1 in modulus, zero-padded to a multiple of [`NORM_CHECK_SAMPLES`].
     vector: Vec<f64>,
-    /// ⟨t, x⟩ of every column, and of the target.
+    /// ⟨t, x⟩ of every column, and ⟨t, y⟩ of the target.
     products: Vec<f64>,
     target: f64,
     /// Fᵀt of every own column, one after the other, each as long as the vector.
     acted: Vec<f64>,
 }
 
-/// What a vector came to for a candidate: hardly less than for those with the same own columns and nearly its
-/// coefficients.
+/// Norm ‖Dᵀt‖ of one vector for one candidate. Candidates with the same own columns and similar coefficients have
+/// nearly the same norm.
 #[derive(Clone, Copy)]
 struct Near {
     which: usize,
     own: [Weighted; PAIR],
-    /// ‖Dᵀt‖ and what rounding may do to it.
+    /// ‖Dᵀt‖ with its rounding-error bound.
     norm: f64,
-    /// a₂ = share·a₁ + g for the a = Fᵀt of both columns; ‖a₁‖ and ‖g‖, which are not numbers until somebody asks.
+    /// a₂ = share·a₁ + g for the a = Fᵀt of both columns. ‖a₁‖ and ‖g‖ are NaN until first needed.
     share: f64,
     sizes: [f64; PAIR],
-    /// What rounding may do, per unit that a coefficient is off.
+    /// Rounding-error bound per unit change of a coefficient.
     slack: [f64; PAIR],
 }
 
-/// What is remembered from one candidate to the next.
+/// Cache of one thread, kept from one candidate to the next.
 #[derive(Default)]
 pub(crate) struct Memory {
     own: Vec<Weighted>,
-    /// The vector that excluded a candidate last.
+    /// Index of the vector that excluded the previous candidate.
     last: usize,
-    /// What vectors came to, by own columns, if that is to be remembered.
+    /// Norms by own columns. `None` disables the cache.
     near: Option<Vec<Option<Near>>>,
 }
 
 impl Memory {
-    /// For candidates one after the other.
+    /// Return a cache for candidates visited in index order.
     pub(crate) fn of_neighbours() -> Self {
         Self { near: Some(Vec::new()), ..Self::default() }
     }
 }
 
-/// Some of them, and what rounding may do to all.
+/// Test vectors tailored to candidates, and their rounding-error bounds.
 pub(crate) struct Adapted {
     losses: Losses,
-    /// Row of an own column; [`NONE`] of another.
+    /// Row of an own column, [`NO_INDEX`] for any other column.
     rows: Vec<usize>,
     pub(crate) each: Vec<Fitted>,
 }
 
 impl Adapted {
-    /// Bytes of one.
+    /// Memory of one vector [bytes].
     pub(crate) fn bytes(banks: &[Bank]) -> u64 {
         let samples: usize = banks.iter().map(samples).sum();
         let own = banks.first().map_or(0, |bank| own(bank).len());
         8 * (samples.next_multiple_of(STRETCH) as u64 * (own as u64 + 1) + banks.first().map_or(0, Bank::len) as u64)
     }
 
-    /// None yet, for these records.
+    /// Return an empty set for these records.
     pub(crate) fn new(banks: &[Bank], targets: &[Vec<f64>], norm: Norm) -> Self {
         let mut rows = vec![NONE; banks.first().map_or(0, Bank::len)];
         if let Some(bank) = banks.first() {
@@ -96,8 +95,8 @@ impl Adapted {
         Self { losses: Losses::new(banks, targets, norm), rows, each: Vec::new() }
     }
 
-    /// The test vector of the candidate with these columns and coefficients; none where its run or the vector leaves the
-    /// range of floating point. Runs on the current thread pool.
+    /// Build the test vector of the candidate with these columns and coefficients. `None` if its simulation or the
+    /// vector overflows. Runs on the current thread pool.
     pub(crate) fn fit(&self, banks: &[Bank], targets: &[Vec<f64>], terms: &[usize], c: &[f64]) -> Option<Fitted> {
         let backwards = |x: &[f64]| -> Vec<f64> { x.iter().rev().copied().collect() };
         let mut vectors: Vec<Vec<f64>> = Vec::new();
@@ -151,7 +150,8 @@ impl Adapted {
         sound.then_some(Fitted { vector, products, target, acted })
     }
 
-    /// Whether some vector proves that a candidate's raw score exceeds the limit; the one that did so last is asked first.
+    /// Whether some vector proves that a candidate's raw score exceeds the limit. The vector that excluded the previous
+    /// candidate is tried first.
     #[inline(always)]
     pub(crate) fn exclude(&self, terms: &[usize], coefficients: &[f64], limit: f64, memory: &mut Memory) -> bool {
         let limit = self.losses.limit(limit);
@@ -217,7 +217,7 @@ impl Adapted {
         false
     }
 
-    /// At least ‖Dᵀt‖ of a candidate with the same own columns.
+    /// Upper bound of ‖Dᵀt‖ of a candidate with the same own columns.
     #[inline(always)]
     fn at_most(&self, known: &Near, own: &[Weighted; PAIR]) -> f64 {
         let off = [own[0].1 - known.own[0].1, own[1].1 - known.own[1].1];
@@ -227,7 +227,7 @@ impl Adapted {
         (known.norm + along + self.losses.unit * rounding) * (1.0 + self.losses.unit)
     }
 
-    /// What coefficients that are off may do to ‖Dᵀt‖.
+    /// Compute how much ‖Dᵀt‖ changes per unit change of the coefficients.
     #[inline(always)]
     fn spread(&self, known: &mut Near) {
         let fitted = &self.each[known.which];
@@ -238,14 +238,14 @@ impl Adapted {
         };
         let (first, second) = (row(0), row(1));
         let (square, inner) = (simd::dot(first, first), simd::dot(&first[..second.len()], second));
-        // Any number will do.
+        // The bound holds for any share.
         let share = if square > 0.0 && (inner / square).abs() < HUGE { inner / square } else { 0.0 };
         known.share = share;
         known.sizes = [self.size_of(first, first, 0.0), self.size_of(second, first, share)];
         known.slack[1] += share.abs() * known.slack[0];
     }
 
-    /// ‖a − share·b‖ in the dual norm, of rows whose length is a multiple of [`STRETCH`].
+    /// ‖a − share·b‖ in the dual norm, for rows whose length is a multiple of [`NORM_CHECK_SAMPLES`].
     #[inline(always)]
     fn size_of(&self, a: &[f64], b: &[f64], share: f64) -> f64 {
         let mut all = [0.0_f64; WIDTH];
@@ -265,7 +265,7 @@ impl Adapted {
         }
     }
 
-    /// Largest ‖t‖ in the dual norm.
+    /// Largest possible ‖t‖ in the dual norm.
     #[inline(always)]
     #[allow(clippy::cast_precision_loss)]
     fn size(&self) -> f64 {
@@ -275,10 +275,10 @@ impl Adapted {
         }
     }
 
-    /// ‖t − Σ c Fᵀt‖ in the dual norm if it is at most `most`; none where it cannot be told.
+    /// ‖t − Σ c Fᵀt‖ in the dual norm if it is at most `most`. `None` if it is larger or cannot be computed safely.
     #[inline(always)]
     fn within(&self, fitted: &Fitted, own: &[Weighted], most: f64) -> Option<f64> {
-        // What is not a number proves nothing, and nothing overflows below.
+        // A NaN limit proves nothing, and the coefficients below cannot overflow.
         if most.is_nan() || most <= 0.0 || !own.iter().all(|(_, c)| c.abs() < HUGE) {
             return None;
         }
@@ -330,17 +330,17 @@ fn own(bank: &Bank) -> Vec<usize> {
     (0..bank.len()).filter(|&p| !bank.kernel(p).is_empty()).collect()
 }
 
-/// Over all records together.
+/// Rounding-error bounds over all records.
 pub(super) struct Losses {
     pub(super) norm: Norm,
-    /// What rounding may add to |⟨t, w⟩| per unit of a column's coefficient, and for the target, where no |t| exceeds 1.
+    /// Rounding-error bound of |⟨t, w⟩| per unit of a column's coefficient, and for the target, if |t| ≤ 1.
     pub(super) rounding: Vec<f64>,
     pub(super) target_rounding: f64,
-    /// Sum of the moduli of an own column's kernel, times [`Self::size`]; 0 of another.
+    /// Sum of the moduli of an own column's kernel times the largest dual norm, 0 for any other column.
     pub(super) lengths: Vec<f64>,
-    /// Largest dual norm of a vector none of whose values exceeds 1.
+    /// Largest dual norm of a vector whose values are at most 1 in modulus.
     pub(super) size: f64,
-    /// What rounding may add to a sum of as many terms as there are samples, per unit.
+    /// Relative rounding-error bound of a sum over all samples.
     pub(super) unit: f64,
 }
 
@@ -367,7 +367,7 @@ impl Losses {
         Self { norm, rounding, target_rounding, lengths, size, unit }
     }
 
-    /// What a norm must exceed for a raw score to exceed this limit; a hair more, for the rounding of the score itself.
+    /// Norm above which the raw score exceeds this limit, with a margin for the rounding of the score.
     #[inline(always)]
     pub(super) fn limit(&self, raw: f64) -> f64 {
         (1.0 + self.unit)

@@ -1,8 +1,6 @@
-//! Test vectors, and what integrals of the output make of them.
+//! Set of fixed test vectors, and their inner products with the regressors.
 //!
-//! They are complex exponentials under windows that end gently: there F_iᵀt is nearly a multiple of t.
-//!
-//! The test vectors on one record: what each says of a candidate's error there.
+//! The vectors are complex exponentials under windows that end smoothly, for which F_iᵀt is nearly a multiple of t.
 
 use rayon::prelude::*;
 
@@ -16,19 +14,19 @@ use crate::simd::WIDTH;
 /// One value for each of [`WIDTH`] test vectors.
 pub(super) type Wide = [f64; WIDTH];
 
-/// Lowest frequency of a test vector, in cycles a record.
+/// Lowest frequency of a test vector [cycles per record].
 const LOWEST: f64 = 0.3;
 
-/// Spectra of test vectors, and of columns, held at a time, in bytes.
+/// Memory of the spectra of test vectors, and of columns, per batch [bytes].
 const SPECTRA: usize = 64 << 20;
 const COLUMNS: usize = 192 << 20;
 
-/// How a test vector fades; it must not stop dead, which its integrals would all feel.
+/// Window of a test vector. An abrupt end would disturb all its integrals.
 #[derive(Debug, Clone, Copy)]
 enum Window {
-    /// One up to this share of the record, then half a cosine down to zero.
+    /// 1 up to this fraction of the record, then half a cosine down to 0.
     Taper(f64),
-    /// Down to e to the minus this.
+    /// Exponential decay to e^{−rate} at the end of the record.
     Decay(f64),
 }
 
@@ -42,21 +40,21 @@ impl Window {
     }
 }
 
-/// Windows and how many frequencies each gets; measured on Plant A's lattice at three levels of noise, where the late
-/// taper removes most and the decays see the candidates whose error is early.
+/// Windows and their number of frequencies. They were tuned on the grid of Plant A at three noise levels: the late
+/// taper excludes most candidates, the decays exclude those with an early error.
 const WINDOWS: [(Window, usize); 3] = [(Window::Taper(0.5), 24), (Window::Taper(0.0), 12), (Window::Decay(5.0), 12)];
 
-/// Number of test vectors to choose from.
+/// Number of test vectors to select from.
 pub(super) const POOL: usize = 48;
 
-/// A window and how often the vector turns in a record.
+/// Window and number of cycles per record.
 type Shape = (Window, f64);
 
-/// The first `count` test vectors; every window's frequencies span the whole range.
+/// Shapes of the first `count` test vectors. The frequencies of every window span the whole range.
 #[allow(clippy::cast_precision_loss)]
 fn shapes(count: usize, m: usize) -> Vec<Shape> {
     let highest = (m as f64 / 32.0).max(4.0);
-    // Where fewer are asked for, every window gives its share.
+    // For a smaller count, every window contributes proportionally.
     WINDOWS
         .iter()
         .flat_map(|&(window, full)| {
@@ -70,7 +68,7 @@ fn shapes(count: usize, m: usize) -> Vec<Shape> {
         .collect()
 }
 
-/// Writes a test vector's real and imaginary parts.
+/// Write a test vector's real and imaginary parts.
 #[allow(clippy::cast_precision_loss)]
 fn draw((window, cycles): Shape, halves: &mut [Vec<f64>; 2]) {
     let m = halves[0].len();
@@ -83,7 +81,7 @@ fn draw((window, cycles): Shape, halves: &mut [Vec<f64>; 2]) {
     }
 }
 
-/// The first `count` test vectors, real and imaginary parts. What it comes to once it was told to stop is of no use.
+/// The first `count` test vectors, real and imaginary parts. The result is unusable after a stop request.
 pub(super) fn vectors(count: usize, m: usize, stop: &Stop) -> Vec<[Vec<f64>; 2]> {
     shapes(count, m)
         .par_iter()
@@ -97,30 +95,30 @@ pub(super) fn vectors(count: usize, m: usize, stop: &Stop) -> Vec<[Vec<f64>; 2]>
         .collect()
 }
 
-/// A test vector that is held against one own column after another.
+/// Workspace of one test vector that is applied to own columns in sequence.
 struct Vector {
     halves: [Vec<f64>; 2],
-    /// Its number among all.
+    /// Index among all test vectors.
     which: usize,
     size: f64,
-    /// Spectra of its halves read backwards: Fᵀt is F applied to t read backwards, read backwards.
+    /// Spectra of the time-reversed halves. Fᵀt is the time reversal of F applied to the time-reversed t.
     spectra: [Kernel; 2],
-    /// Fᵀt of the last column and of the one before it, backwards.
+    /// Fᵀt of the current column and of the previous one, in reversed time.
     here: [Vec<f64>; 2],
     before: [Vec<f64>; 2],
-    /// g and what rounding may do, of the last column.
+    /// g and rounding-error bound of the current column.
     last: Option<[f64; 3]>,
 }
 
 impl Vector {
-    /// None yet: memory for one of so many samples.
+    /// Return a workspace for this many samples.
     fn none(m: usize) -> Self {
         let none = || [0, 1].map(|_| vec![0.0; m]);
         let spectra = [0, 1].map(|_| Kernel::noughts(m));
         Self { halves: none(), which: 0, size: 0.0, spectra, here: none(), before: none(), last: None }
     }
 
-    /// Turns to the test vector in its halves.
+    /// Load the test vector stored in the halves.
     fn turn(&mut self, which: usize, size: f64, buffers: &mut Buffers) {
         for (spectrum, half) in self.spectra.iter_mut().zip(&self.halves) {
             spectrum.read(half.iter().rev().copied(), buffers);
@@ -128,7 +126,8 @@ impl Vector {
         (self.which, self.size, self.last) = (which, size, None);
     }
 
-    /// Of the next own column, whose moduli add up to `length`, what [`effects`] gives, but the step in place of the way.
+    /// Return the entries of [`divisor_effects`] for the next own column, with the step in place of the path length.
+    /// `length` is the sum of the column's moduli.
     fn on(&mut self, column: &Kernel, length: f64, norm: Norm, unit: f64, buffers: &mut Buffers) -> [f64; 4] {
         std::mem::swap(&mut self.here, &mut self.before);
         for (spectrum, here) in self.spectra.iter().zip(&mut self.here) {
@@ -142,8 +141,8 @@ impl Vector {
     }
 }
 
-/// g·‖t‖, ‖Fᵀt − g t‖, and how far this last vector has come since the first own column, of every own column and test
-/// vector, columns first. What it comes to once it was told to stop is of no use.
+/// g·‖t‖, ‖Fᵀt − g t‖ and path length of Fᵀt − g t since the first own column. One entry for every own column and test
+/// vector, columns first. The result is unusable after a stop request.
 pub(super) fn effects(
     bank: &Bank,
     own: &[usize],
@@ -155,10 +154,10 @@ pub(super) fn effects(
     let (m, count) = (vectors.first().map_or(0, |v| v[0].len()), vectors.len());
     let groups = count / WIDTH;
     let mut out = vec![[[0.0; WIDTH]; 4]; own.len() * groups];
-    // Every thread has a vector of its own; two spectra of as many bins as there are samples.
+    // Each thread needs its own vector, with two spectra of as many bins as samples.
     let threads = rayon::current_num_threads();
     let batch = (SPECTRA / (32 * m.max(1))).max(threads).min(count.max(1));
-    // As many blocks of columns as must be, of one size as nearly as can be.
+    // As few blocks of columns as possible, of nearly equal size.
     let block = own.len().div_ceil(own.len().div_ceil((COLUMNS / (16 * m.max(1))).max(threads)).max(1)).max(1);
     let kernels = |columns: &[usize]| -> Vec<(Kernel, f64)> {
         let kernel = |buffers: &mut Buffers, &column: &usize| {
@@ -167,7 +166,7 @@ pub(super) fn effects(
         };
         columns.par_iter().with_max_len(1).map_init(Buffers::default, kernel).collect()
     };
-    // Of a long record the vectors take more than all else here: drawn again a few at a time they take nothing.
+    // For a long record the vectors need most of the memory, so they are recomputed batch by batch.
     let mut all = Some(vectors).filter(|_| batch == count);
     let shapes = shapes(count, m);
     let mut held: Vec<Vector> = (0..batch).map(|_| Vector::none(m)).collect();
@@ -212,7 +211,7 @@ pub(super) fn effects(
             }
         }
     }
-    // Steps add up to ways.
+    // Accumulate the steps to path lengths.
     for place in groups..out.len() {
         let before = out[place - groups][3];
         out[place][3].iter_mut().zip(before).for_each(|(way, before)| *way += before);
@@ -220,8 +219,8 @@ pub(super) fn effects(
     out
 }
 
-/// g, ‖u − g t‖, what rounding may do to that vector, and its distance from the one before; of u given backwards, and of
-/// the u before it with its g and what rounding may do. g is the projection of u on t, best for the norm of squares.
+/// g, ‖u − g t‖, rounding-error bound and distance from the previous vector. u is given in reversed time, as is the
+/// previous u with its g and bound. g is the projection of u on t, which is optimal for the L2 norm.
 #[allow(clippy::cast_precision_loss)]
 fn effect(
     [a, b]: &[Vec<f64>; 2],
@@ -244,7 +243,7 @@ fn effect(
         p * p + q * q
     };
     let count = (a.len() as f64).sqrt();
-    // Both in one reading: a long record is not in any cache.
+    // One pass for both, since a long record does not fit into any cache.
     let add = |sum: f64, x: f64| match norm {
         Norm::L1 => sum.max(x),
         Norm::L2 => sum + x,
@@ -267,10 +266,10 @@ fn effect(
     [g, h, f64::sqrt(rest) + lost, lost, step]
 }
 
-/// A column without an effect on the divisor.
+/// Index of a column that does not enter the divisor.
 pub(crate) const NONE: usize = usize::MAX;
 
-/// The test vectors on one record: what they make of each column.
+/// Set of fixed test vectors on one record: products with every column and norms.
 pub(crate) struct Probes {
     /// Number of [`Wide`] groups of test vectors.
     pub(crate) groups: usize,
@@ -278,21 +277,21 @@ pub(crate) struct Probes {
     pub(crate) products: Vec<[Wide; 2]>,
     /// ⟨t, y⟩.
     pub(crate) target: Vec<[Wide; 2]>,
-    /// Row of `effects` of a column, [`NONE`] where it is not of the output itself.
+    /// Row of a column in `effects`, [`NO_INDEX`] if it is not an own column.
     pub(crate) rows: Vec<usize>,
-    /// g·‖t‖ (real, imaginary), ‖Fᵀt − g t‖, and the way that Fᵀt − g t has come since the first row: no two rows are
-    /// farther apart than the way between them.
+    /// g·‖t‖ (real, imaginary), ‖Fᵀt − g t‖, and the path length of Fᵀt − g t since the first row. The distance of two
+    /// rows is at most the path length between them.
     pub(crate) effects: Vec<[Wide; 4]>,
     /// ‖t‖ in the dual norm.
     pub(crate) size: Vec<Wide>,
-    /// What rounding may add to |⟨t, w⟩| per unit of a column's coefficient, and for the target.
+    /// Rounding-error bound of |⟨t, w⟩| per unit of a column's coefficient, and for the target.
     pub(crate) rounding: Vec<f64>,
     pub(crate) target_rounding: f64,
-    /// What rounding may add to a sum of m terms, per unit.
+    /// Relative rounding-error bound of a sum of m terms.
     pub(crate) unit: f64,
 }
 
-/// Most own columns that are looked at together.
+/// Maximum own columns whose slack is bounded jointly.
 const TOGETHER: usize = 4;
 
 impl Probes {
@@ -330,7 +329,7 @@ impl Probes {
         };
         let products: Vec<[Wide; 2]> = (0..bank.len()).flat_map(gathered).collect();
 
-        // A generous multiple of what m additions may lose; it covers columns, inner products and the march as well.
+        // Generous multiple of the error of m additions, which also covers columns, inner products and simulation.
         let unit = 16.0 * f64::EPSILON * m as f64;
         let sum = |x: &[f64]| x.iter().map(|v| v.abs()).sum::<f64>();
         let size_of_target = sum(target);
@@ -388,7 +387,7 @@ impl Probes {
         pairs.fold(self.target_rounding, |sum, (&p, c)| sum + c.abs() * self.rounding[p])
     }
 
-    /// Bounds and guesses of one group of test vectors.
+    /// Bounds and score estimates of one group of test vectors.
     #[inline(always)]
     pub(super) fn group(
         &self,
@@ -440,15 +439,15 @@ impl Probes {
         for n in 0..WIDTH {
             let seen = (re[n] * re[n] + im[n] * im[n]).sqrt() - rounding;
             let size = (divisor[n] * divisor[n] + divisor_im[n] * divisor_im[n]).sqrt();
-            // A hair more, for the rounding of the divisor and of the score itself.
+            // Margin for the rounding of the divisor and of the score.
             bounds[n] = seen / ((size + slack[n]) * (1.0 + self.unit));
             guesses[n] = seen / size;
         }
         (bounds, guesses)
     }
 
-    /// At most ‖Σ c (Fᵀt − g t)‖ of own columns by row, whose coefficients may cancel: all of them times what the first
-    /// row has, and all but the first so many times the way to the next.
+    /// Upper bound of ‖Σ c (Fᵀt − g t)‖ for own columns whose coefficients may cancel. The sum of all coefficients
+    /// multiplies the first row. Each partial sum multiplies the path length to the next row.
     #[inline(always)]
     fn together(&self, group: usize, own: &mut [(usize, f64)]) -> Wide {
         for i in 1..own.len() {
@@ -467,7 +466,7 @@ impl Probes {
         let [.., last] = &self.effects[own[own.len() - 1].0 * self.groups + group];
         let mut most = [0.0; WIDTH];
         for n in 0..WIDTH {
-            // What is left of sums loses as much as they are.
+            // Partial sums lose accuracy in proportion to the sum of the moduli.
             most[n] = left.abs() * first[n] + 16.0 * f64::EPSILON * all * (first[n] + last[n]);
         }
         for at in 1..own.len() {

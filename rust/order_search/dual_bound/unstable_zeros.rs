@@ -1,10 +1,10 @@
-//! Zeros of a candidate's divisor that its driven part lacks: a proof, without a run, that its free run explodes.
+//! Unstable zeros of a candidate's divisor: proof, without simulation, that its simulated output diverges.
 //!
-//! The free run obeys D ŷ = N. As polynomials, D(z) ŷ(z) = N(z) + τ(z) where τ holds what the record cuts off; inside the
-//! unit circle that is next to nothing. If ‖e‖ ≤ L then Σ|ŷ| ≤ Σ|y| + L, so on a closed path there |τ| < |N| may be
-//! proved, and by Rouché's theorem D ŷ has as many zeros inside the path as N: at least as many as D. A candidate whose
-//! D has more than its N is therefore beyond the limit. Zeros are counted by how often the values along the path turn
-//! around 0: values at nodes, chords between them, and what the second derivative allows beside these.
+//! The simulated output obeys D ŷ = N. As polynomials, D(z) ŷ(z) = N(z) + τ(z), where τ contains the terms beyond the
+//! record, which are negligible inside the unit circle. If ‖e‖ ≤ L, then Σ|ŷ| ≤ Σ|y| + L, so |τ| < |N| can be proved
+//! on a closed path inside it. By Rouché's theorem D ŷ and N have the same number of zeros inside the path, at least
+//! as many as D. A candidate whose D has more zeros than its N therefore exceeds the limit. The zeros are counted by
+//! the winding number along the path, from values at nodes, chords between them, and bounds of the second derivative.
 
 use rayon::prelude::*;
 
@@ -17,21 +17,23 @@ use crate::parallel::Stop;
 use crate::regressors::{Bank, Index, Key, Record};
 use crate::simd::WIDTH;
 
-/// Decay rates of the paths, per record: a path bounds the half disc of three times its rate to the right of it. Growth
-/// that a record does not show makes no free run large; faster growth than the last is stopped early by any run.
+/// Decay rates of the paths, per record. A path encloses the half disc to the right of its rate, with three times the
+/// rate as radius. Slower growth hardly enlarges the simulated output. Faster growth is stopped early by the simulation
+/// itself.
 const RATES: [f64; 6] = [20.0, 28.0, 14.0, 40.0, 56.0, 80.0];
-/// Radius over rate, and chords on the arc and on the line of one half of a path; the other half mirrors it. The chords
-/// on the line are half as long, for there the powers decay most slowly.
+/// Ratio of radius to rate, and chords on the arc and on the line of one half path. The other half is its mirror image.
+/// Chords on the line are half as long because the powers decay most slowly there.
 const RADIUS: f64 = 3.0;
 const CHORDS: [usize; 2] = [25, 39];
 const SEGMENTS: usize = CHORDS[0] + CHORDS[1];
-/// Nodes of a path in the tables, filled up so that each has a next one in whole lanes.
+/// Nodes of a path in the tables, padded so that each node has a successor in whole lanes.
 const NODES: usize = SEGMENTS + WIDTH;
-/// Samples that are read at a time, and most samples of a record: products with all columns at all nodes take time.
+/// Samples read per block, and maximum samples of a record. Products with all columns at all nodes are expensive.
 const AT_ONCE: usize = 4096;
 const LONGEST: usize = 1 << 14;
 
-/// Whether the zeros of an equation's divisor prove that its output error at rest exceeds `limit`: Σ|y − ŷ| or Σ(y − ŷ)².
+/// Whether zeros of an equation's divisor prove that its output error exceeds `limit`. The error is Σ|y − ŷ| or Σ(y −
+/// ŷ)² with zero initial conditions.
 ///
 /// # Errors
 /// Orders or signals that make no equation, coefficients that are not one a term.
@@ -47,8 +49,8 @@ const LONGEST: usize = 1 << 14;
 /// let terms = vec![Term { signal: 0, order: 0.0 }, Term { signal: 1, order: 0.0 }];
 /// let structure = Structure { output: 0, order: 1.0, terms };
 /// let equation = |c: f64| Equation { structure: structure.clone(), coefficients: vec![c, 1.0] };
-/// assert!(explodes(&record, &equation(1.2), Norm::L1, 100.0)?);
-/// assert!(!explodes(&record, &equation(-1.2), Norm::L1, 100.0)?);
+/// assert!(has_unstable_zeros(&record, &equation(1.2), Norm::L1, 100.0)?);
+/// assert!(!has_unstable_zeros(&record, &equation(-1.2), Norm::L1, 100.0)?);
 /// # Ok::<(), ftlm::error::Error>(())
 /// ```
 pub fn explodes(record: &Record, equation: &Equation, norm: Norm, limit: f64) -> Result<bool> {
@@ -65,18 +67,18 @@ pub fn explodes(record: &Record, equation: &Equation, norm: Norm, limit: f64) ->
     Ok(roots.exclude(&columns, coefficients, limit, &mut 0))
 }
 
-/// What the paths see of every column, on every record.
+/// Values of every column along the paths, on every record.
 pub(crate) struct Roots {
     norm: Norm,
     own: Vec<bool>,
     records: Vec<Seen>,
 }
 
-/// What they see on one record.
+/// Values of every column along the paths, on one record.
 struct Seen {
     paths: usize,
     samples: f64,
-    /// Per column and node: real and imaginary part; and per segment what its second derivative and rounding allow.
+    /// Real and imaginary part per column and node, and per segment a bound from second derivative and rounding.
     values: Vec<[[f64; NODES]; 3]>,
     /// Largest |z^M| of each segment.
     tails: Vec<[f64; SEGMENTS]>,
@@ -84,11 +86,11 @@ struct Seen {
     sums: Vec<f64>,
     /// Σ|y|.
     size: f64,
-    /// What rounding may add to a sum of M terms, per unit.
+    /// Relative rounding-error bound of a sum of M terms.
     unit: f64,
 }
 
-/// Nodes of a half path of this rate, from the real axis along the arc to the line and down it to the real axis.
+/// Nodes of a half path of this rate: from the real axis along the arc, then down the line to the real axis.
 #[allow(clippy::cast_precision_loss)]
 fn nodes(rate: f64) -> Vec<(f64, f64)> {
     let radius = RADIUS * rate;
@@ -102,7 +104,7 @@ fn nodes(rate: f64) -> Vec<(f64, f64)> {
     arc.chain(line).collect()
 }
 
-/// What a path sees of some series, and its largest |z^M| by segment; a stretch of samples at a time.
+/// Values of series along a path, and its largest |z^M| by segment. Samples are read block by block.
 #[allow(clippy::cast_precision_loss)]
 fn path(rate: f64, series: &[&[f64]], moduli: &[&[f64]], unit: f64) -> (Vec<[[f64; NODES]; 3]>, [f64; SEGMENTS]) {
     let nodes = nodes(rate);
@@ -164,15 +166,15 @@ impl Seen {
         let moduli: Vec<Vec<f64>> = series.iter().map(|x| x.iter().map(|v| v.abs()).collect()).collect();
         let moduli: Vec<&[f64]> = moduli.iter().map(Vec::as_slice).collect();
         let sums = series.iter().map(|x| modulus(x)).collect();
-        // Beyond this the powers of a pulse alias.
+        // Above this limit the powers of a pulse alias.
         let rates: Vec<f64> = RATES.into_iter().filter(|rate| RADIUS * rate <= samples).collect();
         let paths: Vec<_> = rates.par_iter().map(|&rate| path(rate, &series, &moduli, unit)).collect();
         let (values, tails): (Vec<_>, Vec<_>) = paths.into_iter().unzip();
         Self { paths: tails.len(), samples, values: values.concat(), tails, sums, size: modulus(target), unit }
     }
 
-    /// How often D, or N, turns around 0 along a path, which is how many zeros it has inside; none where it may pass
-    /// through 0, or N through what is left out of it.
+    /// Number of zeros of D, or of N, inside a path, from the winding number of the values along it. `None` if the
+    /// values may pass through 0, or N through its truncation bound.
     #[inline(always)]
     fn zeros(
         &self,
@@ -202,9 +204,10 @@ impl Seen {
                 let (a, b, c, d) = (re[j + n], im[j + n], re[j + n + 1], im[j + n + 1]);
                 let middle = ((a + c) * (a + c) + (b + d) * (b + d)).sqrt();
                 let half = ((c - a) * (c - a) + (d - b) * (d - b)).sqrt();
-                // What is not a number is near.
+                // NaN counts as near.
                 near[n] |= !(middle - half > 2.0 * slack[j + n] && middle < f64::MAX);
-                // Where a half path crosses the imaginary axis the whole one makes a turn, its mirror image the other half.
+                // A half path that crosses the imaginary axis contributes one turn, because its mirror image adds the
+                // other half.
                 let crossed = i32::from((a < 0.0) != (c < 0.0));
                 turns[n] += crossed * if a * d > b * c { 1 } else { -1 };
             }
@@ -214,12 +217,12 @@ impl Seen {
 }
 
 impl Roots {
-    /// Whether records are short enough.
+    /// Whether all records are short enough for the tables.
     pub(crate) fn pay(targets: &[Vec<f64>]) -> bool {
         targets.iter().all(|target| target.len() <= LONGEST)
     }
 
-    /// Bytes of them on these banks.
+    /// Memory of the tables for these banks [bytes].
     pub(crate) fn bytes(banks: &[Bank]) -> u64 {
         banks.iter().map(|bank| (bank.len() * RATES.len() * size_of::<[[f64; NODES]; 3]>()) as u64).sum()
     }
@@ -231,7 +234,8 @@ impl Roots {
         Self { norm, own, records }
     }
 
-    /// Whether some path proves that a candidate's raw score exceeds the limit; the one that did so last is asked first.
+    /// Whether some path proves that a candidate's raw score exceeds the limit. The path that excluded the previous
+    /// candidate is tried first.
     #[inline(always)]
     pub(crate) fn exclude(&self, terms: &[usize], coefficients: &[f64], limit: f64, last: &mut usize) -> bool {
         for seen in &self.records {

@@ -1,7 +1,7 @@
-//! The search of a stage: what its equations share, and the course that it takes.
+//! Best-first evaluation of a coupled search.
 //!
-//! Each equation's distinct orders are evaluated once. Table entries start as lower bounds (left early) and are
-//! sharpened until every tuple that could be kept is exact, so the result is that of enumeration, ties by index.
+//! The distinct orders of each equation are evaluated once. Table entries start as lower bounds (early stop) and are
+//! refined until every tuple that may enter the table is exact. The result equals that of enumeration, ties by index.
 
 use std::borrow::Cow;
 use std::sync::atomic::Ordering;
@@ -21,12 +21,12 @@ use crate::order_search::stage_join::join::{spans, Candidates, Class, Entries, E
 use crate::parallel::{pool, PerThread};
 use crate::regressors::Record;
 
-/// An equation's candidates are first followed up to this multiple of its best score.
+/// Ratio to the best score up to which an equation's candidates are evaluated first.
 const FIRST_LIMIT: f64 = 4.0;
-/// Candidates of one equation evaluated between two looks at its best score, at first: a later look tells less.
+/// Minimum candidates of one equation between two updates of its best score.
 const ROUND: usize = 4096;
 
-/// One kept tuple of free orders.
+/// Row of the result table: one tuple of free orders.
 #[derive(Debug, Clone, PartialEq)]
 pub struct StageRow {
     /// Index in the product of the axes.
@@ -37,28 +37,28 @@ pub struct StageRow {
     pub score: f64,
     /// The structure of each equation.
     pub structures: Vec<Structure>,
-    /// The row of each equation (its index is not used).
+    /// Row of each equation (its index is not used).
     pub rows: Vec<Row>,
 }
 
-/// The result of a search over a stage.
+/// Result of a search over coupled equations.
 #[derive(Debug, Clone, PartialEq)]
 pub struct StageOutcome {
-    /// Kept rows, best first, ties by index.
+    /// Best rows in ascending order of the score, ties by index.
     pub rows: Vec<StageRow>,
-    /// What became of the tuples.
+    /// Number of tuples by outcome.
     pub counts: Counts,
-    /// The first tuples without a score by index, at most 100.
+    /// First tuples without a score by index, at most 100.
     pub failures: Vec<(u64, Failure)>,
-    /// Distinct candidates of each equation.
+    /// Number of distinct candidates of each equation.
     pub distinct: Vec<u64>,
 }
 
-/// What the candidates of one equation share.
+/// Candidates of one equation and their shared data.
 struct Table {
     problem: Problem,
     candidates: Candidates,
-    /// Those that some tuple needs.
+    /// Candidates that occur in some tuple.
     used: Vec<usize>,
     scale: f64,
 }
@@ -75,7 +75,7 @@ impl Table {
     }
 }
 
-/// A stage made ready: what the candidates of its equations share.
+/// Stage of coupled equations, prepared for a search, with the data shared by their candidates.
 pub struct Stage<'a> {
     lattice: Cow<'a, LawLattice>,
     options: Options,
@@ -83,27 +83,27 @@ pub struct Stage<'a> {
     samples: f64,
 }
 
-/// How far the search of a stage is: what is known of every candidate, and which are to be followed next.
+/// State of a coupled search: scores of every candidate, and the candidates to evaluate next.
 ///
-/// What comes next depends on nothing but what the candidates before came to, so these may be followed anywhere, in any
-/// order, and a search goes on from their verdicts.
+/// The next candidates depend only on the verdicts of earlier ones. They may therefore be evaluated anywhere and in any
+/// order.
 pub struct Course {
     join: Join,
     known: Entries,
-    /// In the first pass: the equation, how many of its candidates are done or wanted, its best score so far.
+    /// First pass: current equation, number of its candidates already requested, its best score so far.
     pass: (usize, usize, f64),
     raise: f64,
     wanted: Vec<Span>,
     total: u64,
-    /// The best exact tuples, once the first pass is over.
+    /// Best exact tuples, after the first pass.
     kept: Vec<(f64, u64)>,
 }
 
 impl<'a> Stage<'a> {
-    /// Lays out the join and builds what every equation's candidates share.
+    /// Build the join and the data shared by every equation's candidates.
     ///
-    /// `fixed[e]` gives known coefficients of equation e, `scales[e]` what its score is divided by (say σ(y)·M for norm
-    /// L1), so that radians of hub and of deflection weigh alike.
+    /// The entry `fixed[e]` holds the fixed coefficients of equation e, and `scales[e]` divides its score. An example
+    /// for norm L1 is σ(y)·M. Joint angles and link deflections then have equal weight.
     ///
     /// # Errors
     /// As [`crate::order_search::batches::search`]; [`Error::EmptyLattice`] where no tuple obeys the law,
@@ -179,26 +179,26 @@ impl<'a> Stage<'a> {
         Ok((stage, course))
     }
 
-    /// The raw sum up to which a candidate is followed for a scaled score.
+    /// Raw sum up to which a candidate is evaluated for a scaled score.
     fn raw(&self, equation: usize, score: f64) -> f64 {
         let scaled = score * self.tables[equation].scale;
         let raw = match self.options.norm {
             Norm::L1 => scaled,
             Norm::L2 => scaled * scaled * self.samples,
         };
-        // A hair above, so that a tie in the scaled sum is followed to its end.
+        // Margin, so that a tie in the scaled sum is evaluated completely.
         raw * (1.0 + 1e-12)
     }
 
-    /// Follows these candidates: what each came to, in raw sums.
+    /// Evaluate these candidates. Return their verdicts in raw sums.
     ///
     /// # Errors
-    /// Candidates that this stage has not, or [`Error::Interrupted`].
+    /// Candidates that are not part of this stage, or [`Error::Interrupted`].
     pub fn evaluate(&self, spans: &[Span], pool: &rayon::ThreadPool, control: &Control) -> Result<Vec<Verdict>> {
         let mut wanted = Vec::new();
         for &Span { equation, first, last, limit } in spans {
             let used = self.tables.get(equation).map_or(&[][..], |table| &table.used);
-            // Candidates that no tuple needs have no regressors.
+            // Candidates that occur in no tuple have no regressors.
             let known =
                 first < last && last - first <= used.len() && (first..last).all(|id| used.binary_search(&id).is_ok());
             if !known || limit.is_nan() {
@@ -228,10 +228,10 @@ impl<'a> Stage<'a> {
         Ok(verdicts)
     }
 
-    /// The result of a search that has nothing left to follow.
+    /// Result of a completed search.
     ///
     /// # Errors
-    /// A search that has something left, or an internal fault.
+    /// Candidates that are not evaluated yet, or an internal fault.
     pub fn outcome(&self, course: &Course, control: &Control) -> Result<StageOutcome> {
         if !course.wanted.is_empty() {
             let what = "a search that has candidates left to follow has no result".into();
@@ -260,7 +260,7 @@ impl<'a> Stage<'a> {
         Ok(StageOutcome { rows, counts, failures, distinct })
     }
 
-    /// Its lattice.
+    /// Order grid of the stage.
     #[must_use]
     pub fn lattice(&self) -> &LawLattice {
         &self.lattice
@@ -268,25 +268,25 @@ impl<'a> Stage<'a> {
 }
 
 impl Course {
-    /// Candidates to follow next; none at the end.
+    /// Candidates to evaluate next. Empty at the end.
     #[must_use]
     pub fn wanted(&self) -> &[Span] {
         &self.wanted
     }
 
-    /// Candidates to follow in all, as far as is known: one that was left early may have to be followed further.
+    /// Number of candidates to evaluate in total, as far as known. A candidate stopped early may be evaluated again.
     #[must_use]
     pub fn total(&self) -> u64 {
         self.total
     }
 
-    /// Best score of a tuple, once there is one.
+    /// Best score of a tuple, if there is one.
     #[must_use]
     pub fn best(&self) -> Option<f64> {
         self.kept.first().map(|kept| kept.0)
     }
 
-    /// Refuses to go on with another stage.
+    /// Raise an error if the state belongs to another stage.
     fn check(&self, stage: &Stage<'_>) -> Result<()> {
         let candidates = stage.tables.iter().map(|table| table.candidates.len());
         if candidates.eq(self.known.iter().map(Vec::len)) {
@@ -300,10 +300,10 @@ impl Course {
         std::array::from_fn(|h| self.join.halves[h].states(&self.known))
     }
 
-    /// Takes in what the wanted candidates came to, in their order, and finds those to follow next.
+    /// Record the verdicts of the pending candidates, in their order, and select the next ones.
     ///
     /// # Errors
-    /// Verdicts that are not theirs, or [`Error::Interrupted`].
+    /// Verdicts that do not match, or [`Error::Interrupted`].
     pub fn take(
         &mut self,
         stage: &Stage<'_>,
@@ -336,7 +336,7 @@ impl Course {
 
     fn next(&mut self, stage: &Stage<'_>, pool: &rayon::ThreadPool, control: &Control) -> Result<()> {
         control.total.store(self.total, Ordering::Relaxed);
-        // First pass: each equation's own best, the others left at a few times it.
+        // First pass: find each equation's best score. Evaluations stop at a multiple of it.
         while let Some(Table { used, .. }) = stage.tables.get(self.pass.0) {
             let (equation, start, best) = self.pass;
             if start < used.len() {
@@ -360,7 +360,7 @@ impl Course {
     }
 }
 
-/// Searches the free orders of a stage: the sum over equations of score / scale is smallest.
+/// Search the free orders that minimize the sum of score / scale over the equations.
 ///
 /// # Errors
 /// As [`Stage::new`].
@@ -370,7 +370,7 @@ impl Course {
 /// # use ftlm::order_search::options::Options;
 /// # use ftlm::order_search::stage_join::best_first::search;
 /// # use ftlm::equation::AffineOrder;
-/// # use ftlm::order_search::grid::{LawEquation, LawLattice};
+/// # use ftlm::order_search::grid::{LawEquation, OrderLawGrid};
 /// let law = |constant: f64| AffineOrder { constant, weights: vec![1.0] };
 /// let equation = LawEquation { output: 0, order: law(0.0), terms: vec![(1, law(-1.0))] };
 /// # use ftlm::regressors::Record;
@@ -381,7 +381,7 @@ impl Course {
 /// # let output = Record::new(0.1, vec![input.clone()], None)?.integral(0, 1.0);
 /// // D^α y = D^{α−1} u for any α: y is the integral of u.
 /// let record = Record::new(0.1, vec![output, input], None)?;
-/// let lattice = LawLattice::new(&[vec![1.0, 1.5]], &[equation], &[false, true])?;
+/// let lattice = OrderLawGrid::new(&[vec![1.0, 1.5]], &[equation], &[false, true])?;
 /// let fixed = [vec![None]];
 /// let found = search(&[record], &lattice, &fixed, &[1.0], &Options::default(), &Control::default())?;
 /// assert_eq!(found.counts.candidates, 2);

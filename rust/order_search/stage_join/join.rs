@@ -1,17 +1,11 @@
-//! The layout of a join: which orders of the equations fit together under the law.
+//! Layout of a join: compatible orders of the equations under the order law, with their scores and bounds.
 //!
-//! The law ties the equations' orders to a few free ones, so many tuples of free orders share an equation's orders.
-//! The free orders are split between the first equation and the others: x = (a, b). An equation's orders are then what
-//! its own half of x gives plus what the other half adds, and that addend takes few distinct values: (a, addend from b)
-//! and (b, addend from a) fit together exactly where each names the other's addend. Rows of both halves meet in the
-//! bucket of the two addends; within a bucket every pair is a tuple, and every tuple is one pair of one bucket. The
-//! product of the axes is never gone through.
-//!
-//! What is known of the candidates of each equation: a score, or a bound below it.
-//!
-//! The distinct orders that an order law gives one equation: the candidates of a stage, by number.
-//!
-//! What free orders add to the order laws of some equations: the addends by which the halves of a join meet.
+//! The law ties the equations' orders to a few free orders, so many tuples of free orders share an equation's orders.
+//! The free orders are divided between the first equation and the others: x = (a, b). An equation's orders are the
+//! contribution of its own half of x plus an addend from the other half, which takes few distinct values. (a, addend
+//! from b) and (b, addend from a) are compatible exactly if each names the other's addend. Rows of both halves meet
+//! in the bucket of the two addends. Every pair within a bucket is a tuple, and every tuple is one pair of one
+//! bucket. The product of the axes is never enumerated.
 
 use std::collections::hash_map::Entry as Slot;
 use std::collections::HashMap;
@@ -25,27 +19,27 @@ use crate::order_search::control::Control;
 use crate::order_search::grid::order_law::{LawEquation, LawLattice};
 use crate::order_search::result::Failure;
 
-/// A row of one half of the join: a choice of its own free orders, and the addend of the other half's.
+/// Row of one half of the join: values of its own free orders, and the addend of the other half.
 #[derive(Debug, Clone, Copy)]
 pub(super) struct Part {
-    /// The two addends by which it meets rows of the other half.
+    /// Bucket number, from the two addends that the row shares with rows of the other half.
     bucket: u64,
-    /// What its own free orders contribute to the index of a tuple.
+    /// Contribution of its own free orders to the index of a tuple.
     pub(super) index: u64,
-    /// Which candidates of its equations it names.
+    /// Number of the combination of candidates of its equations.
     pub(super) combination: u32,
 }
 
 /// One half of the join.
 pub(super) struct Half {
     pub(super) equations: Range<usize>,
-    /// Candidates of each equation, combination after combination.
+    /// Candidates of each equation, combination by combination.
     combinations: Vec<u32>,
     pub(super) parts: Vec<Part>,
 }
 
 impl Half {
-    /// Sum and class of every combination.
+    /// Sum of scores and class of every combination.
     pub(super) fn states(&self, known: &Entries) -> Vec<Entry> {
         let width = self.equations.len();
         if width == 0 {
@@ -69,25 +63,25 @@ impl Half {
     }
 }
 
-/// Rows of both halves that fit together, each with each.
+/// Rows of both halves that are compatible, each with each.
 pub(super) struct Bucket {
     pub(super) rows: [Range<usize>; 2],
 }
 
-/// The layout of a join.
+/// Layout of a join.
 pub(super) struct Join {
     pub(super) halves: [Half; 2],
     pub(super) buckets: Vec<Bucket>,
 }
 
-/// Most rows of both halves: they take a GB.
+/// Maximum rows of both halves, about 1 GB.
 const MAX_PARTS: u128 = 40_000_000;
-/// Memory of a row, and as much again while their list grows.
+/// Memory per row, doubled while the list grows [bytes].
 const ROW: u128 = 2 * size_of::<Part>() as u128;
-/// Free orders whose place in either half is tried; more go to the second.
+/// Maximum free orders assigned to either half by trial. Further ones belong to the second half.
 const PLACED: usize = 10;
 
-/// The free orders that go to the first half: those that leave the fewest rows.
+/// Select the free orders of the first half such that the number of rows is smallest.
 fn split(lattice: &LawLattice, rows: &[Sums; 2], memory: u64, control: &Control) -> Result<Vec<usize>> {
     let axes: Vec<usize> = (0..lattice.axes().len()).collect();
     let size = |axes: &[usize]| axes.iter().map(|&a| lattice.axes()[a].len() as u128).product::<u128>();
@@ -126,8 +120,8 @@ fn split(lattice: &LawLattice, rows: &[Sums; 2], memory: u64, control: &Control)
 }
 
 impl Join {
-    /// Lays out the join and the distinct candidates of every equation; marks those that some tuple needs. Refuses rows of
-    /// more than so many bytes.
+    /// Build the join and the distinct candidates of every equation, and mark the candidates that occur in some tuple.
+    /// Raises an error for rows beyond this memory [bytes].
     pub(super) fn new(
         lattice: &LawLattice,
         candidates: &mut [Candidates],
@@ -195,7 +189,7 @@ impl Join {
         Ok((join, used))
     }
 
-    /// Finds the buckets that hold rows of both halves.
+    /// Find the buckets with rows of both halves.
     fn meet(&mut self, control: &Control) -> Result<()> {
         let [a, b] = [&self.halves[0].parts, &self.halves[1].parts];
         let end = |parts: &[Part], start: usize| {
@@ -222,7 +216,7 @@ impl Join {
         Ok(())
     }
 
-    /// Memory of its rows.
+    /// Memory of the rows [bytes].
     pub(super) fn bytes(&self) -> u128 {
         self.halves.iter().map(|half| (half.parts.capacity() * size_of::<Part>()) as u128).sum()
     }
@@ -233,7 +227,7 @@ impl Join {
     }
 }
 
-/// The combination of candidates with these orders, equation after equation, added at the end if new.
+/// Number of the combination of candidates with these orders, appended if it is new.
 fn combination(
     lattice: &LawLattice,
     candidates: &mut [Candidates],
@@ -253,7 +247,7 @@ fn combination(
     match known.entry(ids.as_slice().into()) {
         Slot::Occupied(slot) => Ok(*slot.get()),
         Slot::Vacant(slot) => {
-            // Every equation adds its candidates in the order of combinations where it is alone.
+            // Without free orders of their own, equations add candidates in the order of combinations.
             let next = number(if ids.is_empty() { 0 } else { half.combinations.len() / ids.len() })?;
             half.combinations.extend_from_slice(ids);
             Ok(*slot.insert(next))
@@ -261,20 +255,20 @@ fn combination(
     }
 }
 
-/// What is known of one equation's candidate: its scaled score, or a bound below it.
+/// Score of one equation's candidate divided by its scale, or a lower bound of it.
 #[derive(Debug, Clone, Copy)]
 pub(super) struct Entry {
     pub(super) value: f64,
     pub(super) class: Class,
 }
 
-/// What became of a candidate, or of several together: the first failure, else the largest.
+/// Class of an entry, or of several combined: the first failure, else the largest class.
 #[derive(Debug, Clone, Copy, PartialEq, Eq, PartialOrd, Ord)]
 pub(super) enum Class {
     Exact,
-    /// A bound without a run is all that is known.
+    /// Only a lower bound without simulation exists.
     Bounded,
-    /// Left at a partial sum, or not looked at.
+    /// Early stop at a partial sum, or no evaluation yet.
     Open,
     Failed(Failure),
 }
@@ -293,26 +287,26 @@ impl Class {
     }
 }
 
-/// Of a candidate that was not looked at.
+/// Entry of a candidate that has not been evaluated.
 pub(super) const OPEN: Entry = Entry { value: 0.0, class: Class::Open };
 
-/// What is known of every candidate of every equation.
+/// Entries of every candidate of every equation.
 pub(super) type Entries = Vec<Vec<Entry>>;
 
-/// Candidates `first … last − 1` of one equation, to be followed up to one limit of its scaled score.
+/// Candidates `first … last − 1` of one equation, to be evaluated up to one limit of the scaled score.
 #[derive(Debug, Clone, Copy, PartialEq)]
 pub struct Span {
-    /// Equation.
+    /// Number of the equation.
     pub equation: usize,
-    /// See above.
+    /// First candidate.
     pub first: usize,
-    /// See above.
+    /// Candidate after the last one.
     pub last: usize,
-    /// See above.
+    /// Limit of the scaled score.
     pub limit: f64,
 }
 
-/// Candidates of an equation with the limit of each, in stretches that share one.
+/// Group the candidates of an equation into spans with the same limit.
 pub(super) fn spans(equation: usize, wanted: impl Iterator<Item = (usize, f64)>) -> Vec<Span> {
     let mut spans: Vec<Span> = Vec::new();
     for (id, limit) in wanted {
@@ -343,7 +337,7 @@ impl Candidates {
         self.ids.len()
     }
 
-    /// Number of the candidate with these orders, added at the end if new.
+    /// Number of the candidate with these orders, appended if it is new.
     pub(super) fn id(&mut self, orders: &[f64], key: &mut Vec<i64>) -> Result<u32> {
         key.clear();
         key.extend(orders.iter().map(|&v| grains(v)));
@@ -364,15 +358,15 @@ impl Candidates {
     }
 }
 
-/// A count as a number of 32 bits, which is what tables hold.
+/// A count as a 32-bit number, the type of the tables.
 pub(super) fn number(count: usize) -> Result<u32> {
     u32::try_from(count).map_err(|_| Error::Internal { what: "more than 2^32 distinct orders".into() })
 }
 
-/// Rows of a layout between two looks at whether it is to stop.
+/// Rows of a layout between two checks for a stop request.
 pub(super) const LOOK: usize = 4096;
 
-/// Vectors of sums, each once.
+/// Distinct vectors of sums.
 #[derive(Debug)]
 pub(super) struct Distinct {
     width: usize,
@@ -382,11 +376,11 @@ pub(super) struct Distinct {
 }
 
 impl Drop for Distinct {
-    /// Millions of keys take longer to give back than Ctrl-C may take, so nobody waits for it.
+    /// Deallocate millions of keys in the background, since this would delay a response to Ctrl-C.
     fn drop(&mut self) {
         if self.count > 8 * LOOK {
             let ids = std::mem::take(&mut self.ids);
-            // Where no thread can be had they are given back here.
+            // If no thread can be started, the keys are deallocated here.
             drop(std::thread::Builder::new().spawn(move || drop(ids)));
         }
     }
@@ -397,7 +391,8 @@ impl Distinct {
         Self { width, count: 0, values: Vec::new(), ids: HashMap::new() }
     }
 
-    /// Sums are of multiples of the grain by short weights: a thousandth of it tells them apart and forgives rounding.
+    /// Key of a vector of sums, in units of a thousandth of the order resolution. This absorbs the rounding of the
+    /// sums.
     #[allow(clippy::cast_possible_truncation)]
     fn key(sums: &[f64]) -> Box<[i64]> {
         sums.iter().map(|v| (v * 1e12).round() as i64).collect()
@@ -426,7 +421,7 @@ impl Distinct {
     }
 }
 
-/// The order laws of some equations of a stage, whose free orders come in two parts.
+/// Order laws of some equations of a stage, with the free orders divided into two sets.
 pub(super) struct Sums {
     equations: Range<usize>,
     constants: Vec<f64>,
@@ -444,7 +439,7 @@ impl Sums {
         Self { constants, weights, equations }
     }
 
-    /// What these free orders add to the laws: distinct sums, or none where there are more than the limit.
+    /// Distinct contributions of these free orders to the laws. `None` if there are more than the limit.
     ///
     /// # Errors
     /// [`crate::error::Error::Interrupted`].
@@ -477,11 +472,11 @@ impl Sums {
         Ok(Some(found))
     }
 
-    /// Calls `take` for every choice of these free orders with its part of a tuple's index, its sums in these laws
-    /// (constants included) and its sums in the others (without).
+    /// Call `take` for every choice of these free orders. Its arguments are the contribution to a tuple's index, the
+    /// sums in these laws (constants included) and the sums in the other laws (without).
     ///
     /// # Errors
-    /// The first of `take`.
+    /// The first error of `take`.
     pub(super) fn each(
         &self,
         lattice: &LawLattice,
@@ -514,7 +509,7 @@ impl Sums {
         }
     }
 
-    /// The orders of these equations from own sums and an addend; tells whether they make equations.
+    /// Compute the orders of these equations from their own sums and an addend. Return whether they form equations.
     pub(super) fn orders(&self, lattice: &LawLattice, sums: &[f64], addend: &[f64], orders: &mut Vec<f64>) -> bool {
         orders.clear();
         orders.extend(sums.iter().zip(addend).map(|(s, a)| tidy(s + a)));

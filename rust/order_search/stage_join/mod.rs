@@ -1,4 +1,4 @@
-//! Order search over all equations of a stage under its order law, by joining the equations' score tables on the law.
+//! Order search over coupled equations, by joining the score tables of the equations on their order law.
 
 mod best_first;
 mod join;

@@ -1,5 +1,6 @@
-//! Tuples of a join: the best of the best buckets, those that are yet to be resolved, and what became of all, counted
-//! bucket by bucket.
+//! Tuples of a join: the best ones, the unresolved ones, and the counts by outcome.
+//!
+//! They are found bucket by bucket.
 
 use rayon::prelude::*;
 
@@ -8,7 +9,7 @@ use crate::order_search::control::Control;
 use crate::order_search::result::{Counts, Failure, LISTED};
 use crate::order_search::stage_join::join::{spans, Bucket, Class, Entries, Entry, Join, Part, Span};
 
-/// Sums of scores are compared with this much room: their terms may have been added in another order.
+/// Relative tolerance of sums of scores, whose terms may have been added in another order.
 const ROUNDING: f64 = 1e-12;
 
 impl Join {
@@ -25,7 +26,7 @@ impl Join {
         least.iter().all(|v| v.is_finite()).then_some(least)
     }
 
-    /// Score of a tuple: its equations' in their order, as enumeration adds them.
+    /// Score of a tuple, added over the equations in the order of an enumeration.
     fn score(&self, known: &Entries, pair: [u32; 2]) -> f64 {
         let halves = self.halves.iter().zip(pair);
         halves
@@ -34,7 +35,7 @@ impl Join {
             .sum()
     }
 
-    /// The best exact tuples, best first, ties by index.
+    /// Best exact tuples in ascending order of the score, ties by index.
     pub(super) fn best(
         &self,
         states: &[Vec<Entry>; 2],
@@ -103,7 +104,7 @@ impl Join {
         Ok(kept)
     }
 
-    /// Inexact entries that could still be part of a kept tuple, with the score up to which to follow each.
+    /// Inexact entries that may still belong to a row of the table, with the score up to which to evaluate each.
     pub(super) fn unresolved(
         &self,
         states: &[Vec<Entry>; 2],
@@ -115,7 +116,7 @@ impl Join {
         let mut limits: Vec<Vec<f64>> = known.iter().map(|k| vec![f64::NEG_INFINITY; k.len()]).collect();
         for bucket in &self.buckets {
             control.check_stop()?;
-            // Not finite where all of one half have failed.
+            // `None` if all candidates of one half have failed.
             let Some(least) = self.least(bucket, states, |class| !class.failed()) else { continue };
             if least[0] + least[1] > worst * (1.0 + ROUNDING) {
                 continue;
@@ -132,13 +133,13 @@ impl Join {
                         if entry.class == Class::Exact {
                             continue;
                         }
-                        // Without a full table any tuple may enter: follow this one a few times further than before.
+                        // Without a full table any tuple may enter, so the limit is raised by a factor.
                         let limit = if worst.is_finite() {
                             worst - least[1 - h] - (state.value - entry.value)
                         } else {
                             raise * entry.value
                         };
-                        // Where rounding leaves no room between bound and worst, only its end tells more.
+                        // If rounding leaves no gap between bound and worst score, only a complete evaluation decides.
                         let limit = if limit > entry.value { limit } else { f64::INFINITY };
                         let old = &mut limits[e][id as usize];
                         *old = old.max(limit);
@@ -153,7 +154,7 @@ impl Join {
         Ok(wanted.collect())
     }
 
-    /// What became of all tuples, and the first failures by index.
+    /// Number of tuples by outcome, and the first failures by index.
     pub(super) fn count(&self, states: &[Vec<Entry>; 2]) -> (Counts, Vec<(u64, Failure)>) {
         let mut counts = Counts::default();
         let mut failures: Vec<(u64, Failure)> = Vec::new();
@@ -194,7 +195,7 @@ impl Join {
         (counts, failures)
     }
 
-    /// Adds the failures of a bucket that may be among the first; parts come in the order of their index.
+    /// Add the failures of a bucket that may be among the first. Rows are sorted by index.
     fn list(&self, parts: [&[Part]; 2], states: &[Vec<Entry>; 2], failures: &mut Vec<(u64, Failure)>) {
         for first in parts[0] {
             for second in parts[1] {

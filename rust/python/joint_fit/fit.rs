@@ -1,4 +1,4 @@
-//! A joint fit as one call, and races whose ends several fits go on from.
+//! Bindings of the joint fit in one call, and of the multistart whose candidates several fits share.
 
 use std::sync::Arc;
 
@@ -22,10 +22,10 @@ use crate::python::estimation::status;
 use crate::python::order_search::watch::{served, Stop};
 
 type Table<'py> = Bound<'py, PyArray2<f64>>;
-/// (threads, bytes of memory of one lattice).
+/// Resources: (threads, bytes of memory of one order grid).
 type Means = (usize, u64);
 
-/// Where starts got, best first; fits of the same structure to the same runs go on from there.
+/// Candidates of a multistart, best first. Fits of the same structure to the same runs continue from them.
 #[pyclass(module = "ftlm._core", frozen)]
 pub struct JointRace {
     inner: Arc<Vec<Runner>>,
@@ -37,20 +37,20 @@ impl JointRace {
         attached(|| Ok(self.inner.len()))
     }
 
-    /// Values of everything free, of each.
+    /// Values of the free parameters of each candidate.
     #[getter]
     fn values(&self) -> PyResult<Vec<Vec<f64>>> {
         attached(|| Ok(self.inner.iter().map(|runner| runner.attempt.values()).collect()))
     }
 
-    /// The start that led to each, in words.
+    /// Description of the start of each candidate.
     #[getter]
     fn origins(&self) -> PyResult<Vec<String>> {
         attached(|| Ok(self.inner.iter().map(|runner| runner.origin.clone()).collect()))
     }
 }
 
-/// Runs something on the runs of an argument.
+/// Run `work` with the runs of an argument as source.
 fn asking<T: Send + 'static>(
     py: Python<'_>,
     runs: RunsArg,
@@ -66,7 +66,7 @@ fn asking<T: Send + 'static>(
     )
 }
 
-/// The race of the starts of a problem, every output weighing so; noise alone leaves `floor` per residual.
+/// Multistart of a problem with these output weights. `floor` is the cost of pure noise per residual.
 #[pyfunction]
 #[pyo3(signature = (problem, runs, weights, floor, means, stop=None))]
 #[allow(clippy::needless_pass_by_value)]
@@ -89,7 +89,7 @@ pub fn joint_race(
     Ok(JointRace { inner: Arc::new(reached) })
 }
 
-/// Where starts, each (values of everything free, its words), get on coarse grids.
+/// Refine candidates, each (values of the free parameters, description), on coarse grids.
 #[pyfunction]
 #[pyo3(signature = (problem, runs, weights, decimation, starts, threads, stop=None))]
 #[allow(clippy::needless_pass_by_value, clippy::too_many_arguments)]
@@ -119,10 +119,11 @@ fn started(free: &Free, values: &[f64], origin: String) -> Result<Runner> {
     Ok(Runner::at(Place { point: free.problem.point(values)?, states: Vec::new() }, origin))
 }
 
-/// (values of everything free, noise of each output, pulses a sample interval).
+/// Initial guess near an earlier fit: (values of the free parameters, noise of each output, pulses per sampling
+/// interval).
 type NearArg = (List<f64>, List<f64>, usize);
 
-/// Fits a structure on its runs; None where no start has a finite free run.
+/// Fit a structure to its runs. None if every start has a simulation that overflows.
 #[pyfunction]
 #[pyo3(signature = (problem, runs, sizes, known, start, near, raced, huber, refine, means, stop=None))]
 #[allow(clippy::needless_pass_by_value, clippy::too_many_arguments)]
@@ -163,7 +164,7 @@ pub fn joint_fit<'py>(
     found.map(|found| described(py, found, size)).transpose()
 }
 
-/// Tables of every run.
+/// Tables of all runs.
 fn tables<'py>(py: Python<'py>, runs: &[Vec<Vec<f64>>]) -> PyResult<Vec<Table<'py>>> {
     runs.iter().map(|run| stacked(py, run)).collect()
 }

@@ -1,4 +1,4 @@
-//! Joint fits: structures by name, races, one call from starts to intervals, and what residuals say.
+//! Bindings of the joint fit: structures by name, multistart, fit with intervals, residual analysis.
 
 mod fit;
 mod problem;

@@ -1,4 +1,4 @@
-//! What is free in a joint fit, and its numbers in the runs' own unit of time.
+//! Bindings of the parameter set of a joint fit and of its time scaling.
 
 use std::collections::BTreeMap;
 use std::sync::Arc;
@@ -19,10 +19,10 @@ use crate::python::estimation::{evaluated, experiment, status, ExperimentArg};
 use crate::python::order_search::watch::{leavable, Stop};
 
 type Array<'py> = Bound<'py, PyArray1<f64>>;
-/// Sample interval and duration of each run \[s\].
+/// Sampling interval and duration of each run \[s\].
 type Spans = List<(f64, f64)>;
 
-/// What is free in a joint fit.
+/// Parameter set of a joint fit.
 #[pyclass(module = "ftlm._core", frozen)]
 pub struct JointProblem {
     pub(super) inner: Arc<Free>,
@@ -42,38 +42,38 @@ impl JointProblem {
         attached(|| Ok(self.inner.orders.clone()))
     }
 
-    /// Names of the free coefficients, those of a law among them.
+    /// Names of the free coefficients, including those of a coefficient law.
     #[getter]
     fn coefficients(&self) -> PyResult<Vec<String>> {
         attached(|| Ok(self.inner.coefficients.clone()))
     }
 
-    /// Coefficients that a law gives: name, sign, factors.
+    /// Coefficients that a law determines: name, sign, factors.
     #[getter]
     fn products(&self) -> PyResult<Vec<(String, f64, Vec<String>)>> {
         let told = |law: &Law| (law.name.clone(), law.sign, law.factors.clone());
         attached(|| Ok(self.inner.products.iter().map(told).collect()))
     }
 
-    /// Second order with one derivative of the output, everything else as it is, as far as the bounds allow.
+    /// Integer-order start: second order with one derivative of the output, others unchanged, within the bounds.
     #[getter]
     fn whole_orders(&self) -> PyResult<Vec<f64>> {
         attached(|| Ok(self.inner.whole_orders()))
     }
 
-    /// Free coefficients from freely estimated ones, by name; ratios as the median of what the equations can say.
+    /// Free coefficients from independent estimates by name. Ratios are the median over the equations.
     #[allow(clippy::needless_pass_by_value)]
     fn free_from(&self, estimated: BTreeMap<String, f64>) -> PyResult<Vec<f64>> {
         attached(|| Ok(self.inner.free_from(&estimated)))
     }
 
-    /// Bounds of everything that is free.
+    /// Bounds of all free parameters.
     #[getter]
     fn bounds(&self) -> PyResult<Vec<(f64, f64)>> {
         attached(|| Ok(self.inner.problem.bounds()))
     }
 
-    /// The last point on the way from a feasible one to another that keeps bounds and constraints of orders.
+    /// Last point between a feasible point and another that satisfies bounds and constraints of the orders.
     fn feasible<'py>(
         &self,
         py: Python<'py>,
@@ -85,8 +85,10 @@ impl JointProblem {
         Ok(PyArray1::from_vec(py, found))
     }
 
-    /// Levenberg–Marquardt on sampled runs from (values of everything free, states of runs with friction), in logarithms
-    /// where the start allows them unless plain ones are asked for, numbers held by their places.
+    /// Minimize the output error on sampled runs by Levenberg–Marquardt.
+    ///
+    /// `start` has the values of the free parameters and the states of runs with friction. Coordinates are logarithmic
+    /// where the start allows it, unless `plain`. `held` are the indices of fixed parameters.
     #[pyo3(signature = (runs, start, plain, held, evaluations, tolerance, steady, stop=None))]
     #[allow(clippy::needless_pass_by_value, clippy::too_many_arguments)]
     fn descend<'py>(
@@ -126,7 +128,7 @@ impl JointProblem {
         Ok(dict)
     }
 
-    /// The unit of time of runs, each told by its sample interval and its duration.
+    /// Time scaling of runs, each given by its sampling interval and its duration.
     #[allow(clippy::needless_pass_by_value)]
     fn clock(&self, spans: Spans) -> PyResult<JointClock> {
         attached(|| {
@@ -139,7 +141,7 @@ impl JointProblem {
     }
 }
 
-/// Numbers of a fit in a unit of time of the runs' own.
+/// Parameters of a fit in the time scaling of its runs.
 #[pyclass(module = "ftlm._core", frozen)]
 pub struct JointClock {
     inner: Clock,
@@ -156,25 +158,25 @@ impl JointClock {
 
 #[pymethods]
 impl JointClock {
-    /// ln of the unit of time.
+    /// Logarithm of the time unit.
     #[getter]
     fn unit(&self) -> PyResult<f64> {
         attached(|| Ok(self.inner.unit()))
     }
 
-    /// Parameters in the unit.
+    /// Parameters in scaled time.
     fn told<'py>(&self, py: Python<'py>, values: PyReadonlyArray1<'py, f64>) -> PyResult<Array<'py>> {
         let values = self.values("values", &values)?;
         Ok(PyArray1::from_vec(py, attached(|| Ok(self.inner.told(&values)))?))
     }
 
-    /// Parameters from those in the unit.
+    /// Parameters from those in scaled time.
     fn untold<'py>(&self, py: Python<'py>, values: PyReadonlyArray1<'py, f64>) -> PyResult<Array<'py>> {
         let values = self.values("values", &values)?;
         Ok(PyArray1::from_vec(py, attached(|| Ok(self.inner.untold(&values)))?))
     }
 
-    /// A small step of the parameters at some values, from the one in the unit.
+    /// Small step of the parameters at some values, from the step in scaled time.
     fn step<'py>(
         &self,
         py: Python<'py>,
@@ -185,7 +187,7 @@ impl JointClock {
         Ok(PyArray1::from_vec(py, attached(|| Ok(self.inner.step(&values, &moved)))?))
     }
 
-    /// Standard errors in the unit; infinite where the runs do not see all that takes part.
+    /// Standard errors in scaled time. Infinite if a parameter is not identifiable.
     fn errors<'py>(
         &self,
         py: Python<'py>,

@@ -1,4 +1,4 @@
-//! Runs that Python samples while the core fits: every question is asked once.
+//! Data source that samples runs by Python callbacks during a fit. Responses are cached.
 
 use std::cell::RefCell;
 use std::collections::BTreeMap;
@@ -15,42 +15,42 @@ use crate::python::order_search::watch::Desk;
 use crate::regressors::Record;
 use crate::signal::block_pulse::Intersample;
 
-/// (its methods sampled, records and read, sample interval and duration of each run \[s\], what each signal does between
-/// samples where it is an input, who is told how far a fit is).
+/// Runs: (object with methods sampled, records and read; sampling interval and duration of each run \[s\]; inter-sample
+/// behavior of each signal, None for outputs; progress callback).
 pub type RunsArg = (Py<PyAny>, List<(f64, f64)>, List<Option<String>>, Option<Py<PyAny>>);
 
-/// What the core asks.
+/// Request from the core to Python.
 pub enum Question {
-    /// Runs on a grid.
+    /// Runs sampled on a grid.
     Experiments(Sampling),
-    /// Records of so many pulses, inputs acting with these numbers.
+    /// Records of so many pulses, with inputs transformed by these parameters.
     Records(usize, Vec<f64>),
-    /// What was read of a signal.
+    /// Samples of a signal.
     Samples(usize),
-    /// Nothing: so much of a whole is done.
+    /// Progress: steps done and total.
     Told(usize, usize),
 }
 
-/// What Python answers.
+/// Response of Python to a request.
 pub enum Answer {
-    /// To runs on a grid.
+    /// Response to a grid.
     Experiments(Vec<Experiment>),
-    /// To records.
+    /// Response to records.
     Records(Vec<Record>),
-    /// To what was read, by run.
+    /// Response to samples, by run.
     Samples(Vec<Vec<f64>>),
-    /// To being told.
+    /// Response to progress.
     Heard,
 }
 
-/// What is known of the runs without asking.
+/// Properties of the runs that need no request.
 pub struct Known {
     spans: Vec<(f64, f64)>,
     inputs: Vec<Option<Intersample>>,
 }
 
 impl Known {
-    /// Of an argument, and who answers.
+    /// Properties from an argument, and the resampler.
     pub fn of(argument: RunsArg) -> PyResult<(Self, Answering)> {
         let (runs, spans, inputs, told) = argument;
         for &(step, duration) in spans.iter() {
@@ -71,14 +71,14 @@ impl Known {
     }
 }
 
-/// Who answers, where Python is attached.
+/// Python object that serves requests while Python is attached.
 pub struct Answering {
     runs: Py<PyAny>,
     told: Option<Py<PyAny>>,
 }
 
 impl Answering {
-    /// The answer to a question.
+    /// Serve a request.
     pub fn answer(&self, py: Python<'_>, question: Question) -> PyResult<Answer> {
         Ok(match question {
             Question::Experiments(Sampling { every, decimation, first }) => {
@@ -105,10 +105,10 @@ impl Answering {
     }
 }
 
-/// Records by their pulses and the bits of the numbers of inputs.
+/// Records by number of pulses and the bits of the input parameters.
 type Records = BTreeMap<(usize, Vec<u64>), Vec<Record>>;
 
-/// The runs, as the core has them.
+/// Source of runs that sends requests to Python.
 pub struct Asked<'a, T> {
     desk: &'a Desk<Question, Answer, T>,
     known: Known,
@@ -117,12 +117,12 @@ pub struct Asked<'a, T> {
 }
 
 impl<'a, T> Asked<'a, T> {
-    /// Runs behind a desk.
+    /// Source behind a request channel.
     pub fn new(desk: &'a Desk<Question, Answer, T>, known: Known) -> Self {
         Self { desk, known, samples: RefCell::default(), records: RefCell::default() }
     }
 
-    /// Tells so much of a whole.
+    /// Report progress.
     pub fn tell(&self, done: usize, of: usize) -> Result<(), Error> {
         self.desk.ask(Question::Told(done, of)).map(drop)
     }

@@ -1,4 +1,4 @@
-//! What residuals of a fit say: its covariance, their colour, their whiteness.
+//! Bindings of residual analysis: covariance of a fit, noise coloring, whiteness.
 
 use numpy::{PyArray1, PyArray2, PyReadonlyArray1, PyReadonlyArray2};
 use pyo3::prelude::*;
@@ -16,7 +16,7 @@ fn all_copied(name: &str, arrays: &[PyReadonlyArray1<'_, f64>]) -> PyResult<Vec<
     arrays.iter().map(|array| copied(name, array)).collect()
 }
 
-/// Covariance from a Jacobian, a row a parameter, residuals by run and output, and the sum of their squares.
+/// Covariance from a Jacobian (a row a parameter), residuals by run and output, and their sum of squares.
 #[pyfunction]
 #[allow(clippy::needless_pass_by_value)]
 pub fn covariance_of<'py>(
@@ -31,7 +31,7 @@ pub fn covariance_of<'py>(
     matrix(py, found, size)
 }
 
-/// The same of a fit, whose residuals may have counted by shares.
+/// Covariance of a fit, whose residuals may have robust weights.
 #[pyfunction]
 #[allow(clippy::needless_pass_by_value)]
 pub fn fit_covariance<'py>(
@@ -47,7 +47,7 @@ pub fn fit_covariance<'py>(
     matrix(py, found, size)
 }
 
-/// Covariance of sums of scores with Bartlett weights.
+/// Long-run covariance of sums of scores, with Bartlett weights.
 #[pyfunction]
 #[allow(clippy::needless_pass_by_value)]
 pub fn long_run<'py>(
@@ -61,7 +61,7 @@ pub fn long_run<'py>(
     matrix(py, found, size)
 }
 
-/// The whitening filter of series that share one colour, and the power that it leaves.
+/// Filter that whitens series with one spectrum, and the innovation variance.
 #[pyfunction]
 #[allow(clippy::needless_pass_by_value)]
 pub fn coloured<'py>(
@@ -77,7 +77,7 @@ pub fn coloured<'py>(
     Ok((PyArray1::from_vec(py, filter), power))
 }
 
-/// Autocovariances of noise that a filter makes white.
+/// Autocovariances of noise that a filter whitens.
 #[pyfunction]
 #[allow(clippy::needless_pass_by_value)]
 pub fn colour_covariances<'py>(
@@ -88,14 +88,14 @@ pub fn colour_covariances<'py>(
 ) -> PyResult<Array<'py>> {
     let through = vector("filter", &through)?;
     let found = leavable(py, count, None, move |_| {
-        // A circle of many times as many points holds them.
+        // The circulant has many times as many points.
         crate::error::check_points("points for autocovariances", count.saturating_mul(16))?;
         Ok(statistics::covariances(&through, power, count))
     })?;
     Ok(PyArray1::from_vec(py, found))
 }
 
-/// Autocovariances of series at lags from 0, and how many pairs each is the mean of.
+/// Autocovariances of series at lags from 0, and the number of pairs in each mean.
 #[pyfunction]
 #[allow(clippy::needless_pass_by_value)]
 pub fn autocovariances<'py>(
@@ -112,7 +112,7 @@ pub fn autocovariances<'py>(
     Ok((PyArray1::from_vec(py, sums), PyArray1::from_vec(py, pairs)))
 }
 
-/// Whether autocorrelations of a series could be those of white noise.
+/// Whether autocorrelations of a series are consistent with white noise.
 #[pyfunction]
 #[allow(clippy::needless_pass_by_value)]
 pub fn is_white(py: Python<'_>, series: PyReadonlyArray1<'_, f64>, lags: usize) -> PyResult<bool> {
@@ -120,7 +120,7 @@ pub fn is_white(py: Python<'_>, series: PyReadonlyArray1<'_, f64>, lags: usize) 
     leavable(py, series.len(), None, move |_| Ok(statistics::is_white(&series, lags)))
 }
 
-/// Value that chi-squared exceeds as often as a normal variable exceeds a quantile.
+/// Quantile of chi-squared at the level of a normal quantile.
 #[pyfunction]
 pub fn chi_squared(degrees: f64, quantile: f64) -> PyResult<f64> {
     attached(|| Ok(statistics::chi_squared(degrees, quantile)))

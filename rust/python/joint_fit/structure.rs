@@ -1,4 +1,4 @@
-//! Structures by name, as Python tells them.
+//! Parsing of structures with named parameters from Python.
 
 use pyo3::prelude::*;
 
@@ -7,16 +7,16 @@ use crate::estimation::joint_fit::structure::{Coefficient, Equation, Hints, Inpu
 use crate::python::convert::{initial, InitialArg, List};
 use crate::python::estimation::free_inputs;
 
-/// (constant, weight of each free order by name).
+/// Order: (constant, weight of each free order by name).
 type OrderArg = (f64, List<(String, f64)>);
-/// (factor, coefficient).
+/// Coefficient with a factor: (factor, coefficient).
 type NumberArg = (f64, CoefficientArg);
-/// (signal, order, coefficient, factor).
+/// Term: (signal, order, coefficient, factor).
 type TermArg = (usize, OrderArg, CoefficientArg, f64);
-/// (output, order, terms, fc, fs and vs of friction).
+/// Equation: (output, order, terms, fc, fs and vs of friction).
 type EquationArg = (usize, OrderArg, List<TermArg>, Option<[NumberArg; 3]>);
 
-/// A name or a number.
+/// Coefficient: a name if free, a number if fixed.
 #[derive(FromPyObject)]
 pub enum CoefficientArg {
     Free(String),
@@ -32,7 +32,7 @@ impl From<CoefficientArg> for Coefficient {
     }
 }
 
-/// A structure: a dictionary of these.
+/// Structure from a dictionary with these keys.
 #[derive(FromPyObject)]
 #[pyo3(from_item_all)]
 pub struct StructureArg {
@@ -48,7 +48,7 @@ pub struct StructureArg {
     hints: HintsArg,
 }
 
-/// What is known of where orders lie.
+/// Prior knowledge of orders and coefficients.
 #[derive(FromPyObject)]
 #[pyo3(from_item_all)]
 pub struct HintsArg {
@@ -68,7 +68,7 @@ fn rubs([coulomb, stribeck, speed]: [NumberArg; 3]) -> Rubs {
     Rubs { coulomb: number(coulomb), stribeck: number(stribeck), speed: number(speed) }
 }
 
-/// A structure whose signals and coefficients are there.
+/// Structure whose signals and coefficients exist.
 pub fn named(argument: StructureArg) -> PyResult<Structure> {
     let term = |(signal, at, coefficient, factor): TermArg| Term {
         signal,

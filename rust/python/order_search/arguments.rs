@@ -1,4 +1,4 @@
-//! Tuples from Python become settings, lattices, parts and verdicts, and what a search comes to becomes tuples.
+//! Conversion of Python tuples to settings, order grids, parts and verdicts of a search, and of results to tuples.
 
 use pyo3::prelude::*;
 use pyo3::types::PyDict;
@@ -16,14 +16,14 @@ use crate::order_search::stage_join::Span;
 use crate::python::convert::{initial, lists, nested, records, InitialArg, List, RecordArg};
 use crate::regressors::Record;
 
-/// Change below which a candidate's instrumental variables stand still: far below what moves a rank.
+/// Convergence tolerance of a candidate's instrumental variables, far below a change of the ranking.
 const REFINED: f64 = 1e-4;
 
-/// (criterion, norm, p or 0 for least squares, K₀, Haar rows, keep, threads, early stopping, steps of instrumental
-/// variables or 0, bytes of memory).
+/// Settings: (criterion, norm, p or 0 for least squares, K₀, Haar rows, rows kept, threads, pruning, iterations of
+/// instrumental variables or 0, bytes of memory).
 type SettingsTuple = (String, String, usize, f64, bool, usize, usize, bool, usize, u64);
 
-/// Settings of a search but for its initial terms.
+/// Settings of a search without its initial terms.
 pub struct SettingsArg {
     criterion: Criterion,
     norm: Norm,
@@ -73,14 +73,14 @@ impl<'py> FromPyObject<'_, 'py> for SettingsArg {
 }
 
 impl SettingsArg {
-    /// With the initial terms of the records.
+    /// Options with the initial terms of the records.
     pub fn options(self, terms: InitialArg) -> PyResult<Options> {
         let Self { criterion, norm, estimator, keep, threads, early_stopping, memory } = self;
         Ok(Options { criterion, norm, estimator, initial: initial(terms)?, keep, threads, early_stopping, memory })
     }
 }
 
-/// What a search is given besides its lattice; `F` holds the known coefficients of one equation or of several.
+/// Data and options of a search without its order grid. `F` holds the fixed coefficients of one or several equations.
 pub struct Given<F> {
     records: Vec<Record>,
     pub inputs: Vec<bool>,
@@ -99,7 +99,7 @@ impl<F> Given<F> {
         Ok(Self { records: records(runs)?, inputs: inputs.into(), fixed, options: settings.options(terms)? })
     }
 
-    /// Records, with the clean signals that the estimator asks for.
+    /// Records, with the low-noise signals that the estimator needs.
     pub fn records(&mut self, control: &Control) -> Result<Vec<Record>, Error> {
         let records = std::mem::take(&mut self.records);
         if !matches!(self.options.estimator, Estimator::InstrumentalVariables(_)) {
@@ -110,10 +110,10 @@ impl<F> Given<F> {
     }
 }
 
-/// (output, values of alpha, [(signal, values, interchangeable), …]).
+/// Order grid: (output, values of alpha, [(signal, values, interchangeable), …]).
 type OrdersTuple = (usize, List<f64>, List<(usize, List<f64>, bool)>);
 
-/// The axes of a lattice.
+/// Axes of an order grid.
 pub struct OrdersArg {
     output: usize,
     alphas: Vec<f64>,
@@ -136,12 +136,12 @@ impl OrdersArg {
     }
 }
 
-/// (constant, weight of each free order).
+/// Affine order: (constant, weight of each free order).
 type AffineTuple = (f64, List<f64>);
-/// (output, alpha, [(signal, order), …]).
+/// Order laws: (output, alpha, [(signal, order), …]).
 type LawTuple = (usize, AffineTuple, List<(usize, AffineTuple)>);
 
-/// The order laws of one equation.
+/// Order laws of one equation.
 pub struct LawArg(LawEquation);
 
 impl<'py> FromPyObject<'_, 'py> for LawArg {
@@ -155,7 +155,7 @@ impl<'py> FromPyObject<'_, 'py> for LawArg {
     }
 }
 
-/// The lattice of a stage from the values of its free orders.
+/// Order grid of a coupled search from the values of its free orders.
 pub fn law_lattice(
     axes: &[Vec<f64>],
     laws: List<LawArg>,
@@ -166,7 +166,7 @@ pub fn law_lattice(
     Ok(LawLattice::new(axes, &equations, inputs)?.with_known(fixed))
 }
 
-/// Counts under the names that people read.
+/// Counts under their public names.
 pub fn counted<'py>(py: Python<'py>, counts: &Counts) -> PyResult<Bound<'py, PyDict>> {
     let dict = PyDict::new(py);
     dict.set_item("candidates", counts.candidates)?;
@@ -179,7 +179,7 @@ pub fn counted<'py>(py: Python<'py>, counts: &Counts) -> PyResult<Bound<'py, PyD
     Ok(dict)
 }
 
-/// A failure in a word.
+/// Name of a failure.
 pub fn named(failure: Failure) -> &'static str {
     match failure {
         Failure::Singular => "singular",
@@ -187,20 +187,20 @@ pub fn named(failure: Failure) -> &'static str {
     }
 }
 
-/// (index, raw score, coefficients, initial terms by record).
+/// Row of a result: (index, raw score, coefficients, initial terms by record).
 type RowArg = (u64, f64, List<f64>, List<List<f64>>);
-/// Candidates, kept, beaten, bounded, stopped, singular, diverged; how many of the bounded were in boxes, where any was.
+/// Counts: candidates, kept, beaten, bounded, stopped, singular, diverged. Then, if any, those of the bounded in boxes.
 #[derive(FromPyObject, IntoPyObject)]
 pub enum CountsArg {
     Plain((u64, u64, u64, u64, u64, u64, u64)),
     Boxed((u64, u64, u64, u64, u64, u64, u64, u64)),
 }
-/// Rows, counts, (index, whether diverged rather than singular) of failures.
+/// Part of a result: rows, counts, (index, whether diverged rather than singular) of failures.
 pub type PartArg = (List<RowArg>, CountsArg, List<(u64, bool)>);
-/// (round, followed, end, size, limit, order), whether the stretch was begun anew, and what it came to.
+/// Checkpoint: (batch, followed, end, size, limit, order), whether the block was restarted, and the part so far.
 pub type CheckpointArg = ((u64, u64, u64, u64, f64, u64), bool, PartArg);
 
-/// What rounds came to, as Python keeps it.
+/// Result of batches as Python tuples.
 pub fn part_of(part: Part) -> PartArg {
     let c = part.counts;
     (
@@ -213,7 +213,7 @@ pub fn part_of(part: Part) -> PartArg {
     )
 }
 
-/// What rounds came to, as they told.
+/// Result of batches from Python tuples.
 pub fn part((rows, counts, failures): PartArg) -> Part {
     let (candidates, kept, beaten, bounded, stopped, singular, diverged, boxed) = match counts {
         CountsArg::Plain((a, b, c, d, e, f, g)) => (a, b, c, d, e, f, g, 0),
@@ -237,26 +237,26 @@ pub fn part((rows, counts, failures): PartArg) -> Part {
     }
 }
 
-/// A checkpoint from what Python kept.
+/// Checkpoint from Python tuples.
 pub fn checkpoint(((round, followed, end, size, limit, order), anew, found): CheckpointArg) -> Checkpoint {
     Checkpoint { place: Place { round, followed, end, size, limit, order }, anew, part: part(found) }
 }
 
-/// A checkpoint as Python keeps it.
+/// Checkpoint as Python tuples.
 pub fn checkpoint_of(checkpoint: Checkpoint) -> CheckpointArg {
     let p = checkpoint.place;
     ((p.round, p.followed, p.end, p.size, p.limit, p.order), checkpoint.anew, part_of(checkpoint.part))
 }
 
-/// (equation, first candidate, the one behind the last, limit).
+/// Block of candidates: (equation, first, one past the last, limit).
 pub type SpanArg = (usize, usize, usize, f64);
 
-/// A stretch of candidates.
+/// Contiguous block of candidates.
 pub fn span((equation, first, last, limit): SpanArg) -> Span {
     Span { equation, first, last, limit }
 }
 
-/// What candidates came to: raw sums as little-endian doubles, and a byte each that says of what.
+/// Serialize verdicts: raw sums as little-endian doubles, and one byte each for the kind.
 pub fn verdicts_of(verdicts: &[Verdict]) -> (Vec<u8>, Vec<u8>) {
     let pairs = verdicts.iter().map(|verdict| match *verdict {
         Verdict::Score(raw) => (raw, 0),
@@ -269,7 +269,7 @@ pub fn verdicts_of(verdicts: &[Verdict]) -> (Vec<u8>, Vec<u8>) {
     (values.concat(), kinds)
 }
 
-/// The verdicts that [`verdicts_of`] wrote.
+/// Verdicts serialized by [`verdicts_of`].
 pub fn verdicts(values: &[u8], kinds: &[u8]) -> Result<Vec<Verdict>, Error> {
     let known = kinds.iter().zip(values.chunks_exact(8)).map(|(kind, value)| {
         let raw = f64::from_le_bytes(std::array::from_fn(|i| value[i]));

@@ -1,10 +1,4 @@
-//! Searches over a lattice: at once, or in rounds that are done here or elsewhere.
-//!
-//! Certificates of equation errors over whole intervals of orders.
-//!
-//! Errors of candidates given as points, for a genetic algorithm.
-//!
-//! What tests turn and provoke: the instructions that kernels run with, and panics.
+//! Bindings of the order search: grid search, batches, certificates, given points, test hooks.
 
 use std::borrow::Cow;
 
@@ -55,10 +49,10 @@ pub fn search<'py>(
     found.dict(py)
 }
 
-/// (index, score, α, orders, coefficients, initial terms by record).
+/// Row of a table: (index, score, α, orders, coefficients, initial terms by record).
 type FoundRow = (u64, f64, f64, Vec<f64>, Vec<f64>, Vec<Vec<f64>>);
 
-/// A table, counts and failures with the orders of each index.
+/// Result table with counts and failures, and the orders of each index.
 struct Found {
     rows: Vec<FoundRow>,
     counts: Counts,
@@ -96,8 +90,7 @@ impl Found {
     }
 }
 
-/// Candidates of a search, where each wave of its rounds ends by this algorithm or the present one, and whose number that
-/// is.
+/// Plan of a search: number of candidates, ends of its generations, and number of the present algorithm.
 #[pyfunction]
 #[allow(clippy::needless_pass_by_value)]
 pub fn search_plan(
@@ -117,7 +110,7 @@ pub fn search_plan(
     })
 }
 
-/// The result of a search from the parts that its rounds came to, over records of so many samples.
+/// Result of a search from the parts of its batches, for records of so many samples.
 #[pyfunction]
 #[allow(clippy::needless_pass_by_value)]
 pub fn search_join<'py>(
@@ -153,7 +146,7 @@ pub fn search_join<'py>(
     found.dict(py)
 }
 
-/// A search made ready for its rounds: on this machine, or on one of many.
+/// Search prepared for its batches, on this machine or on several.
 #[pyclass(frozen, module = "ftlm._core")]
 pub struct OrderSearch {
     ready: batches::Search<'static>,
@@ -182,7 +175,7 @@ impl OrderSearch {
         Ok(Self { ready })
     }
 
-    /// Rounds `first … last − 1` of one wave: the part they come to.
+    /// Evaluate batches `first … last − 1` of one generation.
     #[allow(clippy::needless_pass_by_value, clippy::too_many_arguments)]
     fn rounds(
         &self,
@@ -203,10 +196,10 @@ impl OrderSearch {
     }
 }
 
-/// (output, interval of alpha, [(signal, lowest, highest), …], apart).
+/// Search region: (output, interval of alpha, [(signal, lowest, highest), …], smallest separation).
 type RegionTuple = (usize, (f64, f64), List<(usize, f64, f64)>, f64);
 
-/// (within, largest, cells, threads, bytes of memory).
+/// Settings: (tolerance, largest coefficient, cells, threads, bytes of memory).
 type AskedTuple = (f64, f64, u64, usize, u64);
 
 #[pyfunction]
@@ -235,7 +228,7 @@ pub fn certify<'py>(
     Ok(dict)
 }
 
-/// Errors of candidates at orders and coefficients of their own.
+/// Errors of candidates with given orders and coefficients.
 #[pyclass(module = "ftlm._core")]
 pub struct Points {
     inner: PointsOf,
@@ -260,7 +253,7 @@ impl Points {
         Ok(Self { inner: detached(py, || PointsOf::new(records, output, signals, inputs, norm))?, width })
     }
 
-    /// Errors of candidates given as rows (alpha, orders, coefficients); infinite beyond the limit.
+    /// Errors of candidates in rows (alpha, orders, coefficients). Infinite above the limit.
     #[allow(clippy::needless_pass_by_value)]
     fn scores<'py>(
         &mut self,
@@ -283,8 +276,7 @@ impl Points {
     }
 }
 
-/// Panics where it is told to, so that a test can see what becomes of a panic: in a call, in the thread that a search
-/// runs on, or in one of its workers.
+/// Panic at a requested place: in the call, in the search thread, or in one of its workers.
 #[pyfunction]
 #[allow(clippy::panic)]
 pub fn panic_on_purpose(py: Python<'_>, place: &str) -> PyResult<()> {
@@ -296,7 +288,7 @@ pub fn panic_on_purpose(py: Python<'_>, place: &str) -> PyResult<()> {
     }
 }
 
-/// Whether kernels run as they are compiled for the oldest machine.
+/// Make kernels run as compiled for the oldest machine.
 #[pyfunction]
 pub fn portable(on: bool) {
     crate::simd::portable(on);

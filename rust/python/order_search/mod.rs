@@ -1,4 +1,4 @@
-//! Order searches for Python: over a lattice, over a stage, at points; watched for Ctrl-C while they run.
+//! Bindings of the order search: order grid, coupled search, given points. Ctrl-C is watched during a search.
 
 mod arguments;
 mod grid_search;

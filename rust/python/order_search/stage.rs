@@ -1,4 +1,4 @@
-//! Searches over the free orders of a stage: at once, or followed here and elsewhere.
+//! Bindings of the coupled search over the free orders of a joint: in one call, or block by block.
 
 use std::borrow::Cow;
 use std::sync::{Mutex, PoisonError};
@@ -41,10 +41,10 @@ pub fn search_stage<'py>(
     found.dict(py)
 }
 
-/// (score, α, orders, coefficients, initial terms by record) of one equation.
+/// Result of one equation: (score, α, orders, coefficients, initial terms by record).
 type FoundEquation = (f64, f64, Vec<f64>, Vec<f64>, Vec<Vec<f64>>);
 
-/// A table, counts and failures with the free orders of each index.
+/// Result table with counts and failures, and the free orders of each index.
 struct Found {
     rows: Vec<(u64, f64, Vec<f64>, Vec<FoundEquation>)>,
     counts: Counts,
@@ -80,8 +80,8 @@ impl Found {
     }
 }
 
-/// The search of a stage made ready: its candidates are followed here or elsewhere, and taken in where its course is
-/// kept.
+/// Search over coupled equations, prepared for evaluation here or elsewhere. The instance that keeps the search state
+/// collects results.
 #[pyclass(frozen, module = "ftlm._core")]
 pub struct StageSearch {
     stage: Stage<'static>,
@@ -89,7 +89,7 @@ pub struct StageSearch {
 }
 
 impl StageSearch {
-    /// Works on the course.
+    /// Run `work` on the search state.
     fn course<T>(&self, work: impl FnOnce(&mut Course) -> Result<T, Error>) -> Result<T, Error> {
         let mut course = self.course.lock().unwrap_or_else(PoisonError::into_inner);
         let found = course.as_mut().ok_or_else(|| Error::Structure {
@@ -127,19 +127,19 @@ impl StageSearch {
         Ok(Self { stage, course: Mutex::new(keeps_course.then_some(course)) })
     }
 
-    /// Candidates to follow next; none at the end.
+    /// Candidates to evaluate next. Empty at the end.
     fn wanted(&self, py: Python<'_>) -> PyResult<Vec<SpanArg>> {
         detached(py, || {
             self.course(|c| Ok(c.wanted().iter().map(|s| (s.equation, s.first, s.last, s.limit)).collect()))
         })
     }
 
-    /// Candidates to follow in all, as far as is known, and the best score so far.
+    /// Number of candidates to evaluate as far as known, and the best score so far.
     fn state(&self, py: Python<'_>) -> PyResult<(u64, Option<f64>)> {
         detached(py, || self.course(|c| Ok((c.total(), c.best()))))
     }
 
-    /// What these candidates come to.
+    /// Evaluate candidates.
     #[allow(clippy::needless_pass_by_value)]
     fn follow<'py>(
         &self,
@@ -155,7 +155,7 @@ impl StageSearch {
         Ok((PyBytes::new(py, &values), PyBytes::new(py, &kinds)))
     }
 
-    /// Takes in what the wanted candidates came to, in their order.
+    /// Add the results of the pending candidates, in their order.
     fn take(&self, py: Python<'_>, values: &[u8], kinds: &[u8], threads: usize) -> PyResult<()> {
         watched(py, None, |control| {
             let found = verdicts(values, kinds)?;
@@ -163,7 +163,7 @@ impl StageSearch {
         })
     }
 
-    /// The result, once nothing is wanted.
+    /// Result, once no candidates are pending.
     fn outcome<'py>(&self, py: Python<'py>) -> PyResult<Bound<'py, PyDict>> {
         let found = watched(py, None, |control| {
             let outcome = self.course(|course| self.stage.outcome(course, control))?;

@@ -1,6 +1,4 @@
-//! Where joint fits start: order lattices on prefiltered records, delays, resonances.
-//!
-//! Starts along free delays and limits.
+//! Initial guesses of joint fits: order grids on prefiltered records, delays, saturation limits, resonances.
 
 mod order_grid;
 mod prefilter;
@@ -26,16 +24,16 @@ use crate::regressors::Record;
 use crate::signal::block_pulse::Intersample;
 use crate::signal::statistics::median;
 
-/// Pulses of the record on which starts are searched.
+/// Maximum number of block pulses of the records for initial guesses.
 const START_M: usize = 1024;
-/// Prefilters of the start's lattice in units of the frequency below which 90 % of an output's power lies; none: none.
+/// Cutoff frequencies of the prefilters relative to the bandwidth of the outputs; None for no prefilter.
 const PREFILTERS: [Option<f64>; 5] = [Some(1.0), Some(2.0), Some(4.0), Some(8.0), None];
-/// In some order the starts of a lattice differ by so much.
+/// Minimum difference in some order between the candidates of one grid.
 const APART: f64 = 0.35;
-/// An order above another by less is the same.
+/// Difference below which two orders are equal.
 const GRAIN: f64 = 1e-9;
 
-/// Starts from coarse lattices of orders, by least squares on records of the runs.
+/// Initial guesses from coarse order grids, by least squares on records of the runs.
 pub struct Lattices<'a> {
     source: &'a dyn Recordings,
     threads: usize,
@@ -45,17 +43,17 @@ pub struct Lattices<'a> {
 }
 
 impl<'a> Lattices<'a> {
-    /// On these runs, with so many threads and bytes of memory a search.
+    /// Order grids on the given runs, with the number of threads and bytes of memory per search.
     #[must_use]
     pub fn new(source: &'a dyn Recordings, threads: usize, memory: u64, stop: &'a Stop) -> Self {
         Self { source, threads, memory, stop, low_passes: LowPasses::default() }
     }
 
-    /// Starts of a problem on the runs, at several delays and limits where some are free.
+    /// Initial guesses of a problem on the runs, at several delays and limits if these are free.
     ///
     /// # Errors
-    /// [`Error::Structure`] for a held input above the order of the output that it drives, for friction and where two
-    /// terms have become one, [`Error::EmptyLattice`], [`Error::Interrupted`]; those of the source and of a search.
+    /// [`Error::Structure`] for a zero-order-hold input with an order above that of its equation, for friction, and for
+    /// duplicate terms; [`Error::EmptyLattice`], [`Error::Interrupted`]; errors of the source and of a search.
     pub fn starts(&self, free: &Free) -> Result<Vec<Runner>> {
         let frequencies = self.frequencies(free)?;
         if free.structure.inputs.is_empty() {
@@ -73,7 +71,7 @@ impl<'a> Lattices<'a> {
         Ok(attempts)
     }
 
-    /// Frequency below which most of its power lies \[rad/s\] of the output of each equation, by run.
+    /// Bandwidth \[rad/s\] of the output of each equation, by run.
     fn frequencies(&self, free: &Free) -> Result<Vec<Vec<f64>>> {
         let spans = self.source.spans();
         let of = |output: usize| {
@@ -84,18 +82,17 @@ impl<'a> Lattices<'a> {
         free.structure.equations.iter().map(|e| of(e.output)).collect()
     }
 
-    /// Pulses of the records: as many as the shortest run carries, if that is fewer.
+    /// Number of pulses of the records, limited by the shortest run.
     fn pulses(&self, free: &Free) -> Result<usize> {
         let output = free.structure.equations.first().map_or(0, |e| e.output);
         let shortest = self.source.samples(output)?.iter().map(Vec::len).min().unwrap_or(0);
         Ok(START_M.min(shortest.saturating_sub(1)))
     }
 
-    /// Starts from order lattices on prefiltered records, where least squares suffers less from noise, at these numbers of
-    /// inputs.
+    /// Candidates from order grids on prefiltered records, at given values of the free input parameters.
     ///
-    /// The prefilter commutes with the equation: all signals pass it, so the true coefficients stay the same while noise
-    /// above the band is gone.
+    /// The prefilter commutes with the equation: all signals pass it, so the true coefficients are unchanged while
+    /// noise above the bandwidth is removed.
     fn at(&self, free: &Free, frequencies: &[Vec<f64>], numbers: &[f64]) -> Result<Vec<Runner>> {
         self.check_held(free)?;
         let frequency = median(frequencies.concat());
@@ -119,7 +116,7 @@ impl<'a> Lattices<'a> {
             self.stop.check()?;
             let corner = multiple.map(|multiple| multiple * frequency);
             if corner.is_some_and(|corner| corner >= fastest) {
-                // Nothing on these pulses lies above it.
+                // The cutoff is above the Nyquist frequency of the pulses.
                 continue;
             }
             let records = self.prefiltered(&unfiltered, corner)?;
@@ -145,7 +142,7 @@ impl<'a> Lattices<'a> {
         records.iter().map(|record| self.low_passes.through(record, corner)).collect()
     }
 
-    /// Refuses the derivative of a jump: a held input above the order of the output that it drives.
+    /// Reject a zero-order-hold input with an order above that of its equation: jumps have no derivative.
     fn check_held(&self, free: &Free) -> Result<()> {
         let (inputs, signals) = (self.source.inputs(), &free.structure.signals);
         for item in free.structure.equations.iter().filter(|e| !e.order.is_free()) {
@@ -173,17 +170,18 @@ impl Starts for Lattices<'_> {
     }
 }
 
-/// Starts along the interval of a free delay: one for this phase of the frequency below which 90 % of the power lies, and
-/// at most so many over all delayed inputs.
+/// Largest distance of initial guesses of a delay, as phase at the bandwidth of the output. There are at most
+/// [`MAX_DELAY_STARTS`] combinations over all inputs with free parameters.
 const DELAY_PHASE: f64 = 1.0;
 const DELAY_STARTS: f64 = 12.0;
-/// Limits are tried at so many values from this share of the largest input.
+/// Number of initial guesses of a saturation or dead zone, from [`MIN_LIMIT_RATIO`] of the largest input upwards.
 const LIMIT_STARTS: usize = 4;
 const LEAST_LIMIT: f64 = 0.1;
 
-/// Values of free delays and limits to start from, each with where they are in words.
+/// Initial guesses of free delays and limits, each with a description.
 ///
-/// A fit from too far away in time ends on a wrong oscillation; a limit that no sample reaches moves nothing.
+/// A fit with a delay too far off ends in a local optimum shifted by an oscillation. A limit above all samples has no
+/// effect.
 pub(super) fn points(free: &Free, source: &dyn Recordings, fastest: f64) -> Result<Vec<(Vec<f64>, String)>> {
     let inputs = &free.structure.inputs;
     let axes = inputs.iter().map(|item| axis(item, inputs.len(), source, fastest)).collect::<Result<Vec<_>>>()?;
@@ -204,7 +202,7 @@ fn axis(item: &Input, count: usize, source: &dyn Recordings, fastest: f64) -> Re
         let wanted = ((high - low) * fastest / DELAY_PHASE).ceil() as usize;
         return Ok(between(low, high, wanted.saturating_add(1).max(2).min(most)));
     }
-    // What was not read is not a number, and larger than nothing.
+    // `max` ignores NaN, so missing samples are skipped.
     let samples = source.samples(item.free.signal)?;
     let largest = samples.iter().flatten().fold(0.0, |largest: f64, v| largest.max(v.abs()));
     let (least, reached) = (low.max(LEAST_LIMIT * largest), high.min(largest));
@@ -213,7 +211,7 @@ fn axis(item: &Input, count: usize, source: &dyn Recordings, fastest: f64) -> Re
     Ok(values)
 }
 
-/// Where a start is, in words.
+/// Description of an initial guess.
 fn at(item: &Input, value: f64) -> String {
     match item.free.law {
         InputLaw::Delay => format!("delay {} ms", short(1e3 * value, 3)),

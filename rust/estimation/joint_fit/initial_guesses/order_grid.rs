@@ -1,10 +1,4 @@
-//! Rows of coarse lattices.
-//!
-//! Starts from coarse lattices.
-//!
-//! Coarse lattices of free orders.
-//!
-//! What an order search takes one by one.
+//! Coarse order grids and the least-squares coefficients at their best points.
 
 use std::collections::{BTreeMap, BTreeSet};
 
@@ -24,28 +18,28 @@ use crate::parallel::Stop;
 use crate::regressors::Record;
 use crate::signal::statistics::mean;
 
-/// A row of a lattice: its orders, and the coefficients freely estimated there, by name.
+/// Row of an order grid: orders and unconstrained coefficient estimates, by name.
 #[derive(Debug, Clone, Default, PartialEq)]
 pub(super) struct Row {
-    /// Orders, in the order of their axes.
+    /// Orders, in the sequence of the axes.
     pub orders: Vec<(String, f64)>,
     /// Coefficients.
     pub coefficients: BTreeMap<String, f64>,
 }
 
 impl Row {
-    /// Values of these orders.
+    /// Values of the named orders.
     pub(super) fn values(&self, names: &[String]) -> Vec<f64> {
         let value = |name: &String| self.orders.iter().find(|(n, _)| n == name).map_or(f64::NAN, |(_, value)| *value);
         names.iter().map(value).collect()
     }
 
-    /// Whether another one has the same orders, in whatever order they stand.
+    /// True if another row has the same orders, in any sequence.
     pub(super) fn is_at(&self, other: &Self) -> bool {
         self.orders.len() == other.orders.len() && self.orders.iter().all(|pair| other.orders.contains(pair))
     }
 
-    /// Takes in the orders and coefficients of another one.
+    /// Merge the orders and coefficients of another row into this one.
     fn take(&mut self, other: &Self) {
         for (name, value) in &other.orders {
             match self.orders.iter_mut().find(|(n, _)| n == name) {
@@ -57,30 +51,30 @@ impl Row {
     }
 }
 
-/// How coarse lattices are searched: by least squares, in time, on so many threads, within so many bytes.
+/// Settings of the least-squares search of coarse order grids.
 #[derive(Clone, Copy)]
 pub(super) struct Coarse<'a> {
-    /// What they are searched on.
+    /// Records of the search.
     pub records: &'a [Record],
-    /// Which signals are inputs.
+    /// True for signals that are inputs.
     pub inputs: &'a [bool],
     /// Initial terms of each record.
     pub initial: &'a Initial,
-    /// Threads.
+    /// Number of threads.
     pub threads: usize,
-    /// Bytes.
+    /// Memory budget in bytes.
     pub memory: u64,
-    /// Ends a search.
+    /// Cancellation flag.
     pub stop: &'a Stop,
 }
 
 impl Coarse<'_> {
-    /// The same on other records.
+    /// Search on other records.
     pub(super) fn on<'b>(&'b self, records: &'b [Record]) -> Coarse<'b> {
         Coarse { records, ..*self }
     }
 
-    /// So many best rows of a coarse lattice, by least squares.
+    /// Best rows of a coarse order grid by least squares, at most `keep`.
     pub(super) fn rows(&self, structure: &Structure, axes: &Axes, keep: usize) -> Result<Vec<Row>> {
         if !structure.has_order_law() {
             let tables: Result<Vec<_>> =
@@ -91,7 +85,7 @@ impl Coarse<'_> {
         if stages.len() <= 1 {
             return self.of_stage(structure, axes, keep);
         }
-        // Stages that share no order are searched one by one; the best of each belong together.
+        // Groups of equations without common orders are searched separately; their best rows are combined.
         let table = |stage: &Structure| {
             let names = stage.order_names();
             let own: Axes = axes.iter().filter(|(name, _)| names.contains(name)).cloned().collect();
@@ -109,7 +103,7 @@ impl Coarse<'_> {
         Control { stop: self.stop.clone(), ..Control::default() }
     }
 
-    /// Best rows of equations under their order law.
+    /// Best rows of coupled equations with an order law.
     #[allow(clippy::cast_precision_loss)]
     fn of_stage(&self, structure: &Structure, axes: &Axes, keep: usize) -> Result<Vec<Row>> {
         let (names, along): (Vec<String>, Vec<Vec<f64>>) = axes.iter().cloned().unzip();
@@ -133,7 +127,7 @@ impl Coarse<'_> {
         Ok(found.rows.into_iter().map(row).collect())
     }
 
-    /// Best rows of one equation whose orders are free by themselves.
+    /// Best rows of one equation with independent free orders.
     fn of_equation(&self, structure: &Structure, item: &Equation, axes: &Axes, keep: usize) -> Result<Vec<Row>> {
         check_linear(structure, item, "an order search")?;
         let axis = |order: &Order| match order.names().next() {
@@ -162,7 +156,7 @@ impl Coarse<'_> {
     }
 }
 
-/// Rows of independent tables side by side, rank by rank; a table that ends goes on with its last row.
+/// Combine rows of independent tables rank by rank; a shorter table repeats its last row.
 pub(super) fn side_by_side(tables: &[Vec<Row>], structure: &Structure) -> Vec<Row> {
     let wanted = structure.coefficient_names().len();
     let merged = |rank: usize| {
@@ -174,18 +168,18 @@ pub(super) fn side_by_side(tables: &[Vec<Row>], structure: &Structure) -> Vec<Ro
     (0..ranks).map(merged).filter(|row| row.coefficients.len() == wanted).collect()
 }
 
-/// Free coefficients by name from the core's products of factor and coefficient.
+/// Free coefficients by name, from products of factor and coefficient.
 pub(super) fn named_coefficients<'a>(item: &'a Equation, raw: &'a [f64]) -> impl Iterator<Item = (String, f64)> + 'a {
     let pairs = item.terms.iter().zip(raw);
     pairs.filter_map(|(term, c)| Some((term.coefficient.name()?.clone(), c / term.factor)))
 }
 
-/// Products of factor and coefficient where they are known.
+/// Products of factor and coefficient of the fixed terms; None for free ones.
 pub(super) fn known(item: &Equation) -> Vec<Option<f64>> {
     item.terms.iter().map(Term::fixed).collect()
 }
 
-/// Refuses friction where nothing knows it.
+/// Reject friction in methods that are linear in the coefficients.
 pub(super) fn check_linear(structure: &Structure, item: &Equation, what: &str) -> Result<()> {
     if item.friction.is_none() {
         return Ok(());
@@ -197,10 +191,10 @@ pub(super) fn check_linear(structure: &Structure, item: &Equation, what: &str) -
     })
 }
 
-/// The core knows signals by number; people know them by name.
+/// Replace signal numbers by names in error messages.
 fn named_signals(error: Error, signals: &[String]) -> Error {
     let named = |mut text: String| {
-        // From the last on, so that no number is the beginning of another.
+        // Descending, so that no number is a prefix of another.
         for (i, signal) in signals.iter().enumerate().rev() {
             text = text.replace(&format!("signal {i}"), &format!("signal '{signal}'"));
         }
@@ -220,25 +214,25 @@ fn deviation(values: &[f64]) -> f64 {
     mean(&squares).sqrt()
 }
 
-/// Steps of the lattices on which a row is followed downhill, and how often it may move on each.
+/// Increments of the local refinement of a grid point, and maximum number of moves with each.
 const ZOOM_STEPS: [f64; 2] = [0.1, 0.05];
 const ZOOM_ROUNDS: usize = 8;
-/// Rows of each prefilter's table that are looked at, all where the first few do not do, and how many of them become
-/// starts: the first, then those that differ by APART in some order.
+/// Best rows of the table of each prefilter to examine first, then at most, and maximum number of initial guesses: the
+/// best row, then rows that differ sufficiently in some order.
 const FIRST_ROWS: usize = 25;
 const ROWS_PER_FILTER: usize = 400;
 const STARTS_PER_FILTER: usize = 4;
-/// Ratios of a coefficient law at which a start takes one equation's coefficients from another's.
+/// Ratios of a coefficient law at which the coefficients of one equation follow from those of another.
 const LAW_RATIOS: [f64; 3] = [0.25, 1.0, 4.0];
-/// Orders are one where they differ by less than these shares of 1 and of themselves.
+/// Absolute and relative difference below which two orders are equal.
 const CLOSE: (f64, f64) = (1e-9, 1e-5);
 
-/// A start.
+/// Candidate from orders and coefficients.
 pub(super) fn runner(orders: Vec<f64>, coefficients: Vec<f64>, origin: &str) -> Runner {
     Runner::at(Place { point: Point { orders, coefficients, inputs: Vec::new() }, states: Vec::new() }, origin)
 }
 
-/// Starts from the rows of a lattice that lie apart, the best one followed downhill; none that stood before.
+/// Candidates from separated rows of an order grid, the best one refined locally, without earlier candidates.
 pub(super) fn lattice_attempts(
     free: &Free,
     coarse: &Coarse<'_>,
@@ -268,7 +262,7 @@ fn close(values: &[f64], others: &[f64]) -> bool {
     values.iter().zip(others).all(|(a, b)| (a - b).abs() <= CLOSE.0 + CLOSE.1 * b.abs())
 }
 
-/// The rows of a lattice, best first, that each differ from all before in some order; many are asked for late.
+/// Iterator over the best rows of an order grid that differ from all previous ones in some order.
 struct LyingApart<'a> {
     free: &'a Free,
     coarse: &'a Coarse<'a>,
@@ -277,7 +271,7 @@ struct LyingApart<'a> {
     picked: Vec<Vec<f64>>,
     rows: std::vec::IntoIter<Row>,
     seen: usize,
-    /// How many are asked for next; none where no more are there.
+    /// Table sizes still to request; empty if there are no more rows.
     wanted: Vec<usize>,
 }
 
@@ -309,10 +303,11 @@ impl<'a> LyingApart<'a> {
     }
 }
 
-/// Starts with one equation's coefficients from another's by the law, the rest of it by least squares.
+/// Candidates with the coefficients of one equation from another by the law, the rest by least squares.
 ///
-/// The hub of an arm is overdamped: current and friction nearly cancel, and what is left of the hub's acceleration is told
-/// as well by the link's own equation. Freely estimated, the hub's becomes the link's, stiffness reversed.
+/// The motor hub of a flexible arm is overdamped: current and friction nearly cancel, and the link equation explains
+/// the rest of the acceleration equally well. An unconstrained estimate of the hub equation then converges to the link
+/// equation with the sign of the stiffness reversed.
 pub(super) fn lawful_attempts(free: &Free, coarse: &Coarse<'_>, axes: &Axes, origin: &str) -> Result<Vec<Runner>> {
     let (structure, signs) = (&free.structure, &free.structure.hints.positive);
     let tied: Vec<(&Law, &String, usize)> = (free.products.iter())
@@ -350,7 +345,7 @@ pub(super) fn lawful_attempts(free: &Free, coarse: &Coarse<'_>, axes: &Axes, ori
     Ok(attempts)
 }
 
-/// Follow a row downhill on ever finer lattices around it.
+/// Refine a row locally on finer grids around it.
 fn zoom(free: &Free, coarse: &Coarse<'_>, mut row: Row) -> Result<Row> {
     if row.orders.is_empty() {
         return Ok(row);
@@ -377,26 +372,26 @@ fn zoom(free: &Free, coarse: &Coarse<'_>, mut row: Row) -> Result<Row> {
     Ok(row)
 }
 
-/// A number to nine decimals, the nearest of them that there is.
+/// Round a value to nine decimals.
 fn to_nine(value: f64) -> f64 {
     format!("{value:.9}").parse().unwrap_or(value)
 }
 
-/// Step of the lattice on which starts are searched; a start within half of it leads to the optimum.
+/// Increment of the order grid of the initial guesses; a start within half of it leads to the optimum.
 const START_STEP: f64 = 0.2;
-/// Candidates of the start's lattice beyond which orders of other signals get fewer values.
+/// Number of grid points above which the orders of other signals get fewer values.
 const START_CANDIDATES: u128 = 200_000;
-/// The lowest of the intervals that are usual for highest orders where nothing is known of them.
+/// Lower end of the typical interval of highest orders without prior knowledge.
 const LOWEST: f64 = 0.2;
-/// Highest order that any term but the highest is started from.
+/// Largest initial guess of the order of a term below the highest derivative.
 const BELOW: f64 = 2.0;
-/// Orders are kept to one in so many.
+/// Inverse of the resolution to which orders are rounded.
 const GRAINS: f64 = 1e9;
 
 /// Values of free orders, by name.
 pub(super) type Axes = Vec<(String, Vec<f64>)>;
 
-/// A coarse lattice of the free orders within their bounds.
+/// Coarse grid of the free orders within their bounds.
 #[allow(clippy::cast_possible_truncation, clippy::cast_sign_loss)]
 pub(super) fn start_axes(free: &Free) -> Axes {
     let equations = &free.structure.equations;
@@ -418,7 +413,7 @@ pub(super) fn start_axes(free: &Free) -> Axes {
         (name.clone(), values)
     };
     let mut axes: Axes = free.orders.iter().zip(free.bounds()).map(axis).collect();
-    // Orders at which other signals enter matter less for where the optimum is than the output's own.
+    // The orders of other signals affect the location of the optimum less than the autoregressive orders.
     let driving: BTreeSet<&String> = equations
         .iter()
         .flat_map(|e| e.driving().flat_map(|term| term.order.names()))
@@ -437,7 +432,7 @@ pub(super) fn start_axes(free: &Free) -> Axes {
     axes
 }
 
-/// A small lattice beside the whole orders of a structure's physics, or none where it knows of none.
+/// Small grid of the typical orders of a structure; None if there are none.
 pub(super) fn natural_axes(free: &Free) -> Option<Axes> {
     let natural = &free.structure.hints.natural;
     let axis = |(name, &(low, high)): (&String, &(f64, f64))| {
@@ -449,7 +444,7 @@ pub(super) fn natural_axes(free: &Free) -> Option<Axes> {
     (!natural.is_empty()).then_some(axes)
 }
 
-/// Evenly spaced values from one to another, both ends as they are.
+/// Evenly spaced values including both exact ends.
 #[allow(clippy::cast_precision_loss)]
 pub(super) fn between(low: f64, high: f64, count: usize) -> Vec<f64> {
     let intervals = count.saturating_sub(1);
@@ -458,21 +453,20 @@ pub(super) fn between(low: f64, high: f64, count: usize) -> Vec<f64> {
     (0..count).map(value).collect()
 }
 
-/// The values of an order; none where it is not among them.
+/// Values of an order; empty if it is not in the grid.
 pub(super) fn values<'a>(axes: &'a Axes, name: &str) -> &'a [f64] {
     axes.iter().find(|(n, _)| n == name).map_or(&[], |(_, values)| values)
 }
 
-/// Candidates of an equation's lattice, whether they make an equation or not.
+/// Number of grid points of an equation, including invalid ones.
 fn size(equation: &Equation, axes: &Axes) -> u128 {
     let names: BTreeSet<&String> = equation.orders().flat_map(Order::names).collect();
     names.iter().fold(1, |size, name| size.saturating_mul(values(axes, name).len() as u128))
 }
 
-/// What an order search takes one by one: equations that share no free order do not wait for one another.
+/// Groups of equations that share no free order, so that an order search can treat them separately.
 ///
-/// Equations that an order law ties stay together; any other equation is by itself. Equations without free orders are
-/// left out.
+/// Equations tied by an order law form one group. Equations without free orders are omitted.
 pub(super) fn parts(structure: &Structure) -> Vec<Structure> {
     let mut groups: Vec<(BTreeSet<&String>, Vec<&Equation>)> = Vec::new();
     for item in &structure.equations {

@@ -1,8 +1,8 @@
-//! Starts from a scan of resonances: with the own terms of an equation fixed, its output error is linear in the rest.
+//! Initial guesses from a scan of resonances: for fixed autoregressive terms the output error is linear in the rest.
 //!
-//! Where signals feed back on each other or residuals are coloured, least squares on the equation error says nothing about
-//! the own terms. Here they are put on a grid of frequencies and damping ratios; all other coefficients, and the initial
-//! terms, follow by linear least squares on the output error itself.
+//! With feedback between signals or autocorrelated residuals, equation-error least squares does not identify the
+//! autoregressive terms. Here they are placed on a grid of frequencies and damping ratios. All other coefficients and
+//! the initial terms follow by linear least squares on the output error.
 
 use std::collections::BTreeMap;
 
@@ -15,8 +15,7 @@ use crate::estimation::joint_fit::structure::{Equation, Structure, Term};
 use crate::estimation::resonance_scan::projected;
 use crate::signal::statistics::median;
 
-/// Frequencies of the scan in units of the frequency below which 90 % of the output's power lies: evenly from 0.15 to 8 in
-/// logarithms.
+/// Frequencies of the scan relative to the bandwidth of the output, logarithmically spaced from 0.15 to 8.
 const FREQUENCIES: [f64; 14] = [
     0.15,
     0.203_674_807_750_629_52,
@@ -33,16 +32,16 @@ const FREQUENCIES: [f64; 14] = [
     5.891_744_851_769_920_5,
     8.0,
 ];
-/// Damping ratios.
+/// Damping ratios of the scan.
 const DAMPINGS: [f64; 4] = [0.03, 0.15, 0.5, 1.0];
-/// Points of a scan of resonances that become starts.
+/// Maximum number of points of a scan that become candidates.
 const SCANNED: usize = 4;
-/// Powers of t closer than this are one.
+/// Difference below which two exponents of t are equal.
 const GRAIN: f64 = 1e-9;
 
-/// Starts whose own terms are scanned over frequency and damping, at whole orders and at the lattice's best ones.
+/// Candidates from a scan over frequency and damping, at integer orders and at the best orders of the grid.
 ///
-/// Of each equation the frequencies of its output on each run are given.
+/// `frequencies` are the bandwidths of the output of each equation, by run.
 pub(super) fn scanned_attempts(
     free: &Free,
     coarse: &Coarse<'_>,
@@ -58,7 +57,7 @@ pub(super) fn scanned_attempts(
     let mut out = Vec::new();
     for values in points {
         let point: BTreeMap<String, f64> = free.orders.iter().cloned().zip(values.iter().copied()).collect();
-        // Whole orders that the bounds moved together make no equation.
+        // Integer orders that coincide at the bounds give no valid equation.
         let Ok(fixed) = structure.with_orders(&point) else { continue };
         if doubles(&fixed) {
             continue;
@@ -73,7 +72,7 @@ pub(super) fn scanned_attempts(
     Ok(out)
 }
 
-/// Whether an offset is one of the initial terms that were given: they cannot be told apart.
+/// True if an offset coincides with a given initial term: they are not separately identifiable.
 fn doubles(fixed: &Structure) -> bool {
     let given = match fixed.initial.under() {
         Initial::Powers(powers) if !fixed.history => powers,
@@ -83,8 +82,7 @@ fn doubles(fixed: &Structure) -> bool {
     fixed.equations.iter().flat_map(offsets).any(|power| given.iter().any(|e| (power - e).abs() < GRAIN))
 }
 
-/// Coefficients of the own terms of D^alpha y = -2 zeta w^(alpha - nu) D^nu y - w^alpha y, one a term; none where all are
-/// known, or some.
+/// Autoregressive coefficients of D^alpha y = -2 zeta w^(alpha - nu) D^nu y - w^alpha y; None if any is fixed.
 #[allow(clippy::cast_precision_loss)]
 fn own_coefficients(item: &Equation, omega: f64, damping: f64) -> Option<Vec<(String, f64)>> {
     let mut own: Vec<(usize, &Term)> = item.own().enumerate().collect();
@@ -99,9 +97,9 @@ fn own_coefficients(item: &Equation, omega: f64, damping: f64) -> Option<Vec<(St
     Some(out).filter(|out| !out.is_empty())
 }
 
-/// Best points of the scan of one equation whose orders are numbers, of each frequency only the best damping.
+/// Best points of the scan of one equation with fixed orders, with the best damping of each frequency.
 ///
-/// The frequency \[rad/s\] is the unit of the scan's. Points come in the order of their root mean square output error.
+/// The scan is relative to `frequency` \[rad/s\]. Points are sorted by their root mean square output error.
 fn scan_equation(structure: &Structure, item: &Equation, coarse: &Coarse<'_>, frequency: f64) -> Result<Vec<Row>> {
     let others: Vec<Term> = item.driving().cloned().collect();
     let own: Vec<&Term> = item.own().collect();
@@ -113,7 +111,7 @@ fn scan_equation(structure: &Structure, item: &Equation, coarse: &Coarse<'_>, fr
     let Some(tried) = tried else { return Ok(Vec::new()) };
     check_linear(structure, item, "what is linear in its coefficients")?;
     coarse.stop.check()?;
-    // Caputo's powers of the whole equation: the rest alone would not know those of the own terms.
+    // The Caputo exponents must be those of the full equation, including the autoregressive terms.
     let rest = Equation { terms: others, ..item.clone() };
     let bare = Bare {
         output: rest.output,
@@ -127,7 +125,7 @@ fn scan_equation(structure: &Structure, item: &Equation, coarse: &Coarse<'_>, fr
     let found = projected(coarse.records, &bare, &known(&rest), coarse.initial, &etas, &points)?;
     let mut best: Vec<(f64, Row)> = Vec::new();
     for (found, tried) in found.chunks(DAMPINGS.len()).zip(tried.chunks(DAMPINGS.len())) {
-        // What is not there is too fast for the step, or has regressors that this filter makes alike.
+        // Missing points are too fast for the step, or have collinear regressors.
         let there = found.iter().zip(tried).filter_map(|(at, values)| Some((at.as_ref()?, values)));
         let there = there.filter(|(at, _)| at.error.is_finite());
         if let Some((at, values)) = there.min_by(|(a, _), (b, _)| a.error.total_cmp(&b.error)) {

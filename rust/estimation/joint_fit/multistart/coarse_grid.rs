@@ -1,6 +1,4 @@
-//! A grid on which starts may compete.
-//!
-//! As many samples as starts compete on.
+//! Coarse grid of the multistart: subsampled records on which candidates compete.
 
 use super::halving::{distinct, near, same_optimum, same_place, Laps, FIRST_LAP, GLANCE};
 use crate::error::Result;
@@ -11,26 +9,26 @@ use crate::estimation::joint_fit::problem::Runner;
 use crate::estimation::joint_fit::source::{Recordings, Sampling};
 use crate::signal::statistics::mean;
 
-/// Starts that tell how fine the grid must be on which all compete.
+/// Number of candidates that determine the step of the coarse grid.
 const PIONEERS: usize = 3;
-/// A coarse grid tells where starts lead if a finer one moves no number of the best by more than this share.
+/// Largest relative change of a parameter of the best candidate on a finer grid for which the ranking is stable.
 const MOVED: f64 = 0.1;
 
-/// A grid on which starts may compete.
+/// Coarse grid and the candidates optimized on it so far.
 pub(super) struct Chosen<'a> {
     pub grid: Grid<'a>,
-    /// The same on half the step, where it was made.
+    /// The grid of half the step, if it was computed.
     pub half: Option<Grid<'a>>,
-    /// Where the others are after a glance.
+    /// Remaining candidates after the prescreening.
     pub glanced: Vec<Runner>,
-    /// Where a few are after a lap.
+    /// Pilot candidates after the first budget.
     pub ran: Vec<Runner>,
 }
 
-/// A grid on which starts may compete, as far as a few tell.
+/// Choose the coarse grid by a few pilot candidates.
 ///
-/// A stiff equation may have no stable scheme, and so no start, on a coarse grid; and a coarse grid has optima of its own:
-/// all start anew on the grid on which those few no longer move.
+/// A stiff equation may have no stable scheme on a coarse grid, and a coarse grid has spurious optima. The step is
+/// halved until the pilot candidates no longer change; then all candidates start on that grid.
 pub(super) fn fine_enough<'a>(laps: Laps<'_>, free: &Free, coarse: Grid<'a>, starts: &[Runner]) -> Result<Chosen<'a>> {
     let glance = |grid: &Grid<'_>, starts: &[Runner]| Ok(distinct(&laps.run(free, grid, starts, GLANCE)?, same_place));
     let mut glanced: Vec<Runner> = glance(&coarse, starts)?;
@@ -56,7 +54,7 @@ pub(super) fn fine_enough<'a>(laps: Laps<'_>, free: &Free, coarse: Grid<'a>, sta
         }
         (coarse, pioneers) = (finer, reached);
         if pioneers.is_empty() {
-            // Where none has a scheme, others may on half the step.
+            // If no pilot has a stable scheme, other candidates may have one on half the step.
             pioneers = glance(&coarse, starts)?;
             pioneers.truncate(PIONEERS);
         }
@@ -73,7 +71,7 @@ pub(super) fn fine_enough<'a>(laps: Laps<'_>, free: &Free, coarse: Grid<'a>, sta
     if let Some((grid, _)) = before.iter().find(alike) {
         let glanced = glance(grid, &starts)?;
         if glanced.iter().map(|runner| 1 + runner.alike.len()).sum::<usize>() == starts.len() {
-            // This coarser grid has the same optimum, a little moved: of those that come to one place there one goes on.
+            // This coarser grid has nearly the same optimum: one candidate per optimum found there continues.
             starts = distinct(&laps.run(free, grid, &glanced, FIRST_LAP)?, same_optimum);
         }
     }
@@ -81,20 +79,20 @@ pub(super) fn fine_enough<'a>(laps: Laps<'_>, free: &Free, coarse: Grid<'a>, sta
     Ok(Chosen { grid: coarse, half, glanced, ran: Vec::new() })
 }
 
-/// Samples of the coarse fits that compare starts, of all runs together, and of each at least; the best ones continue on all
-/// samples.
+/// Samples of the coarse fits over all runs; each run has at least [`MIN_RUN_SAMPLES`].
 const COARSE_SAMPLES: usize = 1200;
 const LEAST_SAMPLES: usize = 400;
-/// So many samples become one without asking what that shows; half a turn of what holds 90 % of the power is to be as many
-/// at least; a part of a record stands for it if its outputs deviate by this share of the whole's.
+/// Largest decimation without a check of the bandwidth. Above it, half a period of the frequency that contains 90 % of
+/// the power needs at least [`MIN_SAMPLES_PER_HALF_PERIOD`]. The first part of a record can represent it if its outputs
+/// have at least [`MIN_DEVIATION_RATIO`] of the standard deviation of the whole.
 const THINNEST: usize = 10;
 const SHOWN: f64 = 1.0;
 const AS_LIVELY: f64 = 0.7;
 
-/// A sampling of as many samples as starts compete on: what one run does not tell of where they lead, another does.
+/// Sampling of the runs for the multistart.
 ///
-/// Thinned until they no longer show the motion, the samples of a long record tell no start from another: then its first
-/// part is taken, if that moves as the whole does.
+/// Decimation must not alias the motion. If a long record needs a larger decimation, its first part is used instead,
+/// provided that it varies like the whole record.
 #[allow(clippy::cast_precision_loss, clippy::cast_possible_truncation, clippy::cast_sign_loss)]
 pub(super) fn thinned(free: &Free, source: &dyn Recordings) -> Result<Sampling> {
     let spans = source.spans();
@@ -125,7 +123,7 @@ pub(super) fn thinned(free: &Free, source: &dyn Recordings) -> Result<Sampling> 
     Ok(Sampling { decimation: carried, first: Some(first), ..all })
 }
 
-/// Standard deviation of what was read.
+/// Standard deviation of the present samples.
 fn deviation(samples: &[f64]) -> f64 {
     let known: Vec<f64> = samples.iter().copied().filter(|v| !v.is_nan()).collect();
     let middle = mean(&known);

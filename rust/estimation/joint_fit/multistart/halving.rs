@@ -1,4 +1,4 @@
-//! Laps of runners on a grid, and which of those that ended go on.
+//! Successive halving: evaluation budgets, survivors and distinct optima.
 
 use std::sync::atomic::{AtomicUsize, Ordering};
 use std::sync::mpsc::channel;
@@ -11,27 +11,28 @@ use crate::estimation::joint_fit::progress::Listener;
 use crate::estimation::output_error::{Experiment, Settings};
 use crate::parallel::Stop;
 
-/// Evaluations of every coarse fit, then of those that are ahead: one in [`RUNNERS`], but not fewer than [`FEWEST`].
+/// Evaluations of every candidate. Then the best get [`SECOND_BUDGET_EVALUATIONS`]: one in [`CANDIDATES_PER_SURVIVOR`],
+/// but at least [`MIN_SURVIVORS`].
 pub(super) const FIRST_LAP: usize = 15;
 pub(super) const SECOND_LAP: usize = 60;
 pub(super) const RUNNERS: usize = 3;
 pub(super) const FEWEST: usize = 8;
-/// Evaluations by which those are chosen that run ahead.
+/// Evaluations of the prescreening.
 pub(super) const GLANCE: usize = 2;
-/// Coarse fits that continue on all samples.
+/// Maximum number of candidates that continue on all samples.
 pub(super) const FINALISTS: usize = 3;
-/// ... unless their coarse cost exceeds the best one's by this factor; on few samples nobody as far behind goes on.
+/// Ratio to the best coarse cost above which a candidate does not continue.
 pub(super) const CONTENDER: f64 = 3.0;
-/// Share of its start below which a coefficient is as good as 0: a descent that keeps its sign ends at e^-20.
+/// Ratio to its initial guess below which a coefficient counts as 0: in logarithms an optimization stops at e^-20.
 const VANISHED: f64 = 1e-8;
-/// Two costs closer than this share are the same optimum.
+/// Relative difference of two costs below which they can belong to the same optimum.
 const SAME_COST: f64 = 1e-3;
-/// Starts whose numbers are all as near as this share are in the same place, optima if their orders are as near as this.
+/// Relative difference of all parameters below which candidates coincide; absolute one of the orders of an optimum.
 const SAME_PLACE: f64 = 0.02;
-/// ... and by this share of themselves: orders are of any size.
+/// Relative difference of the orders of the same optimum, added to the absolute one.
 const SAME_ORDER: f64 = 1e-5;
 
-/// Who runs how many laps at a time, and who is told.
+/// Executor of budgets: number of starts for the progress, threads, progress callback.
 #[derive(Clone, Copy)]
 pub(super) struct Laps<'a> {
     pub starts: usize,
@@ -40,7 +41,7 @@ pub(super) struct Laps<'a> {
 }
 
 impl Laps<'_> {
-    /// Where the runners get with so many evaluations of a problem, best first.
+    /// Optimize candidates with a budget of evaluations; return them best first.
     pub(super) fn run(
         &self,
         free: &Free,
@@ -52,7 +53,7 @@ impl Laps<'_> {
         Ok(sorted(ended.into_iter().flatten().collect()))
     }
 
-    /// Where each of the runners gets; none of those whose free run is not finite.
+    /// Optimize each candidate with a budget of evaluations; None if its simulation is not finite.
     pub(super) fn each(
         &self,
         free: &Free,
@@ -115,7 +116,7 @@ impl Laps<'_> {
     }
 }
 
-/// What all runners of a lap share.
+/// Common settings of the candidates of one budget.
 struct Lap<'a> {
     free: &'a Free,
     experiments: &'a [Experiment],
@@ -125,7 +126,7 @@ struct Lap<'a> {
 }
 
 impl Lap<'_> {
-    /// Where a runner gets; a start whose free run is not finite is no start, and if none is left, the fit says so.
+    /// Optimize one candidate; None if its simulation is not finite.
     fn tried(&self, runner: &Runner) -> Result<Option<Runner>> {
         let settings = Settings { evaluations: self.evaluations, tolerance: TOLERANCE };
         let place = &runner.attempt.place;
@@ -138,9 +139,7 @@ impl Lap<'_> {
     }
 }
 
-/// A runner with coefficients at 0 that fell towards it as far as a sign that is kept lets them.
-///
-/// From there they may take the other sign.
+/// Set coefficients to 0 that vanished in logarithmic coordinates, so that they can change their sign.
 fn without_vanished(free: &Free, start: &Runner, mut ended: Runner) -> Runner {
     if free.products.is_empty() && !free.has_friction() {
         let before = &start.attempt.place.point.coefficients;
@@ -153,13 +152,13 @@ fn without_vanished(free: &Free, start: &Runner, mut ended: Runner) -> Runner {
     ended
 }
 
-/// Best first; those that cost the same as they stood.
+/// Sort candidates by cost, stable for ties.
 pub(super) fn sorted(mut runners: Vec<Runner>) -> Vec<Runner> {
     runners.sort_by(|a, b| a.level().total_cmp(&b.level()));
     runners
 }
 
-/// Those that go on on all samples: the best of different optima, unless they are far behind.
+/// Survivors that continue on all samples: the best distinct optima within the cost ratio.
 #[must_use]
 pub fn finalists(reached: &[Runner]) -> Vec<Runner> {
     let mut first = distinct(reached, same_optimum);
@@ -167,14 +166,14 @@ pub fn finalists(reached: &[Runner]) -> Vec<Runner> {
     in_reach(&first)
 }
 
-/// Those of runners, best first, that are not far behind the best; on a finer grid one that is may come before another.
+/// Candidates with a cost within [`MAX_SURVIVOR_COST_RATIO`] of the best; the input need not be sorted after the first.
 #[must_use]
 pub fn in_reach(reached: &[Runner]) -> Vec<Runner> {
     let limit = reached.first().map_or(0.0, |best| CONTENDER * best.level());
     reached.iter().filter(|runner| runner.level() <= limit).cloned().collect()
 }
 
-/// Whether two that ended cost the same at orders that are as near.
+/// True if two candidates agree in cost and orders.
 #[must_use]
 pub fn same_optimum(one: &Runner, other: &Runner) -> bool {
     let orders = |runner: &Runner| runner.attempt.place.point.orders.clone();
@@ -182,18 +181,18 @@ pub fn same_optimum(one: &Runner, other: &Runner) -> bool {
         && near(&orders(other), &orders(one), SAME_ORDER, SAME_PLACE)
 }
 
-/// Whether two are at the same numbers, each as near as a share of itself: several lattices have the same rows.
+/// True if two candidates agree in all parameters. Several order grids contain the same points.
 #[must_use]
 pub fn same_place(one: &Runner, other: &Runner) -> bool {
     near(&other.attempt.values(), &one.attempt.values(), SAME_PLACE, 0.0)
 }
 
-/// Whether each number is as near to another as a share of that and a distance.
+/// True if all values agree within a relative and an absolute tolerance.
 pub(super) fn near(numbers: &[f64], others: &[f64], share: f64, distance: f64) -> bool {
     numbers.iter().zip(others).all(|(a, b)| (a - b).abs() <= distance + share * b.abs())
 }
 
-/// Runners, best first; those that are the same as an earlier one are alike to it.
+/// Merge candidates that duplicate an earlier one; their origins are added to it.
 #[must_use]
 pub fn distinct(runners: &[Runner], same: impl Fn(&Runner, &Runner) -> bool) -> Vec<Runner> {
     let mut kept: Vec<Runner> = Vec::new();
@@ -227,7 +226,7 @@ mod tests {
 
     #[test]
     fn one_too_far_behind_hides_nobody_behind_it() {
-        // On a finer grid the last one was last: its own level is in reach all the same.
+        // The order comes from a finer grid; the cost of the last one is within the ratio nevertheless.
         let reached = [ended(1.0, 0.5), ended(3.5, 1.0), ended(2.0, 1.5)];
         let orders: Vec<f64> = finalists(&reached).iter().map(|r| r.attempt.place.point.orders[0]).collect();
         assert_eq!(orders, [0.5, 1.5]);

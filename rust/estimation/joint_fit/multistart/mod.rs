@@ -1,8 +1,9 @@
-//! The race of starts: short fits on thinned samples, of which the best go on.
+//! Multistart with successive halving: short fits on subsampled records, of which the best continue.
 //!
-//! [`race`] sends starts over laps, from a glance to those few that go on on all samples. Beside them run the problems
-//! inside a problem, whose optima it reaches, too: a term less ([`Simpler`]), an order less ([`LowerOrder`]), orders known
-//! ([`Held`]) or whole ([`Whole`]).
+//! Candidates are optimized with growing budgets, from a prescreening to the few survivors that continue on all
+//! samples. Submodels supply further candidates, because the full problem reaches their optima, too: problems with one
+//! term less ([`ReducedProblem`]), a lower order ([`LowerOrderProblem`]), one fixed order ([`FixedOrderProblem`]) or
+//! integer orders ([`IntegerOrderProblem`]).
 
 mod coarse_grid;
 mod halving;

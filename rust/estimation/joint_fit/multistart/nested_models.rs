@@ -1,10 +1,4 @@
-//! Problems with one term less, or known.
-//!
-//! The problem of lower order behind a pole that is too fast to see.
-//!
-//! A problem with whole orders.
-//!
-//! A problem with one of its orders known.
+//! Submodels: one term less, one fixed order, a lower order, or integer orders.
 
 use std::collections::{BTreeMap, BTreeSet};
 
@@ -15,20 +9,20 @@ use crate::estimation::joint_fit::problem::{Attempt, Place, Runner};
 use crate::estimation::joint_fit::structure::{Coefficient, Equation, Order, Structure};
 use crate::estimation::output_error::Point;
 
-/// A problem with one term less, or known: its coefficient, and the highest order of the equation that lacks it.
+/// Submodel with one term removed or its coefficient fixed.
 #[derive(Debug, Clone, PartialEq)]
 pub struct Simpler {
-    /// What is still free.
+    /// Remaining free parameters.
     pub free: Free,
     coefficient: String,
     order: Order,
     value: f64,
-    /// Whether it is an equation driven by measured signals, all of which it still has.
+    /// True if the coefficient is fixed and all signals remain in the equation.
     pub driven: bool,
 }
 
 impl Simpler {
-    /// A point of the whole problem as a start of this one.
+    /// Restrict a candidate of the full problem to this one.
     #[must_use]
     pub fn without(&self, runner: &Runner, whole: &Free) -> Runner {
         let Point { orders, coefficients, inputs } = &runner.attempt.place.point;
@@ -42,7 +36,7 @@ impl Simpler {
         Runner::at(Place { point, states: Vec::new() }, runner.origin.clone())
     }
 
-    /// The same point of the whole problem; the order of a term that is 0 may be any, so it is half the highest.
+    /// Embed a candidate in the full problem. The free order of a term with coefficient 0 is set to half the highest.
     #[must_use]
     pub fn embedded(&self, runner: &Runner, whole: &Free) -> Runner {
         let Point { orders, coefficients, inputs } = &runner.attempt.place.point;
@@ -60,11 +54,11 @@ impl Simpler {
     }
 }
 
-/// Problems with one term less; none under a law, where no coefficient can be 0 by itself.
+/// Submodels with one term less; empty with a law, under which no single coefficient can be 0.
 ///
-/// A term of a measured signal is left out where it is not the only one that drives: signals of one machine go with each
-/// other, and where one stands for the rest there is an optimum that tells nothing of the machine. For the same reason a
-/// coefficient that physics knows is held there first.
+/// A term of a measured signal is removed if it is not the only input. The signals of one machine are correlated, so
+/// there can be optima in which one signal replaces the others. For the same reason a coefficient with a known physical
+/// value is first fixed at that value.
 #[must_use]
 pub fn simpler(free: &Free) -> Vec<Simpler> {
     let structure = &free.structure;
@@ -73,7 +67,7 @@ pub fn simpler(free: &Free) -> Vec<Simpler> {
     }
     let mut out = Vec::new();
     let mut add = |reduced, name: &String, order: &Order, value, driven| {
-        // Some make no equation.
+        // Some give no valid equation.
         if let Ok(free) = Free::of(reduced) {
             out.push(Simpler { free, coefficient: name.clone(), order: order.clone(), value, driven });
         }
@@ -91,7 +85,7 @@ pub fn simpler(free: &Free) -> Vec<Simpler> {
         let driving: Vec<_> = item.driving().filter(|term| term.coefficient.name().is_some()).collect();
         for term in driving.iter().filter(|term| !structure.coupled && driving.len() > 1 && !term.order.is_free()) {
             if let Some(name) = term.coefficient.name() {
-                // The signal stays, at 0: records have it.
+                // The signal stays with coefficient 0, because the records contain it.
                 let known = BTreeMap::from([(name.clone(), 0.0)]);
                 add(structure.with_coefficients(&known), name, &item.order, 0.0, true);
             }
@@ -106,15 +100,16 @@ pub fn simpler(free: &Free) -> Vec<Simpler> {
     out
 }
 
-/// One of those that are one equation but for the names of its free numbers: of two terms alike either may go.
+/// Remove problems that differ only in the names of their free parameters.
 #[must_use]
 pub fn unlike(problems: Vec<Simpler>) -> Vec<Simpler> {
     let mut seen = BTreeSet::new();
     problems.into_iter().filter(|less| nameless(less).is_none_or(|key| seen.insert(key))).collect()
 }
 
-/// The equation of a problem, its terms in an order of their own, and bounds in place of the names of orders; none where
-/// another one may still be another problem.
+/// Canonical text of an equation, with sorted terms and bounds in place of order names.
+///
+/// None if problems with equal text can still differ.
 fn nameless(less: &Simpler) -> Option<String> {
     let structure = &less.free.structure;
     let [item] = structure.equations.as_slice() else { return None };
@@ -134,18 +129,18 @@ fn nameless(less: &Simpler) -> Option<String> {
     Some(format!("{} {} {terms:?}", item.output, of(&item.order)))
 }
 
-/// A pole of this many radians a sample is faster than the samples see.
+/// Frequency at which a pole is too fast to be identified from the samples.
 const FAST_POLE: f64 = 0.2;
-/// Powers of t closer than this are one.
+/// Difference below which two exponents of t are equal.
 const SAME_POWER: f64 = 1e-9;
 
-/// A problem one of whose equations ends with its highest own term: what is left of it behind a fast pole.
+/// Submodel of lower order: the highest autoregressive term takes the place of the highest derivative.
 ///
-/// The coefficient of that term, but for its known factor, is 1 there, and `fast` where the pole is; `others` are the
-/// coefficients of the equation's other terms.
+/// The coefficient of that term, without its fixed factor, is 1 in the submodel and `fast` in the full one.
+/// `others` are the coefficients of the remaining terms of the equation.
 #[derive(Debug, Clone, PartialEq)]
 pub struct LowerOrder {
-    /// What is free.
+    /// Free parameters.
     pub free: Free,
     coefficient: String,
     factor: f64,
@@ -154,7 +149,7 @@ pub struct LowerOrder {
 }
 
 impl LowerOrder {
-    /// The same dynamics in the whole problem, but for what is faster than the sampling.
+    /// Embed a candidate in the full problem: same dynamics with an additional fast pole.
     #[must_use]
     pub fn embedded(&self, runner: &Runner, whole: &Free) -> Runner {
         let point = &runner.attempt.place.point;
@@ -179,8 +174,8 @@ impl LowerOrder {
     }
 }
 
-/// The problem of lower order of one equation whose own orders are numbers, on samples so far apart \[s\]; free orders get
-/// there by themselves.
+/// Submodel of lower order of a single equation with fixed autoregressive orders; `step` is the sampling interval
+/// \[s\]. Free orders reach the lower order without it.
 #[must_use]
 pub fn lower_order(free: &Free, step: f64) -> Option<LowerOrder> {
     let structure = &free.structure;
@@ -203,20 +198,19 @@ pub fn lower_order(free: &Free, step: f64) -> Option<LowerOrder> {
     }
     let mut driving = rest.iter().filter(|term| term.signal != item.output && !term.order.is_free());
     if driving.any(|term| term.order.constant > order) {
-        // Another signal would stand above the order of the lower equation: it cannot where it holds between samples.
+        // A term of another signal would exceed the lower order, which is invalid with a zero-order hold.
         return None;
     }
     let others = rest.iter().filter_map(|term| term.coefficient.name().cloned()).collect();
     let initial = if structure.history { structure.initial.clone() } else { below(&structure.initial, order)? };
     let lower = Equation { order: highest.order.clone(), terms: rest, ..item.clone() };
-    // A term of another signal may differentiate more often than the equation of lower order integrates.
+    // The construction fails if a term of another signal exceeds the lower order.
     let reduced = Free::of(Structure { initial, ..structure.with_equation(0, lower) }).ok()?;
     let fast = libm::pow(FAST_POLE / step, item.order.constant - order);
     Some(LowerOrder { free: reduced, coefficient: name.clone(), factor: highest.factor, others, fast })
 }
 
-/// Initial terms whose exponents are given without those that the equation of lower order integrates to a drive; none where
-/// one of the rest is what its offset is, too.
+/// Initial terms with exponents below an order; None if one of them coincides with an exponent of the offset.
 fn below(initial: &Initial, order: f64) -> Option<Initial> {
     let Initial::Powers(powers) = initial.under() else { return Some(initial.clone()) };
     let powers: Vec<f64> = powers.iter().copied().filter(|power| *power < order).collect();
@@ -228,21 +222,21 @@ fn below(initial: &Initial, order: f64) -> Option<Initial> {
     Some(initial.with_under(under))
 }
 
-/// Whole orders that stand for a free one, and how many points of them a race looks at.
+/// Integer values of a free order; at most [`MAX_INTEGER_ORDER_PROBLEMS`] combinations are tried.
 const WHOLE: [f64; 4] = [0.0, 1.0, 2.0, 3.0];
 const MOST_WHOLE: usize = 12;
 
-/// A problem with every free order at a whole value: what a fractional one is to be better than.
+/// Submodel with every free order fixed at an integer value.
 #[derive(Debug, Clone, PartialEq)]
 pub struct Whole {
-    /// What is still free.
+    /// Remaining free parameters.
     pub free: Free,
     /// The orders.
     pub orders: Vec<f64>,
 }
 
 impl Whole {
-    /// The same point of the whole problem.
+    /// Embed a candidate of this problem in the full problem.
     #[must_use]
     pub fn embedded(&self, runner: &Runner) -> Runner {
         let mut found = runner.clone();
@@ -252,10 +246,10 @@ impl Whole {
     }
 }
 
-/// The problem with whole orders: the usual ones, those nearest to a point, and each with one of them at another.
+/// Submodels with integer orders: the usual ones, the nearest to a point, and each with one order changed.
 ///
-/// Between two whole orders the coefficient of what drives may change its sign, and no descent crosses that: what is nearest
-/// need not be what is lowest. None where they make no equation.
+/// Between two integer orders an input coefficient may change its sign, which an optimization cannot cross. The nearest
+/// integer orders need not be the best. Combinations without a valid equation are omitted.
 #[must_use]
 #[allow(clippy::float_cmp)]
 pub fn whole(free: &Free, near: &[f64]) -> Vec<Whole> {
@@ -295,27 +289,27 @@ fn nearest(values: &[f64], at: f64) -> f64 {
     values.iter().copied().reduce(|best, v| if (v - at).abs() < (best - at).abs() { v } else { best }).unwrap_or(at)
 }
 
-/// The problem at some whole orders, if they make an equation.
+/// Submodel at given integer orders; None if they give no valid equation.
 fn at(free: &Free, orders: Vec<f64>) -> Option<Whole> {
     let known: BTreeMap<String, f64> = free.orders.iter().cloned().zip(orders.iter().copied()).collect();
     let reduced = free.structure.with_orders(&known).and_then(Free::of).ok()?;
-    // Terms in the order in which they stand, so coefficients keep their places.
+    // The sequence of the terms is unchanged, so the coefficients keep their indices.
     (reduced.coefficients == free.coefficients).then_some(Whole { free: reduced, orders })
 }
 
-/// A problem with one free order at the whole value that the equation would have, the others still free.
+/// Submodel with one free order fixed at its integer value.
 #[derive(Debug, Clone, PartialEq)]
 pub struct Held {
-    /// What is still free.
+    /// Remaining free parameters.
     pub free: Free,
-    /// Place of the order in the whole problem.
+    /// Index of the order in the full problem.
     pub order: usize,
-    /// Its value.
+    /// Value of the order.
     pub value: f64,
 }
 
 impl Held {
-    /// A point of the whole problem as a start of this one: coefficients keep their numbers in the clock's unit.
+    /// Restrict a candidate of the full problem to this one, with the coefficients kept in scaled time.
     #[must_use]
     pub fn without(&self, runner: &Runner, clock: &Clock) -> Runner {
         let mut told = clock.told(&runner.attempt.values());
@@ -328,7 +322,7 @@ impl Held {
         Runner::at(Place { point, states: Vec::new() }, runner.origin.clone())
     }
 
-    /// The same point of the whole problem.
+    /// Embed a candidate of this problem in the full problem.
     #[must_use]
     pub fn embedded(&self, runner: &Runner, whole: &Free) -> Runner {
         let mut found = runner.clone();
@@ -338,7 +332,7 @@ impl Held {
     }
 }
 
-/// Problems with one order less, where there are several: none may end below the whole one.
+/// Submodels with one order fixed, if there are several orders. None may fit better than the full problem.
 #[must_use]
 #[allow(clippy::float_cmp)]
 pub fn held(free: &Free) -> Vec<Held> {
@@ -348,7 +342,7 @@ pub fn held(free: &Free) -> Vec<Held> {
             continue;
         }
         let known = BTreeMap::from([(free.orders[order].clone(), value)]);
-        // Some make no equation.
+        // Some give no valid equation.
         let Ok(reduced) = free.structure.with_orders(&known).and_then(Free::of) else { continue };
         let rest = free.orders.iter().enumerate().filter(|(k, _)| *k != order).map(|(_, name)| name);
         if reduced.coefficients == free.coefficients && reduced.orders.iter().eq(rest) {

@@ -1,8 +1,4 @@
-//! The race itself: who runs how far, and the problems inside a problem.
-//!
-//! Those that are behind: who is still on the way goes on.
-//!
-//! Starts of bodies with friction on coarse grids.
+//! Multistart with successive halving: candidates, budgets, promotion and submodels.
 
 use super::coarse_grid::{fine_enough, thinned};
 use super::halving::{
@@ -20,41 +16,41 @@ use crate::estimation::joint_fit::source::Recordings;
 use crate::estimation::joint_fit::structure::{Equation, Structure};
 use crate::parallel::Stop;
 
-/// All get as many evaluations as those ahead where the best is above the noise by this factor; of those further behind than
-/// contenders are, by no more than the second factor, who falls by a share in a few evaluations.
+/// Ratio of the best cost to the noise floor above which candidates behind the best are promoted, too. Candidates up to
+/// [`MAX_PROMOTION_COST_RATIO`] are promoted if they improve in a few evaluations.
 const ABOVE_FLOOR: f64 = 2.0;
 const FAR_BEHIND: f64 = 100.0;
 
-/// Where a race starts.
+/// Source of initial guesses.
 pub trait Starts {
-    /// Starts of a problem on the runs.
+    /// Initial guesses of a problem on the runs.
     ///
     /// # Errors
-    /// Where its equations cannot be searched, [`Error::Interrupted`].
+    /// If its equations cannot be searched; [`Error::Interrupted`].
     fn of(&self, free: &Free) -> Result<Vec<Runner>>;
 }
 
-/// What the races of a problem and of those inside it share.
+/// Common data of the multistarts of a problem and of its submodels.
 #[derive(Clone, Copy)]
 pub struct Course<'a> {
     /// The runs.
     pub source: &'a dyn Recordings,
-    /// Where races start.
+    /// Source of initial guesses.
     pub starts: &'a dyn Starts,
-    /// Whom to ask whether to go on.
+    /// Cancellation flag.
     pub stop: &'a Stop,
-    /// What each output weighs: alike, for noise decides where the optimum is, not how to get near it.
+    /// Weights of the outputs, equal relative to their standard deviations.
     pub weights: &'a [f64],
-    /// What noise alone leaves per residual.
+    /// Noise floor of the cost per residual.
     pub floor: f64,
-    /// Threads; no number depends on them.
+    /// Number of threads; results do not depend on it.
     pub threads: usize,
-    /// Who is told (starts done, starts in all); nobody of a race inside another.
+    /// Progress callback of (starts done, all starts); None in a nested multistart.
     pub told: Option<&'a Listener<'a>>,
 }
 
 impl<'a> Course<'a> {
-    /// That of a race inside this one.
+    /// Context of a nested multistart.
     fn inside(self) -> Self {
         Self { told: None, ..self }
     }
@@ -68,10 +64,10 @@ impl<'a> Course<'a> {
     }
 }
 
-/// Coarse fits from all starts, best first.
+/// Run the multistart on subsampled records; return the candidates best first.
 ///
 /// # Errors
-/// Those of the source and of the starts, what whoever is told ends with, [`Error::Interrupted`].
+/// As the source, the initial guesses and the callback; [`Error::Interrupted`].
 pub fn race(free: &Free, course: Course<'_>) -> Result<Vec<Runner>> {
     if free.structure.history {
         return with_history(free, course);
@@ -79,7 +75,7 @@ pub fn race(free: &Free, course: Course<'_>) -> Result<Vec<Runner>> {
     Ok(without_history(free, course)?.0)
 }
 
-/// What a computation found; nothing where it made no equation.
+/// Convert the error of an invalid model to None.
 fn made<T>(found: Result<T>) -> Result<Option<T>> {
     match found {
         Err(error) if error.kind() == Kind::Model => Ok(None),
@@ -87,23 +83,23 @@ fn made<T>(found: Result<T>) -> Result<Option<T>> {
     }
 }
 
-/// A race under way.
+/// State of a multistart.
 struct Run<'a> {
     free: &'a Free,
     course: Course<'a>,
     laps: Laps<'a>,
     coarse: Grid<'a>,
-    /// The same on half the step, where it was made.
+    /// The grid of half the step, if it was computed.
     half: Option<Grid<'a>>,
     starts: Vec<Runner>,
-    /// Where the first lap of the whole problem ended.
+    /// Candidates of the full problem after the first budget.
     first: Vec<Runner>,
-    /// What whole orders reached.
+    /// Optima with integer orders.
     wholes: Vec<Runner>,
     reached: Vec<Runner>,
 }
 
-/// The race of a problem whose initial terms are few, and the grid on which it was.
+/// Multistart of a problem with few initial terms; return the candidates and their grid.
 fn without_history<'a>(free: &'a Free, course: Course<'a>) -> Result<(Vec<Runner>, Grid<'a>)> {
     let starts = course.starts.of(free)?;
     let laps = Laps { starts: starts.len(), threads: course.threads, told: course.told };
@@ -138,8 +134,7 @@ fn without_history<'a>(free: &'a Free, course: Course<'a>) -> Result<(Vec<Runner
 }
 
 impl<'a> Run<'a> {
-    /// Whatever a simpler equation reaches, this one reaches too: it starts there with the term's coefficient at 0, or with
-    /// a pole too fast to see.
+    /// Add the optima of submodels as candidates: a coefficient at 0, fixed orders, or an additional fast pole.
     fn inside(&mut self) -> Result<()> {
         let Some(best) = self.reached.first() else { return Ok(()) };
         let orders = best.attempt.place.point.orders.clone();
@@ -164,7 +159,7 @@ impl<'a> Run<'a> {
         self.reached = sorted(std::mem::take(&mut self.reached));
     }
 
-    /// Adds runners where they are on this problem's grid.
+    /// Evaluate candidates on the grid of this problem and add them.
     fn join(&mut self, runners: &[Runner]) -> Result<()> {
         let there = self.laps.run(self.free, &self.coarse, runners, 1)?;
         self.add(there);
@@ -173,8 +168,8 @@ impl<'a> Run<'a> {
 
     fn simpler(&mut self, less: &Simpler) -> Result<()> {
         if less.driven {
-            // What drives is solved for at every point, with a term less as well: own terms alone are told apart, so where
-            // the whole problem starts and ends will do, and the way goes on in the whole problem.
+            // Input coefficients are eliminated at every iterate, also with one term less. Candidates differ in the
+            // autoregressive terms only, so those of the full problem suffice.
             let first = distinct(&self.first, same_optimum);
             let from = first.iter().take(FINALISTS).chain(&self.starts);
             let runners: Vec<Runner> = from.map(|runner| less.without(runner, self.free)).collect();
@@ -184,9 +179,9 @@ impl<'a> Run<'a> {
             return self.join(&ended.iter().take(1).map(|r| less.embedded(r, self.free)).collect::<Vec<_>>());
         }
         if is_rich(self.free) && less.free.orders.len() < self.free.orders.len() {
-            // One of several terms of free orders less is still an equation of many optima: searched like the whole.
+            // With several terms of free order, the reduced problem still has many optima and gets its own multistart.
             let ended = without_history(&less.free, self.course.inside())?.0;
-            // Which of its optima is the lowest, a history may turn round.
+            // Initial terms can change which of its optima is the best.
             let there = in_reach(&ended).into_iter().take(FEWEST).map(|runner| less.embedded(&runner, self.free));
             return self.join(&there.collect::<Vec<_>>());
         }
@@ -202,7 +197,7 @@ impl<'a> Run<'a> {
     }
 
     fn whole(&mut self, less: &Whole) -> Result<()> {
-        // At given orders most starts lead to one optimum.
+        // With fixed orders most initial guesses lead to the same optimum.
         let ended = self.of(&less.free, FINALISTS)?;
         let there: Vec<Runner> = ended.iter().take(1).map(|runner| less.embedded(runner)).collect();
         self.wholes.extend(there.iter().cloned());
@@ -210,9 +205,9 @@ impl<'a> Run<'a> {
         Ok(())
     }
 
-    /// Where a problem inside this one ends from starts of its own, so many of which go on.
+    /// Optimize a submodel from its own initial guesses; `going` of them continue.
     fn of(&self, free: &Free, going: usize) -> Result<Vec<Runner>> {
-        // At whole orders two of its terms may have become one.
+        // With integer orders two of its terms may coincide.
         let Some(starts) = made(self.course.starts.of(free))? else { return Ok(Vec::new()) };
         let mut runners = distinct(&self.laps.run(free, &self.coarse, &starts, GLANCE)?, same_place);
         runners.truncate(going);
@@ -220,17 +215,17 @@ impl<'a> Run<'a> {
         self.laps.run(free, &self.coarse, &finalists(&ended), SECOND_LAP)
     }
 
-    /// Nor is it to end above what it reaches with one order known.
+    /// Add the optimum with one order fixed: the full problem must not fit worse.
     fn known(&mut self, one: &Held, unit: &Clock) -> Result<()> {
         let level = self.reached.first().map_or(0.0, Runner::level);
         if one.free.orders.len() == 1 && level > ABOVE_FLOOR * self.course.floor {
-            // A race of one free order costs little where noise alone would leave less; bounds may leave it no lattice.
+            // Above the noise floor a multistart with one free order is worth its cost. Bounds may leave no order grid.
             if let Some((ended, _)) = made(without_history(&one.free, self.course.inside()))? {
                 let there = in_reach(&ended).into_iter().take(FINALISTS).map(|runner| one.embedded(&runner, self.free));
                 return self.join(&there.collect::<Vec<_>>());
             }
         }
-        // From where it is, and from whole orders.
+        // Start from the optima found so far and from those with integer orders.
         let (reached, first) = (distinct(&self.reached, same_optimum), distinct(&self.first, same_optimum));
         let near = reached.iter().take(FINALISTS).chain(first.iter().take(FINALISTS)).chain(&self.wholes);
         let runners: Vec<Runner> = near.map(|runner| one.without(runner, unit)).collect();
@@ -240,7 +235,7 @@ impl<'a> Run<'a> {
         self.join(&ended.iter().take(1).map(|runner| one.embedded(runner, self.free)).collect::<Vec<_>>())
     }
 
-    /// An offset of each run hides which of the measured signals drives: also from where it ends without.
+    /// Add the optima without offsets: offsets of the runs can hide which measured signal is the input.
     fn plain(&mut self) -> Result<()> {
         let structure = &self.free.structure;
         let plain = structure.initial.without_offset();
@@ -254,7 +249,7 @@ impl<'a> Run<'a> {
         Ok(())
     }
 
-    /// Who is ahead goes on; those that came to the same optimum as one, and those that are far behind not at all.
+    /// Promote the survivors to the second budget; duplicates and candidates far behind do not continue.
     fn ended(self) -> Result<(Vec<Runner>, Grid<'a>)> {
         let (laps, free, coarse) = (self.laps, self.free, self.coarse);
         let reached = distinct(&self.reached, same_optimum);
@@ -264,7 +259,7 @@ impl<'a> Run<'a> {
         let mut found = laps.run(free, &coarse, ahead, SECOND_LAP)?;
         let level = found.first().map_or(0.0, Runner::level);
         if level > ABOVE_FLOOR * self.course.floor {
-            // Noise alone would leave less: those behind may yet be on the way to where it does.
+            // The best cost is above the noise floor: candidates behind may still lead to a better optimum.
             rest = on_the_way(laps, free, &coarse, &rest)?;
             let farthest = FAR_BEHIND * contenders[0].level();
             let stirring;
@@ -278,8 +273,7 @@ impl<'a> Run<'a> {
     }
 }
 
-/// Runners in the order of their cost on a grid or on half its step, whichever is the larger; where that cannot be made, on
-/// the grid.
+/// Sort candidates by the larger of their costs on a grid and on half its step; by the former if the latter fails.
 fn ranked(coarse: &Grid<'_>, half: Option<Grid<'_>>, runners: Vec<Runner>) -> Result<Vec<Runner>> {
     if runners.is_empty() {
         return Ok(runners);
@@ -294,16 +288,16 @@ fn ranked(coarse: &Grid<'_>, half: Option<Grid<'_>>, runners: Vec<Runner>) -> Re
     Ok(order.into_iter().filter_map(|i| runners[i].take()).collect())
 }
 
-/// Whether an equation has several own terms of free order.
+/// True if an equation has several autoregressive terms of free order.
 fn is_rich(free: &Free) -> bool {
     let several = |e: &Equation| e.own().filter(|term| term.order.is_free()).count() > 1;
     free.structure.equations.iter().any(several)
 }
 
-/// The same of runs in motion: the terms of their history, many a run, wait for those that go on.
+/// Multistart of a problem with many initial terms per run, which are added for the survivors only.
 ///
-/// What a run remembers moves most optima by less than lies between two; where it does not, the order among them is that of
-/// a lap with it.
+/// The initial terms move most optima by less than their distance. The survivors are ranked again after a budget with
+/// all initial terms.
 fn with_history(free: &Free, course: Course<'_>) -> Result<Vec<Runner>> {
     let few = free.starting(free.structure.initial.with_under(Initial::Caputo), false)?;
     let (reached, coarse) = without_history(&few, course)?;
@@ -323,13 +317,13 @@ fn with_history(free: &Free, course: Course<'_>) -> Result<Vec<Runner>> {
     Ok(distinct(&ahead, same_optimum))
 }
 
-/// Behind the first, a start goes on while a lap lowers its cost by this share: what has come to rest overtakes nobody.
+/// Relative cost decrease per first budget below which a candidate behind the best has converged and is stopped.
 const ON_THE_WAY: f64 = 0.05;
-/// Of those further behind than contenders are, who falls by a share in a few evaluations.
+/// Evaluations in which a candidate far behind must lower its cost by [`MIN_PROMOTION_DECREASE_RATIO`] to be promoted.
 const STIR: usize = 5;
 const STIRS: f64 = 0.1;
 
-/// Where those behind end, each for as long as it is getting on, but no longer than a second lap.
+/// Optimize candidates while they improve, for at most the second budget.
 pub(super) fn on_the_way(laps: Laps<'_>, free: &Free, coarse: &Grid<'_>, behind: &[Runner]) -> Result<Vec<Runner>> {
     let (mut ended, mut going) = (Vec::new(), behind.to_vec());
     for _ in 0..SECOND_LAP / FIRST_LAP {
@@ -345,7 +339,7 @@ pub(super) fn on_the_way(laps: Laps<'_>, free: &Free, coarse: &Grid<'_>, behind:
     Ok(ended)
 }
 
-/// Where those no further behind are after a few evaluations that lower their cost by a share; and the others.
+/// Split candidates up to a cost limit into those that improve in a few evaluations, and the others.
 pub(super) fn stirred(
     laps: Laps<'_>,
     free: &Free,
@@ -365,10 +359,10 @@ pub(super) fn stirred(
     Ok((moving, still))
 }
 
-/// Where starts get on coarse grids, best first.
+/// Optimize candidates on coarse grids; return them best first.
 ///
 /// # Errors
-/// Those of the source, [`crate::error::Error::Interrupted`].
+/// As the source, [`crate::error::Error::Interrupted`].
 pub fn on_coarse_grids(free: &Free, coarse: &Grid<'_>, starts: &[Runner], threads: usize) -> Result<Vec<Runner>> {
     let laps = Laps { starts: starts.len(), threads, told: None };
     let mut coarse = coarse.clone();
