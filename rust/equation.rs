@@ -40,7 +40,7 @@ pub struct Equation {
 }
 
 /// Exponents of t closer than this to that of an offset are not separately identifiable.
-const STAND_IN: f64 = 0.05;
+const OFFSET_EXPONENT_TOLERANCE: f64 = 0.05;
 
 /// Initial conditions of a record.
 #[derive(Debug, Clone, PartialEq)]
@@ -195,13 +195,13 @@ impl Initial {
 
     /// Whether initial conditions are zero apart from offset and filter: all signals were zero before the record.
     #[must_use]
-    pub fn at_rest(&self) -> bool {
+    pub fn is_at_rest(&self) -> bool {
         *self.under() == Self::Rest
     }
 
     /// Initial conditions of an output without a sensor filter.
     #[must_use]
-    pub(crate) fn unfiltered(&self) -> &Self {
+    pub(crate) fn without_filter(&self) -> &Self {
         match self {
             Self::Filtered { under, .. } => under,
             other => other,
@@ -271,11 +271,11 @@ impl Structure {
             return Err(range("order alpha".into(), self.order, format!("(0, {MAX_ORDER}]"), "choose another order"));
         }
         if self.output >= signals {
-            return Err(missing(self.output, signals));
+            return Err(missing_signal_error(self.output, signals));
         }
         for (k, term) in self.terms.iter().enumerate() {
             if term.signal >= signals {
-                return Err(missing(term.signal, signals));
+                return Err(missing_signal_error(term.signal, signals));
             }
             let name = format!("order of term {k}");
             if term.signal == self.output {
@@ -320,7 +320,7 @@ impl Structure {
         };
         let offset = initial.offset_exponents(self.order);
         if *initial.under() == Initial::Caputo {
-            exponents.retain(|e| *e == 0.0 || offset.iter().all(|o| (e - o).abs() > STAND_IN));
+            exponents.retain(|e| *e == 0.0 || offset.iter().all(|o| (e - o).abs() > OFFSET_EXPONENT_TOLERANCE));
         }
         exponents.extend(offset);
         exponents.extend(initial.impulses());
@@ -350,7 +350,7 @@ pub fn order_fits(alpha: f64, order: f64, own: bool, input: bool) -> bool {
     }
 }
 
-fn missing(signal: usize, signals: usize) -> Error {
+fn missing_signal_error(signal: usize, signals: usize) -> Error {
     Error::Structure {
         what: format!("the equation names signal {signal}, but the record holds {signals}"),
         remedy: "give the record all signals of the equation".into(),
@@ -456,7 +456,7 @@ const MOST_EQUATIONS: usize = 16;
 /// Highest order of an entry, its coefficient, and the sum of the absolute values that make up the coefficient.
 type Leading = Option<(f64, f64, f64)>;
 
-fn added(sum: Leading, order: f64, value: f64, size: f64) -> Leading {
+fn add_leading_term(sum: Leading, order: f64, value: f64, size: f64) -> Leading {
     match sum {
         Some((highest, v, s)) if (order - highest).abs() < ORDER_GRAIN => Some((highest, v + value, s + size)),
         Some((highest, ..)) if order < highest => sum,
@@ -494,7 +494,7 @@ pub fn check_regular(equations: &[Equation]) -> Result<()> {
         let mut sum = (i == j).then_some((structure.order, 1.0, 1.0));
         for (term, &c) in structure.terms.iter().zip(coefficients) {
             if term.signal == output && c != 0.0 {
-                sum = added(sum, term.order, -c, c.abs());
+                sum = add_leading_term(sum, term.order, -c, c.abs());
             }
         }
         sum
@@ -511,7 +511,7 @@ pub fn check_regular(equations: &[Equation]) -> Result<()> {
             let later = (columns >> j).count_ones();
             let sign = if later % 2 == 0 { 1.0 } else { -1.0 };
             let next = columns | (1 << j);
-            taken[next] = added(taken[next], order + o, sign * value * v, size * s);
+            taken[next] = add_leading_term(taken[next], order + o, sign * value * v, size * s);
         }
     }
     match taken[(1 << n) - 1] {

@@ -66,13 +66,13 @@ pub enum Error {
     },
     /// Order grid without candidates.
     #[error("the lattice holds no candidate: {why}; widen the intervals or refine the step")]
-    EmptyLattice {
+    EmptyOrderGrid {
         /// Condition that no order satisfies.
         why: String,
     },
     /// Order grid with too many candidates.
-    #[error("the lattice holds up to {count} candidates, more than the limit of {limit}: up to {} of one core at 10 ns each, as fast as searches are at best; take a larger step, narrower intervals or fixed orders", spent(*count))]
-    LatticeTooLarge {
+    #[error("the lattice holds up to {count} candidates, more than the limit of {limit}: up to {} of one core at 10 ns each, as fast as searches are at best; take a larger step, narrower intervals or fixed orders", format_search_time(*count))]
+    OrderGridTooLarge {
         /// Number of candidates, or of all tuples of the axes if they were not enumerated.
         count: u128,
         /// Largest number of candidates.
@@ -213,7 +213,7 @@ pub fn check_length(name: &str, expected: usize, found: usize) -> Result<()> {
 
 /// Shortest duration of a search over so many candidates, at 10 ns each, as text.
 #[allow(clippy::cast_precision_loss)]
-fn spent(candidates: u128) -> String {
+fn format_search_time(candidates: u128) -> String {
     let seconds = candidates as f64 * 1e-8;
     let units = [("years", 31_557_600.0), ("days", 86_400.0), ("hours", 3600.0), ("minutes", 60.0)];
     let (unit, size) = units.into_iter().find(|(_, size)| seconds >= 2.0 * size).unwrap_or(("seconds", 1.0));

@@ -11,7 +11,7 @@ use realfft::{ComplexToReal, RealFftPlanner, RealToComplex};
 
 pub use realfft::num_complex::Complex;
 
-use crate::parallel::Shared;
+use crate::parallel::ForkSafeLock;
 
 /// Complex value of one frequency bin.
 pub type Bin = Complex<f64>;
@@ -49,12 +49,12 @@ pub fn fast_length(n: usize) -> usize {
 }
 
 /// Longest transform whose plan is never evicted. A plan takes about 20 bytes a point.
-const KEPT: usize = 1 << 14;
+const MAX_PERMANENT_PLAN_POINTS: usize = 1 << 14;
 /// Total points of longer plans above which the least recently used are evicted.
 ///
 /// Refining a grid again and again would otherwise leave all its plans in memory. A plan evicted too early costs two
 /// transforms.
-const POINTS: usize = 1 << 20;
+const MAX_CACHED_PLAN_POINTS: usize = 1 << 20;
 /// Long plans among so many recent requests are in use and stay, even above the limit: one evaluation of a large
 /// problem may need more points.
 const IN_USE: u64 = 16;
@@ -66,11 +66,11 @@ struct Plans {
 }
 
 /// Plans of all threads. Each thread copies short ones once, so that no thread waits for a lock.
-static SHARED: Shared<Plans> = Shared::new(Plans::new());
+static SHARED_PLANS: ForkSafeLock<Plans> = ForkSafeLock::new(Plans::new());
 
 thread_local! {
     /// Short plans that this thread requested, and plans that it computed while the lock was unavailable.
-    static OWN: RefCell<Plans> = const { RefCell::new(Plans::new()) };
+    static THREAD_PLANS: RefCell<Plans> = const { RefCell::new(Plans::new()) };
 }
 
 impl Plans {
@@ -80,7 +80,7 @@ impl Plans {
 
     fn find(&mut self, len: usize) -> Option<Plan> {
         let (plan, last) = self.made.get_mut(&len)?;
-        if len > KEPT {
+        if len > MAX_PERMANENT_PLAN_POINTS {
             self.asked += 1;
             *last = self.asked;
         }
@@ -96,9 +96,9 @@ impl Plans {
             return (there, vec![plan]);
         }
         let mut forgotten = Vec::new();
-        if len > KEPT {
+        if len > MAX_PERMANENT_PLAN_POINTS {
             self.asked += 1;
-            forgotten = self.make_room(POINTS.saturating_sub(len));
+            forgotten = self.make_room(MAX_CACHED_PLAN_POINTS.saturating_sub(len));
         }
         self.made.insert(len, (plan.clone(), self.asked));
         (plan, forgotten)
@@ -106,8 +106,12 @@ impl Plans {
 
     /// Evict long plans, the least recently used first, until at most this many points are left.
     fn make_room(&mut self, points: usize) -> Vec<Plan> {
-        let mut long: Vec<(u64, usize)> =
-            self.made.iter().map(|(&len, &(_, last))| (last, len)).filter(|&(_, len)| len > KEPT).collect();
+        let mut long: Vec<(u64, usize)> = self
+            .made
+            .iter()
+            .map(|(&len, &(_, last))| (last, len))
+            .filter(|&(_, len)| len > MAX_PERMANENT_PLAN_POINTS)
+            .collect();
         long.sort_unstable();
         let mut held: usize = long.iter().map(|&(_, len)| len).sum();
         let mut forgotten = Vec::new();
@@ -135,22 +139,22 @@ impl Plans {
 /// ```
 #[must_use]
 pub fn plan(len: usize) -> Plan {
-    if let Some(plan) = OWN.with_borrow_mut(|own| own.find(len)) {
+    if let Some(plan) = THREAD_PLANS.with_borrow_mut(|own| own.find(len)) {
         return plan;
     }
-    let (plan, shared) = match SHARED.with(|plans| plans.find(len)).flatten() {
+    let (plan, shared) = match SHARED_PLANS.with(|plans| plans.find(len)).flatten() {
         Some(plan) => (plan, true),
         None => {
             // Plans are computed outside the lock. If two threads compute the same one, the later one is dropped.
             let made = Plan::new(len);
-            match SHARED.with(|plans| plans.keep(made.clone())) {
+            match SHARED_PLANS.with(|plans| plans.keep(made.clone())) {
                 Some((plan, _forgotten)) => (plan, true),
                 None => (made, false),
             }
         }
     };
-    if len <= KEPT || !shared {
-        OWN.with_borrow_mut(|own| own.keep(plan.clone()));
+    if len <= MAX_PERMANENT_PLAN_POINTS || !shared {
+        THREAD_PLANS.with_borrow_mut(|own| own.keep(plan.clone()));
     }
     plan
 }
@@ -162,7 +166,7 @@ pub fn power_spectrum(signal: impl ExactSizeIterator<Item = f64>) -> Vec<f64> {
     let mut time: Vec<f64> = signal.collect();
     time.resize(plan.len(), 0.0);
     let mut spectrum = vec![Bin::new(0.0, 0.0); plan.bins()];
-    plan.forward(&mut time, &mut spectrum, &mut Workspace::new());
+    plan.transform(&mut time, &mut spectrum, &mut Workspace::new());
     spectrum.iter().map(Bin::norm_sqr).collect()
 }
 
@@ -194,7 +198,7 @@ impl Plan {
     ///
     /// # Panics
     /// If the lengths differ. That is an error of the caller, whatever the data.
-    pub fn forward(&self, time: &mut [f64], spectrum: &mut [Bin], workspace: &mut Workspace) {
+    pub fn transform(&self, time: &mut [f64], spectrum: &mut [Bin], workspace: &mut Workspace) {
         self.check(time.len(), spectrum.len());
         let scratch = workspace.at_least(self.forward.get_scratch_len());
         // The transform can only fail on lengths, which were checked.
@@ -259,14 +263,14 @@ mod tests {
     #[allow(clippy::cast_precision_loss)]
     fn is_sound(plan: &Plan) -> bool {
         let mut spectrum = vec![Bin::new(0.0, 0.0); plan.bins()];
-        plan.forward(&mut vec![1.0; plan.len()], &mut spectrum, &mut Workspace::new());
+        plan.transform(&mut vec![1.0; plan.len()], &mut spectrum, &mut Workspace::new());
         (spectrum[0].re - plan.len() as f64).abs() < 1e-6 && spectrum[1].norm() < 1e-6
     }
 
     #[test]
     fn long_plans_are_forgotten_that_nobody_asks_for() {
         let mut plans = Plans::new();
-        let (short, long, next) = (64, POINTS / 2, POINTS / 2 + 2);
+        let (short, long, next) = (64, MAX_CACHED_PLAN_POINTS / 2, MAX_CACHED_PLAN_POINTS / 2 + 2);
         let keep = |plans: &mut Plans, len| plans.keep(Plan::new(len)).1.len();
         for len in [short, long, next] {
             assert_eq!(keep(&mut plans, len), 0, "in use");
@@ -290,8 +294,8 @@ mod tests {
 
     #[test]
     fn a_lock_that_is_never_given_back_stops_no_plan() {
-        for len in [90, KEPT + 2] {
-            let (first, second) = SHARED.held(|| (plan(len), plan(len)));
+        for len in [90, MAX_PERMANENT_PLAN_POINTS + 2] {
+            let (first, second) = SHARED_PLANS.hold_during(|| (plan(len), plan(len)));
             assert!(is_sound(&first));
             assert!(Arc::ptr_eq(&first.forward, &second.forward), "made once");
         }

@@ -87,25 +87,25 @@ impl<T: Default> PerThread<T> {
 }
 
 /// Attempts to take a lock, and how many of them spin before the thread yields.
-const TRIES: usize = 128;
-const SPINS: usize = 64;
+const MAX_LOCK_ATTEMPTS: usize = 128;
+const SPIN_LOCK_ATTEMPTS: usize = 64;
 
 /// Value behind a lock with a bounded number of attempts.
-pub(crate) struct Shared<T>(Mutex<T>);
+pub(crate) struct ForkSafeLock<T>(Mutex<T>);
 
-impl<T> Shared<T> {
+impl<T> ForkSafeLock<T> {
     pub(crate) const fn new(value: T) -> Self {
         Self(Mutex::new(value))
     }
 
     /// Run short work on the value. None if the lock cannot be taken.
     pub(crate) fn with<R>(&self, work: impl FnOnce(&mut T) -> R) -> Option<R> {
-        for turn in 0..TRIES {
+        for turn in 0..MAX_LOCK_ATTEMPTS {
             match self.0.try_lock() {
                 Ok(mut value) => return Some(work(&mut value)),
                 // Poison means that another thread panicked, which leaves the values intact.
                 Err(TryLockError::Poisoned(value)) => return Some(work(&mut value.into_inner())),
-                Err(TryLockError::WouldBlock) if turn < SPINS => std::hint::spin_loop(),
+                Err(TryLockError::WouldBlock) if turn < SPIN_LOCK_ATTEMPTS => std::hint::spin_loop(),
                 Err(TryLockError::WouldBlock) => std::thread::yield_now(),
             }
         }
@@ -114,7 +114,7 @@ impl<T> Shared<T> {
 
     /// Hold the lock during `meanwhile`, like a thread that does not survive a fork.
     #[cfg(test)]
-    pub(crate) fn held<R>(&self, meanwhile: impl FnOnce() -> R) -> R {
+    pub(crate) fn hold_during<R>(&self, meanwhile: impl FnOnce() -> R) -> R {
         let _value = self.0.lock().unwrap_or_else(std::sync::PoisonError::into_inner);
         meanwhile()
     }
@@ -158,14 +158,14 @@ impl Stop {
 
 #[cfg(test)]
 mod tests {
-    use super::Shared;
+    use super::ForkSafeLock;
 
     #[test]
     #[allow(clippy::panic)]
     fn a_lock_that_is_held_is_done_without() {
-        let shared = Shared::new(3);
+        let shared = ForkSafeLock::new(3);
         assert_eq!(shared.with(|value| *value), Some(3));
-        assert_eq!(shared.held(|| shared.with(|value| *value)), None);
+        assert_eq!(shared.hold_during(|| shared.with(|value| *value)), None);
         assert_eq!(shared.with(|value| *value), Some(3));
         let fault = std::panic::catch_unwind(std::panic::AssertUnwindSafe(|| {
             shared.with(|_| std::panic::panic_any("on purpose"));

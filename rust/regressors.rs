@@ -24,11 +24,11 @@ pub struct Record {
     filter: Option<Vec<f64>>,
     clean: Option<Vec<Vec<f64>>>,
     /// Signals whose own sensor filter may have an initial transient. Empty if none has.
-    held: Vec<bool>,
+    filter_transients: Vec<bool>,
     /// Signals minus their initial level, if it is not zero. Empty if all levels are zero.
-    moving: Vec<Option<Vec<f64>>>,
+    deviations: Vec<Option<Vec<f64>>>,
     /// Filter responses to an impulse and to its derivatives, if known more accurately than by pulses.
-    answers: Vec<Vec<f64>>,
+    impulse_responses: Vec<Vec<f64>>,
 }
 
 impl Record {
@@ -53,7 +53,15 @@ impl Record {
             check_length("filter", m, series.len())?;
             check_finite("filter", series)?;
         }
-        Ok(Self { step, signals, filter, clean: None, held: Vec::new(), moving: Vec::new(), answers: Vec::new() })
+        Ok(Self {
+            step,
+            signals,
+            filter,
+            clean: None,
+            filter_transients: Vec::new(),
+            deviations: Vec::new(),
+            impulse_responses: Vec::new(),
+        })
     }
 
     /// Add a low-noise substitute of every signal, for instrumental variables.
@@ -73,10 +81,18 @@ impl Record {
 
     /// Record of the substitutes, or a copy if there are none.
     #[must_use]
-    pub fn cleaned(&self) -> Self {
+    pub fn clean_record(&self) -> Self {
         let signals = self.clean.clone().unwrap_or_else(|| self.signals.clone());
-        let (held, moving, answers) = (self.held.clone(), Vec::new(), self.answers.clone());
-        Self { step: self.step, signals, filter: self.filter.clone(), clean: None, held, moving, answers }
+        let (held, moving, answers) = (self.filter_transients.clone(), Vec::new(), self.impulse_responses.clone());
+        Self {
+            step: self.step,
+            signals,
+            filter: self.filter.clone(),
+            clean: None,
+            filter_transients: held,
+            deviations: moving,
+            impulse_responses: answers,
+        }
     }
 
     /// Record of the substitutes for all signals but one.
@@ -84,8 +100,8 @@ impl Record {
     /// # Panics
     /// If the signal does not exist.
     #[must_use]
-    pub fn cleaned_but(&self, signal: usize) -> Self {
-        let mut cleaned = self.cleaned();
+    pub fn clean_record_except(&self, signal: usize) -> Self {
+        let mut cleaned = self.clean_record();
         cleaned.signals[signal].clone_from(&self.signals[signal]);
         cleaned
     }
@@ -101,14 +117,14 @@ impl Record {
     /// assert_eq!(record.with_filter(&[0.0, 1.0, 0.0])?.signal(0), [0.0, 1.0, 2.0]);
     /// # Ok::<(), ftlm::error::Error>(())
     /// ```
-    pub fn through(&self, filter: &[f64]) -> Result<Self> {
+    pub fn with_filter(&self, filter: &[f64]) -> Result<Self> {
         let m = self.m();
         check_length("filter", m, filter.len())?;
         let filtered = |series: &Vec<f64>| series::multiply(filter, series, m);
         let known = self.filter.as_ref().map_or_else(|| filter.to_vec(), filtered);
         let mut through = Self::new(self.step, self.signals.iter().map(filtered).collect(), Some(known))?;
-        through.held.clone_from(&self.held);
-        through.moving = self.moving.iter().map(|moving| moving.as_ref().map(filtered)).collect();
+        through.filter_transients.clone_from(&self.filter_transients);
+        through.deviations = self.deviations.iter().map(|moving| moving.as_ref().map(filtered)).collect();
         Ok(through)
     }
 
@@ -132,7 +148,7 @@ impl Record {
     /// assert_eq!(record.deviation_signal(0), [0.0, 1.0, 2.0]);
     /// # Ok::<(), ftlm::error::Error>(())
     /// ```
-    pub fn begun(mut self, held: Vec<bool>, levels: &[f64], answers: Vec<Vec<f64>>) -> Result<Self> {
+    pub fn with_initial_state(mut self, held: Vec<bool>, levels: &[f64], answers: Vec<Vec<f64>>) -> Result<Self> {
         check_length("signals whose sensor held something", self.len(), held.len())?;
         check_length("levels of signals", self.len(), levels.len())?;
         check_finite("level of a signal", levels)?;
@@ -144,8 +160,8 @@ impl Record {
         let above = |(signal, &level): (&Vec<f64>, &f64)| {
             (level != 0.0).then(|| signal.iter().zip(&unit).map(|(v, one)| v - level * one).collect())
         };
-        self.moving = self.signals.iter().zip(levels).map(above).collect();
-        (self.held, self.answers) = (held, answers);
+        self.deviations = self.signals.iter().zip(levels).map(above).collect();
+        (self.filter_transients, self.impulse_responses) = (held, answers);
         Ok(self)
     }
 
@@ -154,14 +170,14 @@ impl Record {
     /// # Panics
     /// If the signal does not exist.
     #[must_use]
-    pub fn moving(&self, index: usize) -> &[f64] {
-        self.moving.get(index).and_then(Option::as_ref).unwrap_or(&self.signals[index])
+    pub fn deviation_signal(&self, index: usize) -> &[f64] {
+        self.deviations.get(index).and_then(Option::as_ref).unwrap_or(&self.signals[index])
     }
 
     /// Signal of a term that is integrated by `eta`: its deviation from the initial level for `eta` below 0.
-    pub(crate) fn driver(&self, index: usize, eta: f64) -> &[f64] {
+    pub(crate) fn term_signal(&self, index: usize, eta: f64) -> &[f64] {
         if eta < 0.0 {
-            self.moving(index)
+            self.deviation_signal(index)
         } else {
             self.signal(index)
         }
@@ -169,8 +185,8 @@ impl Record {
 
     /// Whether a signal passed a sensor filter that may have an initial transient.
     #[must_use]
-    pub fn is_held(&self, index: usize) -> bool {
-        self.held.get(index).copied().unwrap_or(false)
+    pub fn has_filter_transient(&self, index: usize) -> bool {
+        self.filter_transients.get(index).copied().unwrap_or(false)
     }
 
     /// Whether signals and initial terms passed a sensor filter.
@@ -249,37 +265,37 @@ impl Record {
     /// ```
     #[must_use]
     pub fn initial_term(&self, exponent: f64) -> Vec<f64> {
-        self.answer(exponent).unwrap_or_else(|| self.behind_filter(power_means(exponent, self.m(), self.step)))
+        self.impulse_response(exponent).unwrap_or_else(|| self.apply_filter(power_means(exponent, self.m(), self.step)))
     }
 
     /// Response of the filter to an impulse or to a derivative of one, if known.
     #[allow(clippy::cast_possible_truncation, clippy::cast_sign_loss)]
-    fn answer(&self, exponent: f64) -> Option<Vec<f64>> {
+    fn impulse_response(&self, exponent: f64) -> Option<Vec<f64>> {
         if !is_impulse(exponent) {
             return None;
         }
-        self.answers.get((-1.0 - exponent) as usize).cloned()
+        self.impulse_responses.get((-1.0 - exponent) as usize).cloned()
     }
 
     /// Initial term as an input of a simulation ([`power_pulses`] if a filter smooths it).
-    pub(crate) fn driving_term(&self, exponent: f64) -> Vec<f64> {
+    pub(crate) fn forcing_term(&self, exponent: f64) -> Vec<f64> {
         match &self.filter {
             None => self.initial_term(exponent),
             Some(_) => {
-                let pulses = || self.behind_filter(power_pulses(exponent, self.m(), self.step));
-                self.answer(exponent).unwrap_or_else(pulses)
+                let pulses = || self.apply_filter(power_pulses(exponent, self.m(), self.step));
+                self.impulse_response(exponent).unwrap_or_else(pulses)
             }
         }
     }
 
     /// Initial term t^e as an input before the filter. None for an unfiltered record and for a known filter response.
     pub(crate) fn unfiltered_term(&self, exponent: f64) -> Option<Vec<f64>> {
-        let passes = self.filter.is_some() && self.answer(exponent).is_none();
+        let passes = self.filter.is_some() && self.impulse_response(exponent).is_none();
         passes.then(|| power_pulses(exponent, self.m(), self.step))
     }
 
     /// Output of the record's sensor filter for a series.
-    pub(crate) fn behind_filter(&self, powers: Vec<f64>) -> Vec<f64> {
+    pub(crate) fn apply_filter(&self, powers: Vec<f64>) -> Vec<f64> {
         match &self.filter {
             None => powers,
             Some(filter) => series::multiply(filter, &powers, self.m()),
@@ -365,13 +381,13 @@ pub struct Bank {
 }
 
 /// Columns of all signals at one order, and the kernel if the output is among them.
-struct Made<'a> {
+struct OrderColumns<'a> {
     order: i64,
     columns: Vec<(usize, &'a mut [f64])>,
     kernel: Option<&'a mut [f64]>,
 }
 
-impl Made<'_> {
+impl OrderColumns<'_> {
     /// Compute one kernel and its spectrum for all signals.
     #[allow(clippy::cast_precision_loss)]
     fn write(self, record: &Record, spectra: &BTreeMap<usize, Kernel>, buffers: &mut Buffers) {
@@ -418,7 +434,7 @@ impl Bank {
         if bytes > limit {
             return Err(Error::BankTooLarge { columns: index.keys.len(), m, bytes, limit });
         }
-        Self::counted(index, record, output, &Stop::default())
+        Self::new_interruptible(index, record, output, &Stop::default())
     }
 
     /// Number of regressors that are integrals of this signal.
@@ -431,7 +447,7 @@ impl Bank {
     /// # Errors
     /// [`Error::Structure`] for a signal that the record does not have, [`Error::Interrupted`].
     #[allow(clippy::cast_precision_loss)]
-    pub(crate) fn counted(index: &Index, record: &Record, output: usize, stop: &Stop) -> Result<Self> {
+    pub(crate) fn new_interruptible(index: &Index, record: &Record, output: usize, stop: &Stop) -> Result<Self> {
         let m = record.m();
         let strange = |key: &&Key| matches!(key, Key::Integral { signal, .. } if *signal >= record.len());
         if let Some(Key::Integral { signal, .. }) = index.keys.iter().find(strange) {
@@ -443,14 +459,15 @@ impl Bank {
         let mut columns = vec![0.0; m * index.keys.len()];
         let mut kernels = vec![0.0; m * Self::own(index, output)];
         let mut own = Vec::with_capacity(index.keys.len());
-        let mut orders: BTreeMap<i64, Made<'_>> = BTreeMap::new();
+        let mut orders: BTreeMap<i64, OrderColumns<'_>> = BTreeMap::new();
         let mut initial = Vec::new();
         let mut rest = kernels.chunks_exact_mut(m).enumerate();
         for (key, column) in index.keys.iter().zip(columns.chunks_exact_mut(m)) {
             let mut kernel = None;
             match *key {
                 Key::Integral { signal, order } => {
-                    let made = orders.entry(order).or_insert_with(|| Made { order, columns: vec![], kernel: None });
+                    let made =
+                        orders.entry(order).or_insert_with(|| OrderColumns { order, columns: vec![], kernel: None });
                     made.columns.push((signal, column));
                     if signal == output {
                         (kernel, made.kernel) = rest.next().unzip();
@@ -524,7 +541,7 @@ pub(crate) fn is_impulse(exponent: f64) -> bool {
 
 /// Initial terms of the equations and impulses of the sensors, by equation.
 #[allow(clippy::type_complexity)]
-pub(crate) fn parted(powers: &[Vec<(f64, f64)>]) -> (Vec<Vec<(f64, f64)>>, Vec<Vec<(f64, f64)>>) {
+pub(crate) fn split_impulses(powers: &[Vec<(f64, f64)>]) -> (Vec<Vec<(f64, f64)>>, Vec<Vec<(f64, f64)>>) {
     powers.iter().map(|own| own.iter().partition(|(e, _)| !is_impulse(*e))).unzip()
 }
 

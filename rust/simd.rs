@@ -9,7 +9,7 @@ use std::sync::atomic::{AtomicBool, Ordering};
 use pulp::{Arch, Simd, WithSimd};
 
 /// Number of values that a kernel processes side by side.
-pub const WIDTH: usize = 8;
+pub const LANE_COUNT: usize = 8;
 
 /// One value of each of several computations that run side by side.
 pub type Lanes<const L: usize> = [f64; L];
@@ -26,9 +26,9 @@ pub trait Kernel {
     fn run(self) -> Self::Output;
 }
 
-struct Inlined<K>(K);
+struct PulpKernel<K>(K);
 
-impl<K: Kernel> WithSimd for Inlined<K> {
+impl<K: Kernel> WithSimd for PulpKernel<K> {
     type Output = K::Output;
 
     #[inline(always)]
@@ -37,11 +37,11 @@ impl<K: Kernel> WithSimd for Inlined<K> {
     }
 }
 
-static PORTABLE: AtomicBool = AtomicBool::new(false);
+static USE_PORTABLE: AtomicBool = AtomicBool::new(false);
 
 /// Make [`dispatch_simd`] run kernels compiled for the oldest machine, so that tests can compare both.
-pub fn portable(on: bool) {
-    PORTABLE.store(on, Ordering::Relaxed);
+pub fn force_portable(on: bool) {
+    USE_PORTABLE.store(on, Ordering::Relaxed);
 }
 
 /// Run a kernel with the widest vector instructions of this machine.
@@ -62,11 +62,11 @@ pub fn portable(on: bool) {
 ///
 /// assert_eq!(dispatch_simd(Squares(&[3.0, 4.0])), 25.0);
 /// ```
-pub fn widest<K: Kernel>(kernel: K) -> K::Output {
-    if PORTABLE.load(Ordering::Relaxed) {
+pub fn dispatch_simd<K: Kernel>(kernel: K) -> K::Output {
+    if USE_PORTABLE.load(Ordering::Relaxed) {
         kernel.run()
     } else {
-        Arch::new().dispatch(Inlined(kernel))
+        Arch::new().dispatch(PulpKernel(kernel))
     }
 }
 
@@ -77,11 +77,11 @@ pub fn widest<K: Kernel>(kernel: K) -> K::Output {
 #[inline(always)]
 #[must_use]
 pub fn dot(a: &[f64], b: &[f64]) -> f64 {
-    let mut sums = [0.0; WIDTH];
-    let (a, b) = (a.chunks_exact(WIDTH), b.chunks_exact(WIDTH));
+    let mut sums = [0.0; LANE_COUNT];
+    let (a, b) = (a.chunks_exact(LANE_COUNT), b.chunks_exact(LANE_COUNT));
     let rest: f64 = a.remainder().iter().zip(b.remainder()).map(|(x, y)| x * y).sum();
     for (a, b) in a.zip(b) {
-        for i in 0..WIDTH {
+        for i in 0..LANE_COUNT {
             sums[i] += a[i] * b[i];
         }
     }

@@ -54,11 +54,11 @@ pub struct OutputFilter<'a> {
 /// # }
 /// ```
 pub fn respond(equations: &[Equation], record: &Record, initial: &[Vec<(f64, f64)>]) -> Result<Vec<Vec<f64>>> {
-    checked(equations, record, initial)?.respond(initial)
+    build_system(equations, record, initial)?.respond(initial)
 }
 
 /// System of user-defined equations. Return an error for invalid ones.
-fn checked<'a>(equations: &[Equation], record: &'a Record, initial: &[Vec<(f64, f64)>]) -> Result<System<'a>> {
+fn build_system<'a>(equations: &[Equation], record: &'a Record, initial: &[Vec<(f64, f64)>]) -> Result<System<'a>> {
     for equation in equations {
         equation.check(record.len())?;
     }
@@ -88,7 +88,7 @@ pub fn respond_damped(
     initial: &[Vec<(f64, f64)>],
     decay: f64,
 ) -> Result<Vec<Vec<f64>>> {
-    checked(equations, record, initial)?.damped(decay).respond(initial)
+    build_system(equations, record, initial)?.with_damping(decay).respond(initial)
 }
 
 /// Inverse of the matrix of the equations: `[j][i]` is the response of output j to a unit pulse in the error of
@@ -97,7 +97,7 @@ pub fn respond_damped(
 /// # Errors
 /// As [`respond`].
 pub fn inverse(equations: &[Equation], record: &Record) -> Result<Vec<Vec<Vec<f64>>>> {
-    checked(equations, record, &[])?.inverse()
+    build_system(equations, record, &[])?.inverse()
 }
 
 /// Response of every output to a unit of each initial term, all other inputs zero.
@@ -125,7 +125,7 @@ pub fn inverse(equations: &[Equation], record: &Record) -> Result<Vec<Vec<Vec<f6
 /// # }
 /// ```
 pub fn unit_responses(equations: &[Equation], record: &Record, units: &[(usize, f64)]) -> Result<Vec<Vec<Vec<f64>>>> {
-    checked(equations, record, &as_terms(equations.len(), units)?)?.units(units)
+    build_system(equations, record, &as_terms(equations.len(), units)?)?.unit_responses(units)
 }
 
 /// Response with zero initial conditions ([`respond`]) and [`unit_responses`], with shared transforms.
@@ -138,8 +138,8 @@ pub fn respond_and_units(
     record: &Record,
     units: &[(usize, f64)],
 ) -> Result<(Vec<Vec<f64>>, Vec<Vec<Vec<f64>>>)> {
-    let system = checked(equations, record, &as_terms(equations.len(), units)?)?;
-    system.rest_and_units(units)
+    let system = build_system(equations, record, &as_terms(equations.len(), units)?)?;
+    system.rest_and_unit_responses(units)
 }
 
 /// Unit initial terms by equation.
@@ -170,7 +170,7 @@ pub fn respond_with_initial(
     initial: &Initial,
     filter: Option<OutputFilter<'_>>,
 ) -> Result<Response> {
-    let system = checked(equations, record, &[])?;
+    let system = build_system(equations, record, &[])?;
     initial.check()?;
     if let Some(filter) = filter {
         check_length("filter", record.m(), filter.series.len())?;
@@ -178,7 +178,7 @@ pub fn respond_with_initial(
     }
     let behind = |i: usize| record.is_filtered() || filter.is_some_and(|f| f.applies[i]);
     let exponents: Vec<Vec<f64>> = (equations.iter().enumerate())
-        .map(|(i, e)| e.structure.initial_exponents(if behind(i) { initial } else { initial.unfiltered() }))
+        .map(|(i, e)| e.structure.initial_exponents(if behind(i) { initial } else { initial.without_filter() }))
         .collect();
     let through = |mut outputs: Vec<Vec<f64>>| {
         if let Some(filter) = filter {
@@ -202,7 +202,7 @@ pub fn respond_with_initial(
         .flat_map(|(i, list)| list.iter().enumerate().map(move |(e, &exponent)| (i, e, exponent)))
         .collect();
     let asked: Vec<(usize, f64)> = units.iter().map(|&(i, _, exponent)| (i, exponent)).collect();
-    let responses: Vec<(usize, usize, Vec<Vec<f64>>)> = (units.iter().zip(system.units(&asked)?))
+    let responses: Vec<(usize, usize, Vec<Vec<f64>>)> = (units.iter().zip(system.unit_responses(&asked)?))
         .map(|(&(i, e, _), outputs)| (i, e, through(outputs)))
         .filter(|(_, _, response)| finite(response))
         .collect();

@@ -7,7 +7,7 @@ use crate::linalg::small::back_substitute;
 use crate::regressors::Record;
 
 /// Relative norm of a column outside the span of the previous ones below which it is linearly dependent.
-const RANK_FLOOR: f64 = 1e-12;
+const RANK_TOLERANCE: f64 = 1e-12;
 
 /// Least-squares estimate of one equation.
 #[derive(Debug, Clone, PartialEq)]
@@ -81,7 +81,7 @@ impl Regression {
 
     /// Number of free coefficients of terms.
     #[must_use]
-    pub fn free(&self) -> usize {
+    pub fn free_count(&self) -> usize {
         self.fixed.iter().filter(|f| f.is_none()).count()
     }
 
@@ -95,8 +95,8 @@ impl Regression {
         let initial = (0..self.starts.len() - 1).map(|r| rest[r * width..(r + 1) * width].to_vec()).collect();
         let dropped = dropped
             .iter()
-            .map(|&d| (d - self.free()) / width.max(1))
-            .zip(dropped.iter().map(|&d| (d - self.free()) % width.max(1)));
+            .map(|&d| (d - self.free_count()) / width.max(1))
+            .zip(dropped.iter().map(|&d| (d - self.free_count()) % width.max(1)));
         Estimate { coefficients, initial, exponents: self.exponents.clone(), dropped: dropped.collect() }
     }
 }
@@ -126,7 +126,7 @@ impl Regression {
 /// ```
 pub fn fit(records: &[Record], structure: &Structure, fixed: &[Option<f64>], initial: &Initial) -> Result<Estimate> {
     let regression = Regression::new(records, structure, fixed, initial)?;
-    let (solution, dropped) = solve(&regression.columns, &regression.target, regression.free())?;
+    let (solution, dropped) = solve(&regression.columns, &regression.target, regression.free_count())?;
     Ok(regression.estimate(&solution, &dropped))
 }
 
@@ -155,7 +155,7 @@ pub fn solve(columns: &[Vec<f64>], target: &[f64], needed: usize) -> Result<(Vec
         scaled.push(target.iter().map(|v| v / target_scale).collect());
         let r = dense::triangular_factor(&scaled);
         let stride = scaled.len();
-        let dependent = (0..kept.len()).find(|&i| r[i * stride + i].abs() <= RANK_FLOOR);
+        let dependent = (0..kept.len()).find(|&i| r[i * stride + i].abs() <= RANK_TOLERANCE);
         if let Some(position) = dependent {
             if kept[position] < needed {
                 return Err(Error::Singular { index: kept[position], count: k });

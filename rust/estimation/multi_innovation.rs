@@ -14,7 +14,7 @@ use crate::regressors::Record;
 
 /// Row basis of the recursion.
 #[derive(Debug, Clone, Copy, PartialEq, Eq)]
-pub enum Rows {
+pub enum RowBasis {
     /// Haar coefficients, coarse to fine, as in the paper; m a power of two.
     Haar,
     /// Pulse means in the sequence of time.
@@ -29,7 +29,7 @@ pub struct Innovation {
     /// Initial covariance K₀ (times the unit matrix) > 0.
     pub prior_covariance: f64,
     /// Basis of the rows.
-    pub rows: Rows,
+    pub row_basis: RowBasis,
 }
 
 impl Innovation {
@@ -94,7 +94,7 @@ pub fn closed_form(
     initial: &Initial,
     innovation: &Innovation,
 ) -> Result<Estimate> {
-    let regression = rows(records, structure, fixed, initial, innovation)?;
+    let regression = regression_in_basis(records, structure, fixed, initial, innovation)?;
     let mut columns = regression.columns.clone();
     let mut target = regression.target.clone();
     for series in columns.iter_mut().chain(std::iter::once(&mut target)) {
@@ -116,7 +116,7 @@ pub fn closed_form(
     target.resize(end + k, 0.0);
     // With a prior no column is linearly dependent in exact arithmetic.
     let (solution, dropped) = least_squares::solve(&columns, &target, 0)?;
-    if let Some(&index) = dropped.iter().find(|&&d| d < regression.free()) {
+    if let Some(&index) = dropped.iter().find(|&&d| d < regression.free_count()) {
         return Err(Error::Singular { index, count: k });
     }
     Ok(regression.estimate(&solution, &dropped))
@@ -135,7 +135,7 @@ pub fn recursion(
     initial: &Initial,
     innovation: &Innovation,
 ) -> Result<(Estimate, Vec<Vec<f64>>)> {
-    let regression = rows(records, structure, fixed, initial, innovation)?;
+    let regression = regression_in_basis(records, structure, fixed, initial, innovation)?;
     let k = regression.columns.len();
     let mut state = Recursion::new(&vec![0.0; k], innovation.prior_covariance)?;
     let end = regression.target.len();
@@ -154,7 +154,7 @@ pub fn recursion(
     Ok((regression.estimate(state.coefficients(), &[]), trace))
 }
 
-fn rows(
+fn regression_in_basis(
     records: &[Record],
     structure: &Structure,
     fixed: &[Option<f64>],
@@ -163,10 +163,10 @@ fn rows(
 ) -> Result<Regression> {
     innovation.check()?;
     let mut regression = Regression::new(records, structure, fixed, initial)?;
-    if innovation.rows == Rows::Haar {
+    if innovation.row_basis == RowBasis::Haar {
         for series in regression.columns.iter_mut().chain(std::iter::once(&mut regression.target)) {
             for pair in regression.starts.windows(2) {
-                operational_matrices::transform(&mut series[pair[0]..pair[1]])?;
+                operational_matrices::haar_transform(&mut series[pair[0]..pair[1]])?;
             }
         }
     }

@@ -9,13 +9,13 @@ use crate::regressors::Record;
 use crate::series::{reciprocal, Buffers, Kernel};
 
 /// Relative norm of the response to an initial term outside the span of the others below which it is dependent.
-const SPANNED: f64 = 1e-12;
+const RANK_TOLERANCE: f64 = 1e-12;
 /// Relative norm of a column after projection below which it is solved for together with the initial terms.
-const LEFT: f64 = 1e-6;
+const MIN_REMAINING_NORM_RATIO: f64 = 1e-6;
 
 /// Best fit of an equation with fixed autoregressive terms.
 #[derive(Debug, Clone, PartialEq)]
-pub struct Projected {
+pub struct FixedPoleEstimate {
     /// Norm of the output error relative to the norm of the output.
     pub error: f64,
     /// One per term of the structure; fixed coefficients as given.
@@ -23,7 +23,7 @@ pub struct Projected {
 }
 
 /// Regression of one record: target, and spectra of the columns.
-struct Part {
+struct RecordSpectra {
     target: Vec<f64>,
     terms: Vec<Kernel>,
     initial: Vec<Kernel>,
@@ -62,34 +62,35 @@ struct Part {
 /// # Ok(())
 /// # }
 /// ```
-pub fn projected(
+pub fn fit_with_fixed_poles(
     records: &[Record],
     structure: &Structure,
     fixed: &[Option<f64>],
     initial: &Initial,
     own: &[f64],
     points: &[Vec<f64>],
-) -> Result<Vec<Option<Projected>>> {
+) -> Result<Vec<Option<FixedPoleEstimate>>> {
     check_length("fixed coefficients", structure.terms.len(), fixed.len())?;
     check_finite("fixed coefficients", &fixed.iter().flatten().copied().collect::<Vec<_>>())?;
     own.iter().try_for_each(|&eta| check_order("integration of an own term", eta))?;
     points.iter().try_for_each(|point| check_length("coefficients of a point", own.len(), point.len()))?;
     let regression = Regression::new(records, structure, &vec![None; fixed.len()], initial)?;
     // Linearly dependent inputs have linearly dependent responses up to rounding.
-    if solve(&regression.columns[..regression.free()], &regression.target, regression.free()).is_err() {
+    if solve(&regression.columns[..regression.free_count()], &regression.target, regression.free_count()).is_err() {
         return Ok(vec![None; points.len()]);
     }
-    let parts: Vec<Part> = (records.iter().enumerate()).map(|(r, record)| part(&regression, own, r, record)).collect();
+    let parts: Vec<RecordSpectra> =
+        (records.iter().enumerate()).map(|(r, record)| record_spectra(&regression, own, r, record)).collect();
     let size = norm(&regression.target).max(1e-300);
-    points.iter().map(|point| at(&parts, fixed, point, size)).collect()
+    points.iter().map(|point| fit_point(&parts, fixed, point, size)).collect()
 }
 
-fn part(regression: &Regression, own: &[f64], r: usize, record: &Record) -> Part {
+fn record_spectra(regression: &Regression, own: &[f64], r: usize, record: &Record) -> RecordSpectra {
     let rows = regression.starts[r]..regression.starts[r + 1];
     let of = |column: &Vec<f64>| Kernel::new(&column[rows.clone()]);
-    let (terms, initial) = regression.columns.split_at(regression.free());
+    let (terms, initial) = regression.columns.split_at(regression.free_count());
     let each = initial.len() / (regression.starts.len() - 1);
-    Part {
+    RecordSpectra {
         target: regression.target[rows.clone()].to_vec(),
         terms: terms.iter().map(of).collect(),
         initial: initial[r * each..(r + 1) * each].iter().map(of).collect(),
@@ -98,7 +99,12 @@ fn part(regression: &Regression, own: &[f64], r: usize, record: &Record) -> Part
 }
 
 /// Fit at one point: responses of each record, then elimination of the initial terms.
-fn at(parts: &[Part], fixed: &[Option<f64>], point: &[f64], size: f64) -> Result<Option<Projected>> {
+fn fit_point(
+    parts: &[RecordSpectra],
+    fixed: &[Option<f64>],
+    point: &[f64],
+    size: f64,
+) -> Result<Option<FixedPoleEstimate>> {
     let mut buffers = Buffers::default();
     let mut target: Vec<f64> = Vec::new();
     let mut columns: Vec<Vec<f64>> = vec![Vec::new(); fixed.iter().filter(|f| f.is_none()).count()];
@@ -136,21 +142,25 @@ fn at(parts: &[Part], fixed: &[Option<f64>], point: &[f64], size: f64) -> Result
     if !finite(&target) || !columns.iter().all(|c| finite(c)) || !starts.iter().flatten().all(|c| finite(c)) {
         return Ok(None);
     }
-    let Some((values, missed)) = solved(columns, target, starts) else { return Ok(None) };
+    let Some((values, missed)) = solve_with_initial_terms(columns, target, starts) else { return Ok(None) };
     let mut values = values.into_iter();
     let coefficients = fixed.iter().map(|f| f.or_else(|| values.next()).unwrap_or(f64::NAN)).collect();
-    Ok(Some(Projected { error: missed / size, coefficients }))
+    Ok(Some(FixedPoleEstimate { error: missed / size, coefficients }))
 }
 
 /// Coefficients of the columns with initial terms of each record, and the norm of the residuals; None if singular.
-fn solved(columns: Vec<Vec<f64>>, target: Vec<f64>, starts: Vec<Vec<Vec<f64>>>) -> Option<(Vec<f64>, f64)> {
+fn solve_with_initial_terms(
+    columns: Vec<Vec<f64>>,
+    target: Vec<f64>,
+    starts: Vec<Vec<Vec<f64>>>,
+) -> Option<(Vec<f64>, f64)> {
     let lengths: Vec<usize> = starts.iter().map(|own| own.first().map_or(0, Vec::len)).collect();
     let free = columns.len();
     let (mut less, mut left) = (columns.clone(), target.clone());
     let mut from = 0;
     for (own, &m) in starts.iter().zip(&lengths) {
         let mut basis = Vec::new();
-        own.iter().for_each(|column| extend_orthonormal(&mut basis, column.clone(), SPANNED));
+        own.iter().for_each(|column| extend_orthonormal(&mut basis, column.clone(), RANK_TOLERANCE));
         for series in less.iter_mut().chain(std::iter::once(&mut left)) {
             let rows = &mut series[from..from + m];
             project_out(&basis, rows);
@@ -158,8 +168,9 @@ fn solved(columns: Vec<Vec<f64>>, target: Vec<f64>, starts: Vec<Vec<Vec<f64>>>) 
         }
         from += m;
     }
-    let told = less.iter().zip(&columns).all(|(less, whole)| norm(less) > LEFT * norm(whole));
-    let (columns, target) = if told { (less, left) } else { (beside(columns, &starts, &lengths), target) };
+    let told = less.iter().zip(&columns).all(|(less, whole)| norm(less) > MIN_REMAINING_NORM_RATIO * norm(whole));
+    let (columns, target) =
+        if told { (less, left) } else { (append_initial_terms(columns, &starts, &lengths), target) };
     let (x, _) = solve(&columns, &target, free).ok()?;
     let mut missed = target;
     for (column, c) in columns.iter().zip(&x) {
@@ -169,7 +180,7 @@ fn solved(columns: Vec<Vec<f64>>, target: Vec<f64>, starts: Vec<Vec<Vec<f64>>>) 
 }
 
 /// Append the columns of the initial terms, each zero outside its record.
-fn beside(mut columns: Vec<Vec<f64>>, starts: &[Vec<Vec<f64>>], lengths: &[usize]) -> Vec<Vec<f64>> {
+fn append_initial_terms(mut columns: Vec<Vec<f64>>, starts: &[Vec<Vec<f64>>], lengths: &[usize]) -> Vec<Vec<f64>> {
     let rows = lengths.iter().sum();
     let mut from = 0;
     for (own, &m) in starts.iter().zip(lengths) {

@@ -7,37 +7,37 @@
 
 use crate::equation::Structure;
 use crate::error::{check_finite, check_length, check_step, Error, Result};
-use crate::estimation::multi_innovation::{Innovation, Rows};
+use crate::estimation::multi_innovation::{Innovation, RowBasis};
 use crate::fractional::exponential_sum::{decay, Rates};
 use crate::fractional::kernels::block_pulse_kernel;
 use crate::linalg::small::Recursion;
 
 /// Relative accuracy of the sum of exponentials, at the rounding level of the batch form.
-const TOLERANCE: f64 = 2e-15;
+const MEMORY_TOLERANCE: f64 = 2e-15;
 
 /// History of one signal: exponential states of all pulses except the newest two, and the last pulse.
 #[derive(Debug, Clone)]
-struct Past {
+struct SignalHistory {
     states: Vec<f64>,
     last: f64,
 }
 
 /// Running integral I^η of one signal at the newest pulse.
 #[derive(Debug, Clone)]
-struct Integral {
+struct RunningIntegral {
     signal: usize,
     /// Weights of the newest pulse and of the previous one.
-    near: [f64; 2],
-    far: Vec<f64>,
+    recent_weights: [f64; 2],
+    history_weights: Vec<f64>,
     /// For orders above 1: the integral of the order minus one, and its running sum.
-    inner: Option<Box<(Integral, f64)>>,
+    inner: Option<Box<(RunningIntegral, f64)>>,
     step: f64,
 }
 
-impl Integral {
+impl RunningIntegral {
     fn new(signal: usize, eta: f64, step: f64, rates: &Rates) -> Result<Self> {
         if eta == 0.0 {
-            return Ok(Self { signal, near: [1.0, 0.0], far: Vec::new(), inner: None, step });
+            return Ok(Self { signal, recent_weights: [1.0, 0.0], history_weights: Vec::new(), inner: None, step });
         }
         if !(eta > 0.0 && eta <= 2.0) {
             return Err(Error::OutOfRange {
@@ -64,13 +64,13 @@ impl Integral {
                 w * keep * if eta > 1.0 { step * last } else { first + last }
             })
             .collect();
-        Ok(Self { signal, near, far, inner, step })
+        Ok(Self { signal, recent_weights: near, history_weights: far, inner, step })
     }
 
     /// Mean over the newest pulse.
-    fn next(&mut self, newest: f64, past: &Past) -> f64 {
-        let older: f64 = self.far.iter().zip(&past.states).map(|(w, z)| w * z).sum();
-        let local = self.near[0] * newest + self.near[1] * past.last + older;
+    fn next(&mut self, newest: f64, past: &SignalHistory) -> f64 {
+        let older: f64 = self.history_weights.iter().zip(&past.states).map(|(w, z)| w * z).sum();
+        let local = self.recent_weights[0] * newest + self.recent_weights[1] * past.last + older;
         match &mut self.inner {
             None => local,
             Some(pair) => {
@@ -85,9 +85,9 @@ impl Integral {
 
 /// Recursion of one equation in a stream.
 #[derive(Debug, Clone)]
-struct Fit {
+struct EquationRecursion {
     output: usize,
-    integrals: Vec<Integral>,
+    integrals: Vec<RunningIntegral>,
     fixed: Vec<Option<f64>>,
     recursion: Recursion,
     /// Ring buffer of the p newest rows, each with its target.
@@ -101,8 +101,8 @@ pub struct Streaming {
     inputs: Vec<bool>,
     keep: Vec<f64>,
     share: Vec<f64>,
-    pasts: Vec<Past>,
-    fits: Vec<Fit>,
+    pasts: Vec<SignalHistory>,
+    fits: Vec<EquationRecursion>,
     sample: Option<Vec<f64>>,
     means: Vec<f64>,
     length: usize,
@@ -140,9 +140,9 @@ impl Streaming {
         prior: f64,
     ) -> Result<Self> {
         check_step(step)?;
-        Innovation { length, prior_covariance: prior, rows: Rows::Time }.check()?;
+        Innovation { length, prior_covariance: prior, row_basis: RowBasis::Time }.check()?;
         #[allow(clippy::cast_precision_loss)]
-        let rates = Rates::new(step, step * (longest.max(2) as f64), TOLERANCE)?;
+        let rates = Rates::new(step, step * (longest.max(2) as f64), MEMORY_TOLERANCE)?;
         let mut fits = Vec::with_capacity(equations.len());
         for (structure, fixed) in equations {
             structure.check(inputs.len(), |s| inputs[s])?;
@@ -153,10 +153,10 @@ impl Streaming {
                 .terms
                 .iter()
                 .enumerate()
-                .map(|(k, term)| Integral::new(term.signal, structure.integration(k), step, &rates))
+                .map(|(k, term)| RunningIntegral::new(term.signal, structure.integration(k), step, &rates))
                 .collect::<Result<Vec<_>>>()?;
             let free = fixed.iter().filter(|f| f.is_none()).count();
-            fits.push(Fit {
+            fits.push(EquationRecursion {
                 output: structure.output,
                 integrals,
                 fixed: fixed.clone(),
@@ -171,7 +171,7 @@ impl Streaming {
             inputs: inputs.to_vec(),
             keep: decays.iter().map(|d| d.0).collect(),
             share: decays.iter().map(|d| step * (d.1 + d.2)).collect(),
-            pasts: vec![Past { states: vec![0.0; count], last: 0.0 }; inputs.len()],
+            pasts: vec![SignalHistory { states: vec![0.0; count], last: 0.0 }; inputs.len()],
             fits,
             sample: None,
             means: vec![0.0; inputs.len()],
@@ -218,7 +218,7 @@ impl Streaming {
     /// Coefficients of the terms of every equation after the newest sample, fixed ones as given.
     #[must_use]
     pub fn coefficients(&self) -> Vec<Vec<f64>> {
-        self.fits.iter().map(Fit::coefficients).collect()
+        self.fits.iter().map(EquationRecursion::coefficients).collect()
     }
 
     /// Number of pulses so far.
@@ -228,8 +228,8 @@ impl Streaming {
     }
 }
 
-impl Fit {
-    fn step(&mut self, means: &[f64], pasts: &[Past], length: usize, pulse: usize) -> Result<()> {
+impl EquationRecursion {
+    fn step(&mut self, means: &[f64], pasts: &[SignalHistory], length: usize, pulse: usize) -> Result<()> {
         let mut target = means[self.output];
         let mut row = Vec::with_capacity(self.integrals.len());
         for (integral, fixed) in self.integrals.iter_mut().zip(&self.fixed) {

@@ -9,9 +9,9 @@
 use crate::error::{check_finite, Error, Result};
 
 /// Lowest rate of the rule times the longest lag. Below it four moments suffice (1e−3⁴/4! < 1e−13).
-const SLOWEST: f64 = 1e-3;
+const LOWEST_RATE_TIMES_LAG: f64 = 1e-3;
 /// Rates below those of the rule, relative to its lowest one.
-const TAIL: [f64; 4] = [0.0, 1.0 / 3.0, 2.0 / 3.0, 1.0];
+const TAIL_RATE_RATIOS: [f64; 4] = [0.0, 1.0 / 3.0, 2.0 / 3.0, 1.0];
 
 /// Decay rates for all kernels t^{q−1}/Γ(q), 0 < q ≤ 1, and lags between two limits.
 #[derive(Debug, Clone)]
@@ -46,7 +46,7 @@ impl Rates {
         let digits = -libm::log(tolerance);
         // The growth of Γ off the real axis costs slightly more than e^{−π²/Δx}.
         let spacing = std::f64::consts::PI * std::f64::consts::PI / (digits + 4.0);
-        let lowest = SLOWEST / longest;
+        let lowest = LOWEST_RATE_TIMES_LAG / longest;
         // Above this rate the remainder at lag `shortest` is below the tolerance, even relative to t^{q−1} at q near 1.
         let highest = (digits + 8.0) / shortest;
         if !(highest / lowest).is_finite() {
@@ -54,7 +54,7 @@ impl Rates {
         }
         #[allow(clippy::cast_possible_truncation, clippy::cast_sign_loss)]
         let count = (libm::log(highest / lowest) / spacing).ceil() as usize + 1;
-        let mut rates: Vec<f64> = TAIL.iter().map(|f| f * lowest).collect();
+        let mut rates: Vec<f64> = TAIL_RATE_RATIOS.iter().map(|f| f * lowest).collect();
         #[allow(clippy::cast_precision_loss)]
         rates.extend((1..=count).map(|j| lowest * libm::exp(spacing * j as f64)));
         Ok(Self { rates, spacing, lowest })
@@ -75,7 +75,7 @@ impl Rates {
             return weights;
         }
         let scale = libm::sin(std::f64::consts::PI * q) / std::f64::consts::PI * self.spacing;
-        for (w, rate) in weights.iter_mut().zip(&self.rates).skip(TAIL.len()) {
+        for (w, rate) in weights.iter_mut().zip(&self.rates).skip(TAIL_RATE_RATIOS.len()) {
             *w = scale * libm::pow(*rate, 1.0 - q);
         }
         // Moments Σ_{j≥0} w_j (rate_j/lowest)^k of the rule's nodes at and below the lowest rate.
@@ -86,13 +86,13 @@ impl Rates {
             *moment = -at / libm::expm1(-power * self.spacing);
             power += 1.0;
         }
-        for (i, weight) in weights.iter_mut().take(TAIL.len()).enumerate() {
+        for (i, weight) in weights.iter_mut().take(TAIL_RATE_RATIOS.len()).enumerate() {
             // Lagrange's polynomial of this node, by its coefficients.
             let mut polynomial = [1.0, 0.0, 0.0, 0.0];
             let mut degree = 0;
-            for (k, node) in TAIL.iter().enumerate() {
+            for (k, node) in TAIL_RATE_RATIOS.iter().enumerate() {
                 if k != i {
-                    let gap = TAIL[i] - node;
+                    let gap = TAIL_RATE_RATIOS[i] - node;
                     for d in (0..=degree).rev() {
                         polynomial[d + 1] += polynomial[d] / gap;
                         polynomial[d] *= -node / gap;

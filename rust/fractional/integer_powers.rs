@@ -4,7 +4,7 @@ use std::cell::RefCell;
 use std::sync::Arc;
 use std::thread::LocalKey;
 
-use crate::parallel::Shared;
+use crate::parallel::ForkSafeLock;
 
 /// `n^exponent` for n = 0 … m−1. Powers are multiplicative: only primes cost a power, everything else one product, so
 /// the relative error grows by half an ε per prime factor, of which n < 2^20 has at most 19.
@@ -77,7 +77,7 @@ fn exact_sum(a: f64, b: f64) -> (f64, f64) {
 
 /// Table that only grows: one for all threads, and one of a thread if the lock is unavailable.
 struct Table<T: 'static> {
-    shared: &'static Shared<Values<T>>,
+    shared: &'static ForkSafeLock<Values<T>>,
     own: &'static LocalKey<RefCell<Values<T>>>,
     make: fn(usize) -> Vec<T>,
 }
@@ -108,7 +108,7 @@ impl<T> Table<T> {
 /// Least prime divisor of each n < m, possibly of more.
 #[allow(clippy::cast_possible_truncation)]
 fn least_divisors(m: usize) -> Arc<Vec<u32>> {
-    static SHARED: Shared<Values<u32>> = Shared::new(None);
+    static SHARED: ForkSafeLock<Values<u32>> = ForkSafeLock::new(None);
     thread_local!(static OWN: RefCell<Values<u32>> = const { RefCell::new(None) });
     let make = |len| {
         let mut divisors: Vec<u32> = (0..len as u32).collect();
@@ -133,7 +133,7 @@ fn least_divisors(m: usize) -> Arc<Vec<u32>> {
 /// For primes p by ln(p − 1) + 2 artanh(1/(2p − 1)), for others by the sum over their divisors.
 #[allow(clippy::cast_precision_loss)]
 fn prime_logarithms(m: usize) -> Arc<Vec<Logarithm>> {
-    static SHARED: Shared<Values<Logarithm>> = Shared::new(None);
+    static SHARED: ForkSafeLock<Values<Logarithm>> = ForkSafeLock::new(None);
     thread_local!(static OWN: RefCell<Values<Logarithm>> = const { RefCell::new(None) });
     let make = |len| {
         let divisors = least_divisors(len);
@@ -167,7 +167,7 @@ fn prime_logarithms(m: usize) -> Arc<Vec<Logarithm>> {
 /// Logarithms ln n for n < m, possibly for more: zip them with a sequence of length m. 0 at n = 0, which is never read.
 #[allow(clippy::cast_precision_loss)]
 pub(crate) fn whole_logarithms(m: usize) -> Arc<Vec<f64>> {
-    static SHARED: Shared<Values<f64>> = Shared::new(None);
+    static SHARED: ForkSafeLock<Values<f64>> = ForkSafeLock::new(None);
     thread_local!(static OWN: RefCell<Values<f64>> = const { RefCell::new(None) });
     let make = |len| (0..len).map(|n: usize| libm::log(n.max(1) as f64)).collect();
     Table { shared: &SHARED, own: &OWN, make }.of(m)
@@ -179,10 +179,10 @@ mod tests {
 
     #[test]
     fn a_lock_that_is_never_given_back_stops_no_table() {
-        static SHARED: Shared<Values<usize>> = Shared::new(None);
+        static SHARED: ForkSafeLock<Values<usize>> = ForkSafeLock::new(None);
         thread_local!(static OWN: RefCell<Values<usize>> = const { RefCell::new(None) });
         let table = Table { shared: &SHARED, own: &OWN, make: |len| (0..len).collect() };
-        let (first, second) = SHARED.held(|| (table.of(5), table.of(8)));
+        let (first, second) = SHARED.hold_during(|| (table.of(5), table.of(8)));
         assert_eq!(*first, [0, 1, 2, 3, 4, 5, 6, 7]);
         assert!(Arc::ptr_eq(&first, &second), "made once");
         let longer = table.of(9);

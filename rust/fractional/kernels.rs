@@ -20,7 +20,7 @@ pub const MAX_ORDER: f64 = 10.0;
 pub const MIN_INPUT_ORDER: f64 = -3.0;
 
 /// Distance in pulses below which the even binomial sum converges slowly and needs [`TERMS_NEAR`] terms.
-const NEAR: usize = 8;
+const FAR_DISTANCE_PULSES: usize = 8;
 /// Terms for distances 2 … 7: 4^−25 is below the rounding error at distance 2.
 const TERMS_NEAR: usize = 25;
 /// Terms from distance 8 on: 64^−8 is below the rounding error.
@@ -43,12 +43,12 @@ const TERMS_FAR: usize = 8;
 pub fn block_pulse_kernel(eta: f64, m: usize, step: f64) -> Vec<f64> {
     let scale = libm::pow(step, eta) / libm::tgamma(eta + 2.0);
     let differences = SecondDifferences::new(eta);
-    if m < SIEVED {
+    if m < MIN_SIEVE_TERMS {
         return (1..=m).map(|n| scale * differences.value(n)).collect();
     }
     let powers = whole_powers(eta + 1.0, m);
-    let head = (1..=HEAD).map(|n| differences.near(n, powers[n - 1]));
-    let tail = powers.iter().enumerate().skip(HEAD).map(|(c, &power)| differences.far(c, power));
+    let head = (1..=LONG_SUM_TERMS).map(|n| differences.near_value(n, powers[n - 1]));
+    let tail = powers.iter().enumerate().skip(LONG_SUM_TERMS).map(|(c, &power)| differences.far_value(c, power));
     head.chain(tail).map(|v| scale * v).collect()
 }
 
@@ -66,15 +66,15 @@ pub fn kernel_with_derivative(eta: f64, m: usize, step: f64) -> (Vec<f64>, Vec<f
     let scale = libm::pow(step, eta) / libm::tgamma(eta + 2.0);
     let slope = libm::log(step) - digamma(eta + 2.0);
     let differences = SecondDifferences::new(eta);
-    if m >= SIEVED {
+    if m >= MIN_SIEVE_TERMS {
         let powers = whole_powers(eta + 1.0, m);
         let logarithms = whole_logarithms(m);
         let (mut kernel, mut slopes) = (Vec::with_capacity(m), Vec::with_capacity(m));
         for (c, (&power, &logarithm)) in powers.iter().zip(logarithms.iter()).enumerate() {
-            let (v, dv) = if c < HEAD {
-                differences.near_with_slope(c + 1, power, logarithm)
+            let (v, dv) = if c < LONG_SUM_TERMS {
+                differences.near_value_and_slope(c + 1, power, logarithm)
             } else {
-                differences.far_with_slope(c, power, logarithm)
+                differences.far_value_and_slope(c, power, logarithm)
             };
             kernel.push(scale * v);
             slopes.push(scale * (v * slope + dv));
@@ -122,13 +122,13 @@ impl SecondDifferences {
 
     /// Σ_k a_k x^k over the terms that matter at this distance, smallest first.
     fn sum(coefficients: &[f64; TERMS_NEAR], centre: usize, shrink: f64) -> f64 {
-        let terms = if centre < NEAR { TERMS_NEAR } else { TERMS_FAR };
+        let terms = if centre < FAR_DISTANCE_PULSES { TERMS_NEAR } else { TERMS_FAR };
         coefficients[..terms].iter().rev().fold(0.0, |sum, &c| (sum + c) * shrink)
     }
 
     #[allow(clippy::cast_precision_loss)]
     pub(crate) fn value(&self, n: usize) -> f64 {
-        self.near(n, if n > 2 { libm::pow((n - 1) as f64, self.eta + 1.0) } else { 1.0 })
+        self.near_value(n, if n > 2 { libm::pow((n - 1) as f64, self.eta + 1.0) } else { 1.0 })
     }
 
     #[allow(clippy::cast_precision_loss)]
@@ -136,12 +136,12 @@ impl SecondDifferences {
         let centre = n.saturating_sub(1) as f64;
         let (power, logarithm) =
             if n > 2 { (libm::pow(centre, self.eta + 1.0), libm::log(centre)) } else { (1.0, 0.0) };
-        self.near_with_slope(n, power, logarithm)
+        self.near_value_and_slope(n, power, logarithm)
     }
 
     /// `v_n` from (n−1)^{η+1}.
     #[allow(clippy::cast_precision_loss)]
-    fn near(&self, n: usize, power: f64) -> f64 {
+    fn near_value(&self, n: usize, power: f64) -> f64 {
         match n {
             0 => 0.0,
             1 => 1.0,
@@ -155,8 +155,8 @@ impl SecondDifferences {
 
     /// `v_n` and its derivative from (n−1)^{η+1} and ln(n−1).
     #[allow(clippy::cast_precision_loss)]
-    fn near_with_slope(&self, n: usize, power: f64, logarithm: f64) -> (f64, f64) {
-        let value = self.near(n, power);
+    fn near_value_and_slope(&self, n: usize, power: f64, logarithm: f64) -> (f64, f64) {
+        let value = self.near_value(n, power);
         match n {
             0 | 1 => (value, 0.0),
             2 => (value, 2.0 * libm::exp2(self.eta) * std::f64::consts::LN_2),
@@ -170,9 +170,9 @@ impl SecondDifferences {
 }
 
 /// Shortest kernel whose powers come from a sieve instead of single evaluations.
-const SIEVED: usize = 256;
+const MIN_SIEVE_TERMS: usize = 256;
 /// Terms with long binomial sums, before the formula for large distances.
-const HEAD: usize = 64;
+const LONG_SUM_TERMS: usize = 64;
 
 /// Terms of the even binomial sum that matter at a distance of at least [`LONG_SUM_TERMS`]: c^{−2K} is below the
 /// rounding error.
@@ -187,7 +187,7 @@ const fn terms_at(centre: usize) -> usize {
 impl SecondDifferences {
     /// `v_n` at n = centre + 1 > [`LONG_SUM_TERMS`] from centre^{η+1}.
     #[allow(clippy::cast_precision_loss)]
-    fn far(&self, centre: usize, power: f64) -> f64 {
+    fn far_value(&self, centre: usize, power: f64) -> f64 {
         let shrink = 1.0 / (centre as f64 * centre as f64);
         let sum = self.coefficients[..terms_at(centre)].iter().rev().fold(0.0, |sum, &c| (sum + c) * shrink);
         2.0 * power * sum
@@ -195,7 +195,7 @@ impl SecondDifferences {
 
     /// `v_n` and its derivative at n = centre + 1 > [`LONG_SUM_TERMS`] from centre^{η+1} and ln centre.
     #[allow(clippy::cast_precision_loss)]
-    fn far_with_slope(&self, centre: usize, power: f64, logarithm: f64) -> (f64, f64) {
+    fn far_value_and_slope(&self, centre: usize, power: f64, logarithm: f64) -> (f64, f64) {
         let shrink = 1.0 / (centre as f64 * centre as f64);
         let terms = terms_at(centre);
         let (mut sum, mut slope) = (0.0, 0.0);
@@ -266,10 +266,10 @@ pub fn power_means(exponent: f64, m: usize, step: f64) -> Vec<f64> {
         return first.iter().zip(&next).map(|(a, b)| scale * (a + 0.5 * (order + 1.0) * b)).collect();
     }
     let means = PowerMeans::new(exponent, step);
-    let mut out: Vec<f64> = (1..=near_pulses(m)).map(|k| means.near(k as f64)).collect();
+    let mut out: Vec<f64> = (1..=near_pulses(m)).map(|k| means.endpoint_mean(k as f64)).collect();
     if out.len() < m {
         let odd = odd_powers(exponent, m);
-        out.extend(odd.iter().enumerate().skip(FEW).map(|(k, &power)| means.far(k, power)));
+        out.extend(odd.iter().enumerate().skip(ENDPOINT_PULSES).map(|(k, &power)| means.midpoint_mean(k, power)));
     }
     out
 }
@@ -285,23 +285,23 @@ pub fn power_means(exponent: f64, m: usize, step: f64) -> Vec<f64> {
 #[allow(clippy::cast_precision_loss)]
 pub fn power_means_slope(exponent: f64, m: usize, step: f64) -> Vec<f64> {
     let means = PowerMeans::new(exponent, step);
-    let mut out: Vec<f64> = (1..=near_pulses(m)).map(|k| means.near_slope(k as f64)).collect();
+    let mut out: Vec<f64> = (1..=near_pulses(m)).map(|k| means.endpoint_slope(k as f64)).collect();
     if out.len() < m {
         let (odd, logarithms) = (odd_powers(exponent, m), whole_logarithms(2 * m));
-        let far = odd.iter().enumerate().skip(FEW);
-        out.extend(far.map(|(k, &power)| means.far_slope(k, power, logarithms[2 * k + 1])));
+        let far = odd.iter().enumerate().skip(ENDPOINT_PULSES);
+        out.extend(far.map(|(k, &power)| means.midpoint_slope(k, power, logarithms[2 * k + 1])));
     }
     out
 }
 
 /// Pulses whose means come from powers of their ends in a long record, and terms of the midpoint series of the pulses
 /// before [`LONG_SUM_TERMS`]: 33^−16 is below the rounding error.
-const FEW: usize = 16;
-const MIDDLE: usize = 8;
+const ENDPOINT_PULSES: usize = 16;
+const MIDPOINT_SERIES_TERMS: usize = 8;
 
 /// Number of pulses whose means come from powers of their ends. Other means come from powers of their midpoints.
 fn near_pulses(m: usize) -> usize {
-    m.min(if m < SIEVED { m } else { FEW })
+    m.min(if m < MIN_SIEVE_TERMS { m } else { ENDPOINT_PULSES })
 }
 
 /// Means of t^e over pulses of length h.
@@ -312,15 +312,15 @@ struct PowerMeans {
     half: f64,
     ln_step: f64,
     /// C(a, 2j+1)/a and their derivatives.
-    sums: [f64; MIDDLE],
-    slopes: [f64; MIDDLE],
+    sums: [f64; MIDPOINT_SERIES_TERMS],
+    slopes: [f64; MIDPOINT_SERIES_TERMS],
 }
 
 impl PowerMeans {
     #[allow(clippy::cast_precision_loss)]
     fn new(exponent: f64, step: f64) -> Self {
         let (a, scale) = (exponent + 1.0, libm::pow(step, exponent));
-        let (mut sums, mut slopes) = ([0.0; MIDDLE], [0.0; MIDDLE]);
+        let (mut sums, mut slopes) = ([0.0; MIDPOINT_SERIES_TERMS], [0.0; MIDPOINT_SERIES_TERMS]);
         let (mut c, mut dc) = (1.0, 0.0);
         for (j, (sum, slope)) in sums.iter_mut().zip(&mut slopes).enumerate() {
             (*sum, *slope) = (c, dc);
@@ -333,34 +333,34 @@ impl PowerMeans {
     }
 
     /// Mean over pulse k, k^a − (k−1)^a, without cancellation.
-    fn near(&self, k: f64) -> f64 {
+    fn endpoint_mean(&self, k: f64) -> f64 {
         let a = self.a;
         self.scale / a * if k == 1.0 { 1.0 } else { -libm::pow(k, a) * libm::expm1(a * libm::log1p(-1.0 / k)) }
     }
 
     /// Derivative of the mean over pulse k with respect to e.
-    fn near_slope(&self, k: f64) -> f64 {
+    fn endpoint_slope(&self, k: f64) -> f64 {
         let a = self.a;
         let turned = |k: f64| if k > 1.0 { libm::pow(k, a) * libm::log(k) } else { 0.0 };
-        self.near(k) * (self.ln_step - 1.0 / a) + self.scale / a * (turned(k) - turned(k - 1.0))
+        self.endpoint_mean(k) * (self.ln_step - 1.0 / a) + self.scale / a * (turned(k) - turned(k - 1.0))
     }
 
     /// Sum over the terms that matter at the midpoint of pulse k + 1, d/2 with d = 2k + 1.
     #[allow(clippy::cast_precision_loss)]
-    fn sum(sums: &[f64; MIDDLE], k: usize) -> f64 {
+    fn sum(sums: &[f64; MIDPOINT_SERIES_TERMS], k: usize) -> f64 {
         let d = (2 * k + 1) as f64;
         let shrink = 1.0 / (d * d);
-        let terms = if k < HEAD { MIDDLE } else { terms_at(2 * k) };
+        let terms = if k < LONG_SUM_TERMS { MIDPOINT_SERIES_TERMS } else { terms_at(2 * k) };
         sums[..terms].iter().rev().fold(0.0, |sum, &c| sum * shrink + c)
     }
 
     /// Mean over pulse k + 1 from d^e: (d/2)^e·Σ C(a, 2j+1)/a·d^−2j, a series about the midpoint.
-    fn far(&self, k: usize, power: f64) -> f64 {
+    fn midpoint_mean(&self, k: usize, power: f64) -> f64 {
         self.half * power * Self::sum(&self.sums, k)
     }
 
     /// Derivative of the mean over pulse k + 1 with respect to e.
-    fn far_slope(&self, k: usize, power: f64, logarithm: f64) -> f64 {
+    fn midpoint_slope(&self, k: usize, power: f64, logarithm: f64) -> f64 {
         let turned = self.ln_step - std::f64::consts::LN_2 + logarithm;
         self.half * power * (Self::sum(&self.sums, k) * turned + Self::sum(&self.slopes, k))
     }
@@ -477,7 +477,7 @@ pub fn kernel_and_slope(eta: f64, m: usize, step: f64) -> (Vec<f64>, Vec<f64>) {
 
 /// First coefficient of [`kernel`]: effect of a pulse on its own mean.
 #[must_use]
-pub fn first(eta: f64, step: f64) -> f64 {
+pub fn first_coefficient(eta: f64, step: f64) -> f64 {
     let size = eta.abs();
     let value = libm::pow(step, size) / libm::tgamma(size + 2.0);
     if eta >= 0.0 {

@@ -162,7 +162,7 @@ fn table(rows: &Wavelet, columns: &Wavelet, m: usize, entry: impl Fn(usize) -> f
 /// As [`operational_matrix`].
 #[cfg(feature = "oracles")]
 pub fn operational_matrix_dense(eta: f64, m: usize, step: f64) -> Result<Vec<f64>> {
-    let phi = matrix(m)?;
+    let phi = haar_matrix(m)?;
     let f = block_pulse_matrix(eta, m, step)?;
     let phi_f = dense::multiply(&phi, &f, m, m, m);
     let mut phi_transposed = phi;
@@ -214,10 +214,10 @@ pub fn check_power_of_two(m: usize) -> Result<()> {
 /// # Ok(())
 /// # }
 /// ```
-pub fn transform(f: &mut [f64]) -> Result<()> {
+pub fn haar_transform(f: &mut [f64]) -> Result<()> {
     check_power_of_two(f.len())?;
     let mut scratch = vec![0.0; f.len()];
-    forward(f, &mut scratch);
+    haar_transform_with_scratch(f, &mut scratch);
     Ok(())
 }
 
@@ -225,7 +225,7 @@ pub fn transform(f: &mut [f64]) -> Result<()> {
 ///
 /// # Errors
 /// [`Error::NotPowerOfTwo`].
-pub fn inverse(c: &mut [f64]) -> Result<()> {
+pub fn haar_inverse(c: &mut [f64]) -> Result<()> {
     check_power_of_two(c.len())?;
     let mut scratch = vec![0.0; c.len()];
     let mut len = 1;
@@ -242,7 +242,7 @@ pub fn inverse(c: &mut [f64]) -> Result<()> {
 }
 
 /// [`haar_transform`] with scratch of the caller, for loops over rows. The length of `f` is a power of two.
-pub(crate) fn forward(f: &mut [f64], scratch: &mut [f64]) {
+pub(crate) fn haar_transform_with_scratch(f: &mut [f64], scratch: &mut [f64]) {
     let mut len = f.len();
     while len > 1 {
         let half = len / 2;
@@ -261,7 +261,7 @@ pub(crate) fn forward(f: &mut [f64], scratch: &mut [f64]) {
 /// # Errors
 /// [`Error::NotPowerOfTwo`].
 #[allow(clippy::cast_precision_loss)]
-pub fn matrix(m: usize) -> Result<Vec<f64>> {
+pub fn haar_matrix(m: usize) -> Result<Vec<f64>> {
     check_power_of_two(m)?;
     check_dense(m)?;
     let mut phi = vec![0.0; m * m];

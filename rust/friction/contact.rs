@@ -12,30 +12,30 @@
 //! Stribeck friction falls with speed. In long pulses several combinations may then be consistent. The one found from
 //! the forces of the previous pulse is used.
 
-use super::convolution::{Heads, Online};
-use super::law::{Law, Moves, Phase, Pulse};
+use super::convolution::{Heads, OnlineConvolution};
+use super::law::{FrictionLaw, Phase, Pulse, PulseDerivatives};
 use crate::error::{Error, Result};
 use crate::linalg::small;
 
 /// Friction laws of coupled bodies, and the velocity change of each for a unit of force on each in one pulse.
 #[derive(Debug, Clone, PartialEq)]
-pub struct Rubbing {
-    laws: Vec<Law>,
+pub struct ContactLaw {
+    laws: Vec<FrictionLaw>,
     /// Velocity changes per force, row by row.
     gains: Vec<f64>,
 }
 
 /// Most iterations for the frictions of a pulse. Two weakly coupled bodies need two.
-const STEPS: usize = 200;
+const MAX_FORCE_ITERATIONS: usize = 200;
 /// Largest error of a solution, relative to the velocities.
-const MISSED: f64 = 1e-9;
+const FORCE_TOLERANCE_RATIO: f64 = 1e-9;
 
-impl Rubbing {
+impl ContactLaw {
     /// Bodies with these laws.
     ///
     /// # Errors
     /// [`Error::Diverged`] if the coupling leaves no unique solution of a pulse: the step is too long.
-    pub fn new(laws: Vec<Law>, gains: Vec<f64>) -> Result<Self> {
+    pub fn new(laws: Vec<FrictionLaw>, gains: Vec<f64>) -> Result<Self> {
         if !is_p_matrix(&gains, laws.len()) {
             // Same error as for a step that is too long, so that an optimizer shortens it.
             return Err(Error::Diverged {
@@ -65,7 +65,7 @@ impl Rubbing {
     }
 
     /// Velocity change of a body by the forces on the others.
-    fn others(&self, body: usize, forces: impl Fn(usize) -> f64) -> f64 {
+    fn coupling_velocity(&self, body: usize, forces: impl Fn(usize) -> f64) -> f64 {
         (0..self.count()).filter(|&b| b != body).map(|b| self.gains[body * self.count() + b] * forces(b)).sum()
     }
 
@@ -75,7 +75,7 @@ impl Rubbing {
     pub fn pulse(&self, v: &[f64], p: &[f64], rounding: &[f64], near: &[f64], at: &mut Vec<(f64, Pulse)>) {
         let n = self.count();
         let of = |a: usize, forces: &[f64]| {
-            let free = p[a] - self.others(a, |b| forces[b]);
+            let free = p[a] - self.coupling_velocity(a, |b| forces[b]);
             (free, self.laws[a].pulse(v[a], free, self.own(a), rounding[a]))
         };
         at.clear();
@@ -89,7 +89,7 @@ impl Rubbing {
         };
         let mut miss = wrong(at, &forces);
         let size = (0..n).map(|a| v[a].abs() + p[a].abs() + self.own(a) * self.breakaway(a)).fold(0.0, f64::max);
-        for _ in 0..STEPS {
+        for _ in 0..MAX_FORCE_ITERATIONS {
             if miss <= 4.0 * f64::EPSILON * size {
                 break;
             }
@@ -110,7 +110,7 @@ impl Rubbing {
             miss = wrong(at, &forces);
         }
         let falls = self.laws.iter().any(|law| law.stribeck > 0.0);
-        if !falls && miss > MISSED * size {
+        if !falls && miss > FORCE_TOLERANCE_RATIO * size {
             // NaN counts as overflow: no solution is better than a wrong one.
             at.iter_mut().for_each(|(_, pulse)| pulse.end = f64::NAN);
         }
@@ -118,7 +118,7 @@ impl Rubbing {
 
     /// Derivative of each body's friction with respect to its end velocity without friction.
     fn rises(&self, v: &[f64], at: &[(f64, Pulse)]) -> Vec<f64> {
-        let unit = Moves { start: 0.0, free: 1.0, first: 0.0, law: [0.0; 3] };
+        let unit = PulseDerivatives { start: 0.0, free: 1.0, first: 0.0, law: [0.0; 3] };
         (0..self.count()).map(|a| self.laws[a].slope(v[a], at[a].0, self.own(a), &at[a].1, &unit).0).collect()
     }
 
@@ -139,9 +139,9 @@ impl Rubbing {
     }
 
     /// Derivatives of frictions and end velocities from those of each body without the forces on the others.
-    pub fn slope(&self, v: &[f64], at: &[(f64, Pulse)], moves: &[Moves], out: &mut Vec<(f64, f64)>) {
+    pub fn slope(&self, v: &[f64], at: &[(f64, Pulse)], moves: &[PulseDerivatives], out: &mut Vec<(f64, f64)>) {
         let n = self.count();
-        let of = |a: usize, moves: &Moves| self.laws[a].slope(v[a], at[a].0, self.own(a), &at[a].1, moves);
+        let of = |a: usize, moves: &PulseDerivatives| self.laws[a].slope(v[a], at[a].0, self.own(a), &at[a].1, moves);
         out.clear();
         out.extend((0..n).map(|a| of(a, &moves[a])));
         if n == 1 {
@@ -150,7 +150,8 @@ impl Rubbing {
         let alone: Vec<f64> = out.iter().map(|x| x.0).collect();
         let forces = self.through(&self.rises(v, at), &alone);
         for (a, moved) in out.iter_mut().enumerate() {
-            *moved = of(a, &Moves { free: moves[a].free - self.others(a, |b| forces[b]), ..moves[a] });
+            *moved =
+                of(a, &PulseDerivatives { free: moves[a].free - self.coupling_velocity(a, |b| forces[b]), ..moves[a] });
         }
     }
 }
@@ -187,30 +188,30 @@ pub struct Trace {
 impl Trace {
     /// Whether the body never moves.
     #[must_use]
-    pub fn is_still(&self) -> bool {
+    pub fn is_always_at_rest(&self) -> bool {
         self.edges.iter().all(|v| *v == 0.0)
     }
 }
 
 /// Solution of the contact problem over all pulses.
 #[derive(Debug, Clone, PartialEq)]
-pub struct March {
+pub struct ContactSolution {
     /// Trajectory of each body with friction.
     pub bodies: Vec<Trace>,
-    rubbing: Rubbing,
+    contact_law: ContactLaw,
 }
 
 /// Rounding error relative to the largest velocity without friction. A force that equals friction moves nothing.
-const ROUNDING: f64 = 1e-12;
+const VELOCITY_ROUNDING_RATIO: f64 = 1e-12;
 
-impl March {
+impl ContactSolution {
     /// Solve pulse by pulse from initial velocities.
     ///
     /// `linear` is L of each body at the ends of the pulses, `responses` are the responses g of the velocities (rows)
     /// to forces.
     #[must_use]
-    pub fn new(linear: &[Vec<f64>], responses: &[Vec<Heads>], rubbing: Rubbing, start: &[f64]) -> Self {
-        let n = rubbing.count();
+    pub fn new(linear: &[Vec<f64>], responses: &[Vec<Heads>], contact_law: ContactLaw, start: &[f64]) -> Self {
+        let n = contact_law.count();
         let m = linear.first().map_or(0, Vec::len);
         let mut bodies: Vec<Trace> = (start.iter())
             .map(|&v| {
@@ -220,16 +221,19 @@ impl March {
                 Trace { force, edges, phases, free }
             })
             .collect();
-        let rounding: Vec<f64> =
-            linear.iter().map(|row| ROUNDING * row.iter().fold(0.0_f64, |a, v| a.max(v.abs()))).collect();
-        let mut pasts: Vec<Vec<Online>> = responses.iter().map(|row| row.iter().map(Online::new).collect()).collect();
+        let rounding: Vec<f64> = linear
+            .iter()
+            .map(|row| VELOCITY_ROUNDING_RATIO * row.iter().fold(0.0_f64, |a, v| a.max(v.abs())))
+            .collect();
+        let mut pasts: Vec<Vec<OnlineConvolution>> =
+            responses.iter().map(|row| row.iter().map(OnlineConvolution::new).collect()).collect();
         let (mut v, mut forces) = (start.to_vec(), vec![0.0; n]);
         let (mut p, mut at) = (vec![0.0; n], Vec::with_capacity(n));
         for k in 0..m {
             for ((p, row), linear) in p.iter_mut().zip(&pasts).zip(linear) {
-                *p = linear[k] - row.iter().map(Online::past).sum::<f64>();
+                *p = linear[k] - row.iter().map(OnlineConvolution::past).sum::<f64>();
             }
-            rubbing.pulse(&v, &p, &rounding, &forces, &mut at);
+            contact_law.pulse(&v, &p, &rounding, &forces, &mut at);
             for (a, &(free, Pulse { force, end, phase })) in at.iter().enumerate() {
                 pasts.iter_mut().for_each(|row| row[a].push(force));
                 let body = &mut bodies[a];
@@ -242,13 +246,13 @@ impl March {
         if let Some(row) = pasts.into_iter().next() {
             bodies.iter_mut().zip(row).for_each(|(body, past)| body.force = past.into_signal());
         }
-        Self { bodies, rubbing }
+        Self { bodies, contact_law }
     }
 
     /// Friction laws and gains of the bodies.
     #[must_use]
-    pub fn rubbing(&self) -> &Rubbing {
-        &self.rubbing
+    pub fn contact_law(&self) -> &ContactLaw {
+        &self.contact_law
     }
 
     /// Derivatives of the frictions with respect to a parameter. None if all are zero.
@@ -266,7 +270,8 @@ impl March {
     ) -> Option<Vec<Vec<f64>>> {
         let n = self.bodies.len();
         let m = moved.first().map_or(0, Vec::len);
-        let mut pasts: Vec<Vec<Online>> = responses.iter().map(|row| row.iter().map(Online::new).collect()).collect();
+        let mut pasts: Vec<Vec<OnlineConvolution>> =
+            responses.iter().map(|row| row.iter().map(OnlineConvolution::new).collect()).collect();
         let mut dv = start.to_vec();
         let (mut v, mut at, mut moves) = (Vec::with_capacity(n), Vec::with_capacity(n), Vec::with_capacity(n));
         let mut slopes = Vec::with_capacity(n);
@@ -279,11 +284,11 @@ impl March {
                 v.push(body.edges[k]);
                 let (force, end, phase) = (body.force[k], body.edges[k + 1], body.phases[k]);
                 at.push((body.free[k], Pulse { force, end, phase }));
-                let past: f64 = pasts[a].iter().map(Online::past).sum();
+                let past: f64 = pasts[a].iter().map(OnlineConvolution::past).sum();
                 let free = moved[k] + first[a] * force - past;
-                moves.push(Moves { start: dv[a], free, first: first[a], law: laws[a] });
+                moves.push(PulseDerivatives { start: dv[a], free, first: first[a], law: laws[a] });
             }
-            self.rubbing.slope(&v, &at, &moves, &mut slopes);
+            self.contact_law.slope(&v, &at, &moves, &mut slopes);
             for (a, &(force, end)) in slopes.iter().enumerate() {
                 dv[a] = end;
                 any |= force != 0.0;
@@ -291,6 +296,6 @@ impl March {
             }
         }
         let row = pasts.into_iter().next()?;
-        any.then(|| row.into_iter().map(Online::into_signal).collect())
+        any.then(|| row.into_iter().map(OnlineConvolution::into_signal).collect())
     }
 }

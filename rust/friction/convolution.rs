@@ -7,7 +7,7 @@ use crate::fractional::kernels::{digamma, kernel_and_slope};
 use crate::series::{Buffers, Kernel};
 
 /// Length of a block that is summed directly. Transforms of shorter blocks cost more.
-const DIRECT: usize = 64;
+const DIRECT_SUM_LENGTH: usize = 64;
 
 /// Spectra of the heads of a kernel, each twice as long as the previous one, shared by all signals.
 pub struct Heads {
@@ -20,7 +20,7 @@ impl Heads {
     #[must_use]
     pub fn new(kernel: &[f64]) -> Self {
         let mut spectra = Vec::new();
-        let mut length = DIRECT;
+        let mut length = DIRECT_SUM_LENGTH;
         while length < kernel.len() {
             // Only the later of two blocks is read, so wrapped-around terms do not matter.
             spectra.push(Kernel::with_length(&kernel[..(2 * length).min(kernel.len())], 2 * length));
@@ -31,7 +31,7 @@ impl Heads {
 }
 
 /// Online convolution of one signal with a kernel.
-pub struct Online<'a> {
+pub struct OnlineConvolution<'a> {
     heads: &'a Heads,
     sums: Vec<f64>,
     signal: Vec<f64>,
@@ -39,7 +39,7 @@ pub struct Online<'a> {
     block: Vec<f64>,
 }
 
-impl<'a> Online<'a> {
+impl<'a> OnlineConvolution<'a> {
     /// Convolution before its first value.
     #[must_use]
     pub fn new(heads: &'a Heads) -> Self {
@@ -52,7 +52,7 @@ impl<'a> Online<'a> {
     #[must_use]
     pub fn past(&self) -> f64 {
         let k = self.signal.len();
-        let first = k - k % DIRECT;
+        let first = k - k % DIRECT_SUM_LENGTH;
         let recent = self.signal[first..].iter().rev().zip(&self.heads.kernel[1..]).map(|(x, c)| x * c).sum::<f64>();
         self.sums.get(k).copied().unwrap_or(0.0) + recent
     }
@@ -61,11 +61,11 @@ impl<'a> Online<'a> {
     pub fn push(&mut self, value: f64) {
         self.signal.push(value);
         let known = self.signal.len();
-        if known % DIRECT != 0 || known >= self.sums.len() {
+        if known % DIRECT_SUM_LENGTH != 0 || known >= self.sums.len() {
             return;
         }
-        let level = (known / DIRECT).trailing_zeros() as usize;
-        let length = DIRECT << level;
+        let level = (known / DIRECT_SUM_LENGTH).trailing_zeros() as usize;
+        let length = DIRECT_SUM_LENGTH << level;
         let past = &self.signal[known - length..];
         let Some(spectrum) = self.heads.spectra.get(level).filter(|_| past.iter().any(|x| *x != 0.0)) else { return };
         self.block.resize(2 * length, 0.0);
@@ -106,7 +106,7 @@ const SEEN_AT_ONCE: f64 = 1e-6;
 
 /// Signal integrated by the order of its term, or the derivative of that in the order.
 #[derive(Debug, Clone)]
-pub(super) struct Integrated {
+pub(super) struct IntegratedSignal {
     /// Pulse means at the level of the output.
     pub(super) output: Vec<f64>,
     /// Velocity at the ends of pulses.
@@ -114,14 +114,14 @@ pub(super) struct Integrated {
 }
 
 /// Kernels of an input integrated by η, at the level of the output: values and derivatives in η.
-pub(super) struct Driver {
+pub(super) struct InputKernels {
     pub(super) output: [Vec<f64>; 2],
     /// Response to a pulse at the ends of pulses. With direct feedthrough: response in pulse means.
     pub(super) edges: [Vec<f64>; 2],
     at_once: bool,
 }
 
-impl Driver {
+impl InputKernels {
     pub(super) fn new(eta: f64, m: usize, step: f64) -> Self {
         let output = kernel_and_slope(eta, m, step);
         let at_once = eta - 1.0 <= SEEN_AT_ONCE;
@@ -130,10 +130,10 @@ impl Driver {
     }
 
     /// Signal through the kernels (0) or their derivatives (1).
-    pub(super) fn of(&self, signal: &Kernel, which: usize) -> Integrated {
+    pub(super) fn of(&self, signal: &Kernel, which: usize) -> IntegratedSignal {
         let edges = product(signal, &self.edges[which]);
-        let edges = if self.at_once { between(&edges) } else { edges };
-        Integrated { output: product(signal, &self.output[which]), edges }
+        let edges = if self.at_once { average_neighbors(&edges) } else { edges };
+        IntegratedSignal { output: product(signal, &self.output[which]), edges }
     }
 }
 
@@ -145,7 +145,7 @@ pub(super) fn product(cached: &Kernel, series: &[f64]) -> Vec<f64> {
 }
 
 /// Values at pulse ends from means: averages of neighboring pulses, the last value extrapolated.
-fn between(means: &[f64]) -> Vec<f64> {
+fn average_neighbors(means: &[f64]) -> Vec<f64> {
     let m = means.len();
     let mut out: Vec<f64> = means.windows(2).map(|pair| 0.5 * (pair[0] + pair[1])).collect();
     let last = means.last().copied().unwrap_or(0.0);

@@ -6,15 +6,15 @@
 //! so their integrals have the kernels of pulse means ([`crate::fractional::kernels::block_pulse_kernel`]). Friction of
 //! a pulse therefore acts within that pulse.
 
-use super::contact::{is_p_matrix, March, Rubbing, Trace};
-use super::convolution::{product, Driver, Heads, Integrated};
-use super::initial_state::{Forcing, Link};
-use super::law::Law;
+use super::contact::{is_p_matrix, ContactLaw, ContactSolution, Trace};
+use super::convolution::{product, Heads, InputKernels, IntegratedSignal};
+use super::initial_state::{InitialForcing, Link};
+use super::law::FrictionLaw;
 use crate::equation::{check_regular, Equation, Initial, ORDER_GRAIN};
 use crate::error::{check_finite, check_length, Error, Result};
 use crate::fractional::kernels::{kernel_and_slope, MAX_EXCESS};
 use crate::linalg::small;
-use crate::regressors::{add_impulses, parted, Record};
+use crate::regressors::{add_impulses, split_impulses, Record};
 use crate::series::{self, Kernel, Solver};
 
 /// System of coupled equations, some of them with friction of their own output's velocity.
@@ -24,7 +24,7 @@ pub struct Body {
     /// bodies may include accelerations.
     pub equations: Vec<Equation>,
     /// Equations with friction, and F of − F(Dy) sgn(Dy).
-    pub frictions: Vec<(usize, Law)>,
+    pub frictions: Vec<(usize, FrictionLaw)>,
 }
 
 /// Motion found by simulation.
@@ -39,7 +39,7 @@ pub struct Motion {
 impl Body {
     /// System of one equation.
     #[must_use]
-    pub fn alone(equation: Equation, friction: Law) -> Self {
+    pub fn single(equation: Equation, friction: FrictionLaw) -> Self {
         Self { equations: vec![equation], frictions: vec![(0, friction)] }
     }
 
@@ -73,7 +73,7 @@ impl Body {
                 });
             }
         }
-        for &(place, Law { coulomb, stribeck, speed }) in &self.frictions {
+        for &(place, FrictionLaw { coulomb, stribeck, speed }) in &self.frictions {
             check_finite("friction", &[coulomb, stribeck, speed])?;
             let alpha = self.equations[place].structure.order;
             if !(alpha > 1.0 && alpha <= 2.0) {
@@ -110,7 +110,7 @@ impl Body {
     ///
     /// Terms above a body's own order are checked on the grid instead.
     fn check_yields(&self) -> Result<()> {
-        let (n, sticks, links) = (self.equations.len(), self.sticks(), self.links());
+        let (n, sticks, links) = (self.equations.len(), self.friction_equations(), self.links());
         if links.iter().flatten().any(|link| link.integration < -ORDER_GRAIN) {
             return Ok(());
         }
@@ -136,7 +136,7 @@ impl Body {
     }
 
     /// Indices of the equations with friction.
-    pub(super) fn sticks(&self) -> Vec<usize> {
+    pub(super) fn friction_equations(&self) -> Vec<usize> {
         self.frictions.iter().map(|f| f.0).collect()
     }
 
@@ -174,13 +174,13 @@ impl Body {
     pub fn run(&self, record: &Record, initial: &[Vec<(f64, f64)>]) -> Result<Motion> {
         self.check(record.len())?;
         check_length("initial terms", self.equations.len(), initial.len())?;
-        let (powers, impulses) = parted(initial);
+        let (powers, impulses) = split_impulses(initial);
         for terms in &powers {
             let (exponents, values): (Vec<f64>, Vec<f64>) = terms.iter().copied().unzip();
             check_finite("coefficients of the initial terms", &values)?;
             Initial::Powers(exponents).check()?;
         }
-        let forcing = Forcing::of(&powers, &self.links(), record.m(), record.step())?;
+        let forcing = InitialForcing::of(&powers, &self.links(), record.m(), record.step())?;
         let mut run = Run::new(self, &Operators::new(self, record)?, &forcing)?;
         add_impulses(&mut run.outputs, &impulses, record.step());
         Ok(Motion { outputs: run.outputs, bodies: run.march.bodies })
@@ -203,9 +203,9 @@ impl Body {
 /// Linear operators of bodies on a record.
 pub(super) struct Operators {
     /// Kernels and spectrum of each term's input signal, by equation. None for a simulated output.
-    pub(super) drivers: Vec<Vec<Option<(Driver, Kernel)>>>,
+    pub(super) drivers: Vec<Vec<Option<(InputKernels, Kernel)>>>,
     /// Signal of each input term, integrated.
-    pub(super) driven: Vec<Vec<Option<Integrated>>>,
+    pub(super) integrated_inputs: Vec<Vec<Option<IntegratedSignal>>>,
     /// Kernel of each term of a simulated output, on means and at edges, and its derivative in the order.
     pub(super) own: Vec<Vec<Option<[Vec<f64>; 2]>>>,
     /// A of A y = b.
@@ -215,7 +215,7 @@ pub(super) struct Operators {
     /// Inverse of A's leading coefficients.
     leading: Vec<f64>,
     /// Kernels of friction, of each body that may stick.
-    pub(super) frictions: Vec<Driver>,
+    pub(super) frictions: Vec<InputKernels>,
     /// Responses of the velocities (rows) at pulse ends to a pulse of force on each body (columns).
     pub(super) responses: Vec<Vec<Heads>>,
     /// First values of these responses, row by row.
@@ -225,7 +225,7 @@ pub(super) struct Operators {
 
 impl Operators {
     pub(super) fn new(body: &Body, record: &Record) -> Result<Self> {
-        let (m, step, n, sticks) = (record.m(), record.step(), body.equations.len(), body.sticks());
+        let (m, step, n, sticks) = (record.m(), record.step(), body.equations.len(), body.friction_equations());
         let mut matrix = vec![vec![vec![0.0; m]; n]; n];
         let (mut drivers, mut driven, mut own) = (Vec::new(), Vec::new(), Vec::new());
         for (i, Equation { structure, coefficients }) in body.equations.iter().enumerate() {
@@ -244,7 +244,7 @@ impl Operators {
                     row_drivers.push(None);
                     row_driven.push(None);
                 } else {
-                    let driver = Driver::new(eta, m, step);
+                    let driver = InputKernels::new(eta, m, step);
                     let signal = Kernel::new(record.signal(term.signal));
                     row_driven.push(Some(driver.of(&signal, 0)));
                     row_drivers.push(Some((driver, signal)));
@@ -258,8 +258,8 @@ impl Operators {
         let leading: Vec<f64> = matrix.iter().flatten().map(|a| a.first().copied().unwrap_or(0.0)).collect();
         let leading = small::inverse(&leading, n)?;
         let inverse = Solver::new(&matrix)?.inverse_spectra(2 * m)?;
-        let frictions: Vec<Driver> =
-            sticks.iter().map(|&b| Driver::new(body.equations[b].structure.order, m, step)).collect();
+        let frictions: Vec<InputKernels> =
+            sticks.iter().map(|&b| InputKernels::new(body.equations[b].structure.order, m, step)).collect();
         let count = sticks.len();
         let mut gains = vec![0.0; count * count];
         let mut responses: Vec<Vec<Heads>> = (0..count).map(|_| Vec::with_capacity(count)).collect();
@@ -270,7 +270,18 @@ impl Operators {
                 row.push(Heads::new(&response));
             }
         }
-        Ok(Self { drivers, driven, own, matrix, inverse, leading, frictions, responses, gains, sticks })
+        Ok(Self {
+            drivers,
+            integrated_inputs: driven,
+            own,
+            matrix,
+            inverse,
+            leading,
+            frictions,
+            responses,
+            gains,
+            sticks,
+        })
     }
 
     /// A⁻¹ of right-hand sides, empty ones being zero.
@@ -283,7 +294,7 @@ impl Operators {
     }
 
     /// Velocities of the bodies with friction at pulse ends, without their friction.
-    pub(super) fn at_edges(&self, total: &Forcing) -> Vec<Vec<f64>> {
+    pub(super) fn at_edges(&self, total: &InitialForcing) -> Vec<Vec<f64>> {
         let of = |&b: &usize| {
             let mut out = vec![total.start[b]; total.edges[b].len()];
             for (kernel, edges) in self.inverse[b].iter().zip(&total.edges) {
@@ -320,15 +331,15 @@ pub(super) struct Run {
     pub(super) solved: Vec<Vec<f64>>,
     /// Velocities at pulse ends minus initial velocities.
     pub(super) moved: Vec<Vec<f64>>,
-    pub(super) march: March,
+    pub(super) march: ContactSolution,
     /// Spectra of the frictions.
     pub(super) forces: Vec<Kernel>,
 }
 
 impl Run {
-    pub(super) fn new(body: &Body, operators: &Operators, forcing: &Forcing) -> Result<Self> {
+    pub(super) fn new(body: &Body, operators: &Operators, forcing: &InitialForcing) -> Result<Self> {
         let mut total = forcing.clone();
-        for (i, (row, equation)) in operators.driven.iter().zip(&body.equations).enumerate() {
+        for (i, (row, equation)) in operators.integrated_inputs.iter().zip(&body.equations).enumerate() {
             for (driven, &c) in row.iter().zip(&equation.coefficients) {
                 if let Some(driven) = driven {
                     total.add_to(i, c, driven);
@@ -341,9 +352,9 @@ impl Run {
             return Err(Error::Diverged { what: "free run".into(), index });
         }
         let laws = body.frictions.iter().map(|f| f.1).collect();
-        let rubbing = Rubbing::new(laws, operators.gains.clone())?;
+        let rubbing = ContactLaw::new(laws, operators.gains.clone())?;
         let start: Vec<f64> = operators.sticks.iter().map(|&b| total.start[b]).collect();
-        let march = March::new(&linear, &operators.responses, rubbing, &start);
+        let march = ContactSolution::new(&linear, &operators.responses, rubbing, &start);
         if let Some(index) = march.bodies.iter().find_map(|x| x.edges.iter().position(|v| !v.is_finite())) {
             return Err(Error::Diverged { what: "free run".into(), index });
         }
@@ -352,7 +363,9 @@ impl Run {
         let largest = |values: &[f64]| values.iter().fold(0.0_f64, |a, v| a.max(v.abs()));
         let drives = total.edges.iter().chain([&total.start]).map(|row| largest(row)).fold(0.0, f64::max);
         for (a, row) in linear.iter().enumerate() {
-            if largest(row) > LOST * (drives + march.rubbing().breakaway(a) * march.rubbing().own(a)) {
+            if largest(row)
+                > MAX_CANCELLATION_RATIO * (drives + march.contact_law().breakaway(a) * march.contact_law().own(a))
+            {
                 return Err(Error::Diverged { what: "free run without its friction".into(), index: row.len() });
             }
         }
@@ -363,7 +376,7 @@ impl Run {
             total.edges[b].iter_mut().zip(&held.edges).for_each(|(b, v)| *b -= v);
         }
         let alone = body.equations.len() == 1;
-        let mut outputs = if alone && march.bodies.iter().all(Trace::is_still) {
+        let mut outputs = if alone && march.bodies.iter().all(Trace::is_always_at_rest) {
             total.levels.iter().map(|&level| vec![level; m]).collect()
         } else {
             let rhs: Vec<&[f64]> = total.output.iter().map(Vec::as_slice).collect();
@@ -371,11 +384,11 @@ impl Run {
         };
         let solved = operators.sticks.iter().map(|&b| outputs[b].clone()).collect();
         for (&b, moved) in operators.sticks.iter().zip(&march.bodies) {
-            if moved.is_still() {
+            if moved.is_always_at_rest() {
                 // A body that never moves stays exactly at its initial position, without rounding errors.
                 outputs[b] = vec![total.levels[b]; m];
             } else if !alone {
-                at_rest(&mut outputs[b], moved);
+                remove_creep(&mut outputs[b], moved);
             }
         }
         if let Some(index) = outputs.iter().find_map(|y| y.iter().position(|v| !v.is_finite())) {
@@ -390,7 +403,7 @@ impl Run {
 ///
 /// Its velocity is 0 at the edges of each pulse. Within a pulse the force of another body changes while the mean of
 /// friction is constant, which moves the mean position in proportion to the square of the step.
-pub(super) fn at_rest(output: &mut [f64], body: &Trace) {
+pub(super) fn remove_creep(output: &mut [f64], body: &Trace) {
     let (mut crept, mut before) = (0.0, output.first().copied().unwrap_or(0.0));
     for (value, edges) in output.iter_mut().skip(1).zip(body.edges.windows(3)) {
         let now = *value;
@@ -403,4 +416,4 @@ pub(super) fn at_rest(output: &mut [f64], body: &Trace) {
 }
 
 /// Largest ratio of the velocity without friction to the inputs. Beyond, fewer than eight of sixteen digits remain.
-const LOST: f64 = 1e8;
+const MAX_CANCELLATION_RATIO: f64 = 1e8;

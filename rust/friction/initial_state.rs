@@ -1,6 +1,6 @@
 //! Initial states and constant forces of a run, as powers of t that enter outputs and velocities.
 
-use super::convolution::Integrated;
+use super::convolution::IntegratedSignal;
 use crate::equation::{Equation, Initial, ORDER_GRAIN};
 use crate::error::{Error, Result};
 use crate::fractional::kernels::{kernel, power_means};
@@ -20,7 +20,7 @@ pub(super) struct Link {
 
 /// Initial states and constant forces as inputs at the levels of outputs and velocities, by equation.
 #[derive(Debug, Clone, PartialEq)]
-pub(super) struct Forcing {
+pub(super) struct InitialForcing {
     /// Pulse means at the level of the output.
     pub(super) output: Vec<Vec<f64>>,
     /// Contribution to the velocity at pulse ends, relative to the initial velocity.
@@ -32,15 +32,15 @@ pub(super) struct Forcing {
     m: usize,
 }
 
-impl Forcing {
-    pub(super) fn none(m: usize, n: usize) -> Self {
+impl InitialForcing {
+    pub(super) fn zeros(m: usize, n: usize) -> Self {
         let rows = vec![vec![0.0; m]; n];
         Self { output: rows.clone(), edges: rows, start: vec![0.0; n], levels: vec![0.0; n], m }
     }
 
     /// Zero forcing of the same size.
-    pub(super) fn nothing(&self) -> Self {
-        Self::none(self.m, self.levels.len())
+    pub(super) fn zeros_like(&self) -> Self {
+        Self::zeros(self.m, self.levels.len())
     }
 
     /// Add a weighted forcing.
@@ -54,7 +54,7 @@ impl Forcing {
     }
 
     /// Add a weighted integrated signal to one equation.
-    pub(super) fn add_to(&mut self, equation: usize, weight: f64, part: &Integrated) {
+    pub(super) fn add_to(&mut self, equation: usize, weight: f64, part: &IntegratedSignal) {
         let add = |sum: &mut Vec<f64>, part: &[f64]| sum.iter_mut().zip(part).for_each(|(s, v)| *s += weight * v);
         add(&mut self.output[equation], &part.output);
         add(&mut self.edges[equation], &part.edges);
@@ -71,9 +71,9 @@ impl Forcing {
     #[allow(clippy::cast_precision_loss)]
     pub(super) fn of(powers: &[Vec<(f64, f64)>], links: &[Vec<Link>], m: usize, step: f64) -> Result<Self> {
         let n = powers.len();
-        let mut out = Self::none(m, n);
+        let mut out = Self::zeros(m, n);
         let constant = |own: &Vec<(f64, f64)>| own.iter().filter(|p| p.0.abs() < ORDER_GRAIN).map(|p| p.1).sum::<f64>();
-        out.levels = at_once(&powers.iter().map(constant).collect::<Vec<f64>>(), links)?;
+        out.levels = solve_feedthrough(&powers.iter().map(constant).collect::<Vec<f64>>(), links)?;
         let mut all = vec![Sum::default(); n];
         for (i, own) in powers.iter().enumerate() {
             for &(exponent, value) in own {
@@ -102,7 +102,7 @@ impl Forcing {
         }
         let given: Vec<f64> =
             all.iter().map(|own| own.powers().filter(|p| p.0.abs() < ORDER_GRAIN).map(|p| p.1).sum()).collect();
-        out.start = at_once(&given, links)?;
+        out.start = solve_feedthrough(&given, links)?;
         for (i, own) in all.iter_mut().enumerate() {
             own.add(0.0, -out.start[i]);
             for link in &links[i] {
@@ -150,7 +150,7 @@ fn means_of(exponent: f64, m: usize, step: f64) -> Vec<f64> {
 }
 
 /// Initial outputs or velocities from the given values, with direct feedthrough between equations.
-fn at_once(given: &[f64], links: &[Vec<Link>]) -> Result<Vec<f64>> {
+fn solve_feedthrough(given: &[f64], links: &[Vec<Link>]) -> Result<Vec<f64>> {
     let n = given.len();
     if !links.iter().flatten().any(|link| link.integration.abs() < ORDER_GRAIN) {
         return Ok(given.to_vec());
@@ -262,7 +262,7 @@ impl State {
 }
 
 /// Merge the powers of t of several states by equation and exponent.
-pub(super) fn together(n: usize, parts: impl IntoIterator<Item = (usize, f64, f64)>) -> Vec<Vec<(f64, f64)>> {
+pub(super) fn merge_powers(n: usize, parts: impl IntoIterator<Item = (usize, f64, f64)>) -> Vec<Vec<(f64, f64)>> {
     let mut out: Vec<Vec<(f64, f64)>> = vec![Vec::new(); n];
     for (i, exponent, value) in parts {
         match out[i].iter_mut().find(|known| (known.0 - exponent).abs() < ORDER_GRAIN) {

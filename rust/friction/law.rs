@@ -22,7 +22,7 @@ pub enum Phase {
 
 /// Coulomb friction with Stribeck effect.
 #[derive(Debug, Clone, Copy, PartialEq)]
-pub struct Law {
+pub struct FrictionLaw {
     /// Coulomb friction fc, not negative, in the unit of D^α y.
     pub coulomb: f64,
     /// Stribeck friction fs at rest in addition to fc, not negative.
@@ -44,7 +44,7 @@ pub struct Pulse {
 
 /// Derivatives of the quantities of a pulse with respect to a parameter.
 #[derive(Debug, Clone, Copy, PartialEq)]
-pub struct Moves {
+pub struct PulseDerivatives {
     /// Velocity at the start.
     pub start: f64,
     /// Velocity at the end without friction in the pulse.
@@ -67,9 +67,9 @@ struct Mean {
 
 /// Difference of speeds, relative to vs, below which quadrature replaces a difference of error functions. Five points
 /// are exact there, and the difference would lose digits.
-const NEAR: f64 = 0.2;
+const QUADRATURE_SPEED_RATIO: f64 = 0.2;
 /// Gauss–Legendre nodes and weights on [0, 1].
-const POINTS: [(f64, f64); 5] = [
+const GAUSS_LEGENDRE_NODES: [(f64, f64); 5] = [
     (0.046_910_077_030_668, 0.118_463_442_528_094_54),
     (0.230_765_344_947_158_45, 0.239_314_335_249_683_24),
     (0.5, 0.284_444_444_444_444_44),
@@ -77,7 +77,7 @@ const POINTS: [(f64, f64); 5] = [
     (0.953_089_922_969_332, 0.118_463_442_528_094_54),
 ];
 /// Most fixed-point iterations for the end velocity. Each gains a digit or more unless two roots nearly coincide.
-const SWEEPS: usize = 500;
+const MAX_SLIDE_ITERATIONS: usize = 500;
 
 /// Mean sign, end velocity and state of a pulse with Coulomb friction.
 ///
@@ -103,7 +103,7 @@ pub fn pulse(v: f64, p: f64, b: f64, rounding: f64) -> (f64, f64, Phase) {
     (sign, p - b * sign, Phase::Turn)
 }
 
-impl Law {
+impl FrictionLaw {
     /// Friction that does not depend on speed.
     #[must_use]
     pub const fn coulomb(coulomb: f64) -> Self {
@@ -119,8 +119,8 @@ impl Law {
     /// Mean of the Stribeck term's exponential between two nonnegative speeds of a linear velocity.
     fn share(&self, from: f64, to: f64) -> f64 {
         let (x, d) = (from / self.speed, (to - from) / self.speed);
-        if d.abs() < NEAR {
-            return POINTS.iter().map(|(u, w)| w * libm::exp(-(x + u * d).powi(2))).sum();
+        if d.abs() < QUADRATURE_SPEED_RATIO {
+            return GAUSS_LEGENDRE_NODES.iter().map(|(u, w)| w * libm::exp(-(x + u * d).powi(2))).sum();
         }
         0.5 * libm::sqrt(PI) * (libm::erf(x + d) - libm::erf(x)) / d
     }
@@ -133,9 +133,9 @@ impl Law {
         let (x, d) = (from / self.speed, (to - from) / self.speed);
         let share = self.share(from, to);
         let gauss = |z: f64| libm::exp(-z * z);
-        let (by_from, by_to) = if d.abs() < NEAR {
+        let (by_from, by_to) = if d.abs() < QUADRATURE_SPEED_RATIO {
             let sloped = |weight: fn(f64) -> f64| -> f64 {
-                POINTS.iter().map(|(u, w)| -2.0 * w * weight(*u) * (x + u * d) * gauss(x + u * d)).sum()
+                GAUSS_LEGENDRE_NODES.iter().map(|(u, w)| -2.0 * w * weight(*u) * (x + u * d) * gauss(x + u * d)).sum()
             };
             (sloped(|u| 1.0 - u), sloped(|u| u))
         } else {
@@ -159,7 +159,7 @@ impl Law {
     fn slide(&self, v: f64, p: f64, g: f64) -> Option<f64> {
         let rounding = 4.0 * f64::EPSILON * (v + p.abs());
         let mut end = v;
-        for _ in 0..SWEEPS {
+        for _ in 0..MAX_SLIDE_ITERATIONS {
             let next = p - g * self.mean(v, end);
             if next < 0.0 {
                 return None;
@@ -207,7 +207,7 @@ impl Law {
 
     /// Derivatives of the friction and of the end velocity of a pulse.
     #[must_use]
-    pub fn slope(&self, v: f64, p: f64, g: f64, at: &Pulse, moves: &Moves) -> (f64, f64) {
+    pub fn slope(&self, v: f64, p: f64, g: f64, at: &Pulse, moves: &PulseDerivatives) -> (f64, f64) {
         let of = |mean: &Mean| mean.law.iter().zip(&moves.law).map(|(a, b)| a * b).sum::<f64>();
         match at.phase {
             Phase::Stick if g > 0.0 && self.breakaway() > 0.0 => ((moves.free - at.force * moves.first) / g, 0.0),

@@ -20,5 +20,5 @@ mod model;
 
 pub use dynamics::{Body, Motion};
 pub use fit::{fit, fit_until, Fit, Start};
-pub use law::Law;
-pub use model::{passing, FreeLaw, FrictionModel};
+pub use law::FrictionLaw;
+pub use model::{filtered_outputs, FreeFrictionLaw, FrictionModel};

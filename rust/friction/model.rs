@@ -1,18 +1,18 @@
 //! Parameters of bodies with friction: residuals of all experiments and their derivatives.
 
-use super::convolution::{product, Integrated};
-use super::dynamics::{at_rest, Body, Operators, Run};
-use super::initial_state::{together, Forcing, State};
-use super::law::Law;
+use super::convolution::{product, IntegratedSignal};
+use super::dynamics::{remove_creep, Body, Operators, Run};
+use super::initial_state::{merge_powers, InitialForcing, State};
+use super::law::FrictionLaw;
 use crate::equation::{Equation, Initial, Structure, Term};
 use crate::error::{check_length, Error, Result};
 use crate::estimation::output_error::{Coordinate, Experiment, FreeEquation, FreeInput, InputLaw, Monomial};
-use crate::regressors::{add_impulses, parted, Record};
+use crate::regressors::{add_impulses, split_impulses, Record};
 use crate::series::Kernel;
 
 /// Friction law with free parameters, each a multiple of one coefficient.
 #[derive(Debug, Clone, PartialEq)]
-pub struct FreeLaw {
+pub struct FreeFrictionLaw {
     /// fc.
     pub coulomb: Monomial,
     /// fs.
@@ -21,7 +21,7 @@ pub struct FreeLaw {
     pub speed: Monomial,
 }
 
-impl FreeLaw {
+impl FreeFrictionLaw {
     /// Friction that does not depend on speed.
     #[must_use]
     pub fn coulomb(coulomb: Monomial) -> Self {
@@ -34,20 +34,20 @@ impl FreeLaw {
     }
 
     /// Law at these coefficients.
-    pub(super) fn at(&self, coefficients: &[f64]) -> Law {
+    pub(super) fn at(&self, coefficients: &[f64]) -> FrictionLaw {
         let [coulomb, stribeck, speed] = self.numbers().map(|number| number.at(coefficients));
-        Law { coulomb, stribeck, speed }
+        FrictionLaw { coulomb, stribeck, speed }
     }
 
     /// Whether a coefficient is a force of this law, which must not be negative.
-    pub(super) fn rubs(&self, coefficient: usize) -> bool {
+    pub(super) fn is_force(&self, coefficient: usize) -> bool {
         [&self.coulomb, &self.stribeck].iter().any(|number| number.powers.iter().any(|&(i, _)| i == coefficient))
     }
 }
 
 /// Outputs that pass a filter before the comparison.
 #[must_use]
-pub fn passing(experiments: &[Experiment]) -> Vec<bool> {
+pub fn filtered_outputs(experiments: &[Experiment]) -> Vec<bool> {
     experiments.first().and_then(|e| e.filter.as_ref()).map_or_else(Vec::new, |(_, passes)| passes.clone())
 }
 
@@ -57,7 +57,7 @@ pub struct FrictionModel {
     /// Linear equations.
     pub equations: Vec<FreeEquation>,
     /// Equations with friction, and F of − F(Dy) sgn(Dy).
-    pub frictions: Vec<(usize, FreeLaw)>,
+    pub frictions: Vec<(usize, FreeFrictionLaw)>,
     /// Free parameters of inputs, at most one an input.
     pub inputs: Vec<FreeInput>,
     /// Bounds of each free order.
@@ -92,17 +92,17 @@ struct Part {
     operators: Operators,
     run: Run,
     /// Derivatives of the means of each input with respect to its free parameter.
-    bent: Vec<Vec<f64>>,
+    input_slopes: Vec<Vec<f64>>,
 }
 
 /// Samples for the initial velocity of a run.
 const FIRST_SAMPLES: usize = 8;
 
 /// Step of central differences. Powers of t are smooth in the orders, so the error is about 1e−10.
-const SHIFT: f64 = 1e-5;
+const DIFFERENCE_STEP: f64 = 1e-5;
 
 /// Parameter of a derivative.
-enum Moved {
+enum Parameter {
     /// Free order, free coefficient, or state of one run.
     Order(usize),
     Coefficient(usize),
@@ -156,7 +156,7 @@ impl FrictionModel {
         for experiment in experiments {
             experiment.check()?;
             check_length("outputs", self.equations.len(), experiment.samples.len())?;
-            if experiment.own.is_some() {
+            if experiment.nonuniform.is_some() {
                 return refuse("friction with samples at times of their own", "leave them out");
             }
             let passes = experiment.filter.as_ref().map_or(&[][..], |(_, applies)| applies);
@@ -168,8 +168,8 @@ impl FrictionModel {
     }
 
     /// Whether a coefficient is a friction force, which must not be negative.
-    pub(super) fn rubs(&self, coefficient: usize) -> bool {
-        self.frictions.iter().any(|(_, law)| law.rubs(coefficient))
+    pub(super) fn is_friction_force(&self, coefficient: usize) -> bool {
+        self.frictions.iter().any(|(_, law)| law.is_force(coefficient))
     }
 
     /// Return an error for invalid free orders.
@@ -232,24 +232,30 @@ impl FrictionModel {
         let parts = states.iter().zip(values).flat_map(|(state, &x)| {
             state.powers(&body.equations, &links).into_iter().map(move |(i, e, c)| (i, e, x * c))
         });
-        together(body.equations.len(), parts)
+        merge_powers(body.equations.len(), parts)
     }
 
-    fn forcing(&self, orders: &[f64], coefficients: &[f64], values: &[f64], record: &Record) -> Result<Forcing> {
+    fn initial_forcing(
+        &self,
+        orders: &[f64],
+        coefficients: &[f64],
+        values: &[f64],
+        record: &Record,
+    ) -> Result<InitialForcing> {
         let body = self.body(orders, coefficients);
-        let (powers, _) = parted(&self.powers(orders, coefficients, values));
-        Forcing::of(&powers, &body.links(), record.m(), record.step())
+        let (powers, _) = split_impulses(&self.powers(orders, coefficients, values));
+        InitialForcing::of(&powers, &body.links(), record.m(), record.step())
     }
 
     /// Record with transformed inputs, and their derivatives in the free parameters. None without free inputs.
-    fn acting(&self, record: &Record, values: &[f64]) -> Result<(Option<Record>, Vec<Vec<f64>>)> {
+    fn transform_inputs(&self, record: &Record, values: &[f64]) -> Result<(Option<Record>, Vec<Vec<f64>>)> {
         if self.inputs.is_empty() {
             return Ok((None, Vec::new()));
         }
         let mut signals: Vec<Vec<f64>> = (0..record.len()).map(|s| record.signal(s).to_vec()).collect();
         let mut bent = Vec::with_capacity(self.inputs.len());
         for (input, &value) in self.inputs.iter().zip(values) {
-            let (means, slope) = input.law.acted(&signals[input.signal], value, record.step(), 0.0)?;
+            let (means, slope) = input.law.apply(&signals[input.signal], value, record.step(), 0.0)?;
             signals[input.signal] = means;
             bent.push(slope);
         }
@@ -263,19 +269,19 @@ impl FrictionModel {
         body.check(usize::MAX).map_err(far)?;
         let mut out = Evaluation { residuals: Vec::new(), size: 0.0, parts: Vec::with_capacity(experiments.len()) };
         for (experiment, values) in experiments.iter().zip(&point.states) {
-            let (acting, bent) = self.acting(&experiment.record, &point.inputs)?;
+            let (acting, bent) = self.transform_inputs(&experiment.record, &point.inputs)?;
             let operators = Operators::new(&body, acting.as_ref().unwrap_or(&experiment.record))?;
-            let forcing = self.forcing(&point.orders, &point.coefficients, values, &experiment.record)?;
+            let forcing = self.initial_forcing(&point.orders, &point.coefficients, values, &experiment.record)?;
             let run = Run::new(&body, &operators, &forcing)?;
-            let mut residuals = experiment.measured();
+            let mut residuals = experiment.measured_samples();
             out.size = out.size.hypot(residuals.iter().map(|v| v * v).sum::<f64>().sqrt());
             let mut outputs = run.outputs.clone();
-            let (_, impulses) = parted(&self.powers(&point.orders, &point.coefficients, values));
+            let (_, impulses) = split_impulses(&self.powers(&point.orders, &point.coefficients, values));
             add_impulses(&mut outputs, &impulses, experiment.record.step());
-            let sampled = experiment.sampled(&outputs);
+            let sampled = experiment.weighted_samples(&outputs);
             residuals.iter_mut().zip(sampled).for_each(|(e, v)| *e -= v);
             out.residuals.extend(residuals);
-            out.parts.push(Part { operators, run, bent });
+            out.parts.push(Part { operators, run, input_slopes: bent });
         }
         Ok(out)
     }
@@ -291,27 +297,27 @@ impl FrictionModel {
         at: &Evaluation,
         numbers: bool,
     ) -> Result<Vec<Vec<f64>>> {
-        let mut all: Vec<Moved> = Vec::new();
+        let mut all: Vec<Parameter> = Vec::new();
         if numbers {
-            all.extend((0..point.orders.len()).map(Moved::Order));
-            all.extend((0..point.coefficients.len()).map(Moved::Coefficient));
-            all.extend((0..point.inputs.len()).map(Moved::Input));
+            all.extend((0..point.orders.len()).map(Parameter::Order));
+            all.extend((0..point.coefficients.len()).map(Parameter::Coefficient));
+            all.extend((0..point.inputs.len()).map(Parameter::Input));
         }
         for (run, states) in point.states.iter().enumerate() {
-            all.extend((0..states.len()).map(|state| Moved::State(run, state)));
+            all.extend((0..states.len()).map(|state| Parameter::State(run, state)));
         }
         let body = self.body(&point.orders, &point.coefficients);
         let mut columns = vec![Vec::with_capacity(at.residuals.len()); all.len()];
         for (index, (experiment, part)) in experiments.iter().zip(&at.parts).enumerate() {
-            let spectra = Spectra::new(part, &body.sticks());
+            let spectra = Spectra::new(part, &body.friction_equations());
             for (column, moved) in columns.iter_mut().zip(&all) {
-                if matches!(moved, Moved::State(run, _) if *run != index) {
-                    column.extend(std::iter::repeat_n(0.0, self.equations.len() * experiment.compared()));
+                if matches!(moved, Parameter::State(run, _) if *run != index) {
+                    column.extend(std::iter::repeat_n(0.0, self.equations.len() * experiment.compared_count()));
                     continue;
                 }
                 let slopes = self.slopes(&body, experiment, part, &spectra, point, index, moved)?;
                 // Residuals are measurement minus response.
-                column.extend(experiment.sampled(&slopes).into_iter().map(|v| -v));
+                column.extend(experiment.weighted_samples(&slopes).into_iter().map(|v| -v));
             }
         }
         if columns.iter().flatten().any(|v| !v.is_finite()) {
@@ -330,10 +336,10 @@ impl FrictionModel {
         spectra: &Spectra,
         point: &Point,
         run: usize,
-        moved: &Moved,
+        moved: &Parameter,
     ) -> Result<Vec<Vec<f64>>> {
         let (operators, motion, record) = (&part.operators, &part.run, &experiment.record);
-        if let Moved::State(_, state) = *moved {
+        if let Parameter::State(_, state) = *moved {
             if let Some(State::Power(i, e)) = self.states(&point.orders).0.get(state).filter(|s| s.is_impulse()) {
                 // A filter transient does not move a body.
                 let mut slopes = vec![vec![0.0; record.m()]; self.equations.len()];
@@ -343,9 +349,9 @@ impl FrictionModel {
                 return Ok(slopes);
             }
         }
-        let Moves { alphas, terms: moves, frictions } = self.moves(point, moved);
+        let BodyDerivatives { alphas, terms: moves, frictions } = self.moves(point, moved);
         let mut total = self.forcing_slope(point, &point.states[run], record, moved)?;
-        let mut add = |i: usize, weight: f64, part: &Integrated| {
+        let mut add = |i: usize, weight: f64, part: &IntegratedSignal| {
             if weight != 0.0 {
                 total.add_to(i, weight, part);
             }
@@ -353,14 +359,16 @@ impl FrictionModel {
         for (i, equation) in body.equations.iter().enumerate() {
             for (k, (&(dc, deta), &c)) in moves[i].iter().zip(&equation.coefficients).enumerate() {
                 let signal = equation.structure.terms[k].signal;
-                if let (Some(driven), Some((driver, spectrum))) = (&operators.driven[i][k], &operators.drivers[i][k]) {
+                if let (Some(driven), Some((driver, spectrum))) =
+                    (&operators.integrated_inputs[i][k], &operators.drivers[i][k])
+                {
                     add(i, dc, driven);
                     if deta != 0.0 {
                         add(i, c * deta, &driver.of(spectrum, 1));
                     }
-                    if let Moved::Input(input) = moved {
+                    if let Parameter::Input(input) = moved {
                         if signal == self.inputs[*input].signal {
-                            add(i, c, &driver.of(&Kernel::new(&part.bent[*input]), 0));
+                            add(i, c, &driver.of(&Kernel::new(&part.input_slopes[*input]), 0));
                         }
                     }
                 }
@@ -374,7 +382,7 @@ impl FrictionModel {
                 }
             }
         }
-        let sticks = body.sticks();
+        let sticks = body.friction_equations();
         for ((&b, friction), force) in sticks.iter().zip(&operators.frictions).zip(&motion.forces) {
             if alphas[b] != 0.0 {
                 add(b, -alphas[b], &friction.of(force, 1));
@@ -391,20 +399,20 @@ impl FrictionModel {
         }
         let mut slopes = operators.through(&total.output);
         if slopes.len() > 1 {
-            sticks.iter().zip(&motion.march.bodies).for_each(|(&b, moved)| at_rest(&mut slopes[b], moved));
+            sticks.iter().zip(&motion.march.bodies).for_each(|(&b, moved)| remove_creep(&mut slopes[b], moved));
         }
         Ok(slopes)
     }
 
     /// Derivatives of the orders, coefficients and friction parameters with respect to a parameter.
-    fn moves(&self, point: &Point, moved: &Moved) -> Moves {
-        let mut out = Moves {
+    fn moves(&self, point: &Point, moved: &Parameter) -> BodyDerivatives {
+        let mut out = BodyDerivatives {
             alphas: vec![0.0; self.equations.len()],
             terms: self.equations.iter().map(|e| vec![(0.0, 0.0); e.terms.len()]).collect(),
             frictions: vec![[0.0; 3]; self.frictions.len()],
         };
         match *moved {
-            Moved::Order(j) => {
+            Parameter::Order(j) => {
                 let of = |weights: &[f64]| weights.get(j).copied().unwrap_or(0.0);
                 for (i, equation) in self.equations.iter().enumerate() {
                     let alpha = of(&equation.order.weights);
@@ -412,7 +420,7 @@ impl FrictionModel {
                     out.terms[i] = equation.terms.iter().map(|t| (0.0, alpha - of(&t.1.weights))).collect();
                 }
             }
-            Moved::Coefficient(j) => {
+            Parameter::Coefficient(j) => {
                 for (terms, equation) in out.terms.iter_mut().zip(&self.equations) {
                     *terms = equation.terms.iter().map(|t| (t.2.slope(&point.coefficients, j), 0.0)).collect();
                 }
@@ -420,24 +428,30 @@ impl FrictionModel {
                     *moves = law.numbers().map(|number| number.slope(&point.coefficients, j));
                 }
             }
-            Moved::State(..) | Moved::Input(_) => {}
+            Parameter::State(..) | Parameter::Input(_) => {}
         }
         out
     }
 
     /// Derivative of the initial forcing, which is linear in states and coefficients and smooth in orders.
-    fn forcing_slope(&self, point: &Point, values: &[f64], record: &Record, moved: &Moved) -> Result<Forcing> {
+    fn forcing_slope(
+        &self,
+        point: &Point,
+        values: &[f64],
+        record: &Record,
+        moved: &Parameter,
+    ) -> Result<InitialForcing> {
         let idle = values.is_empty() || values.iter().all(|x| *x == 0.0);
-        let none = || Ok(Forcing::none(record.m(), self.equations.len()));
+        let none = || Ok(InitialForcing::zeros(record.m(), self.equations.len()));
         match *moved {
-            Moved::State(_, state) => {
+            Parameter::State(_, state) => {
                 let unit: Vec<f64> = (0..values.len()).map(|k| if k == state { 1.0 } else { 0.0 }).collect();
-                self.forcing(&point.orders, &point.coefficients, &unit, record)
+                self.initial_forcing(&point.orders, &point.coefficients, &unit, record)
             }
             // Initial forcing does not depend on inputs.
-            Moved::Input(_) => none(),
+            Parameter::Input(_) => none(),
             _ if idle => none(),
-            Moved::Coefficient(j) => {
+            Parameter::Coefficient(j) => {
                 let followed = |signal: usize| self.equations.iter().any(|e| e.output == signal);
                 let mut terms = self.equations.iter().flat_map(|e| &e.terms);
                 if !terms.any(|t| followed(t.0) && t.2.slope(&point.coefficients, j) != 0.0) {
@@ -446,27 +460,27 @@ impl FrictionModel {
                 let at = |by: f64| {
                     let mut shifted = point.coefficients.clone();
                     shifted[j] += by;
-                    self.forcing(&point.orders, &shifted, values, record)
+                    self.initial_forcing(&point.orders, &shifted, values, record)
                 };
                 let size = point.coefficients[j].abs().max(1.0);
                 // Quadratic at most for one equation. With direct feedthrough between equations it is rational.
-                let by = if self.equations.len() == 1 { size } else { SHIFT * size };
+                let by = if self.equations.len() == 1 { size } else { DIFFERENCE_STEP * size };
                 Ok(difference(&at(by)?, &at(-by)?, 2.0 * by))
             }
-            Moved::Order(j) => {
+            Parameter::Order(j) => {
                 let shifted = |by: f64| {
                     let mut orders = point.orders.clone();
                     orders[j] += by;
-                    self.forcing(&orders, &point.coefficients, values, record)
+                    self.initial_forcing(&orders, &point.coefficients, values, record)
                 };
-                Ok(difference(&shifted(SHIFT)?, &shifted(-SHIFT)?, 2.0 * SHIFT))
+                Ok(difference(&shifted(DIFFERENCE_STEP)?, &shifted(-DIFFERENCE_STEP)?, 2.0 * DIFFERENCE_STEP))
             }
         }
     }
 }
 
 /// Derivatives of each α, of (coefficient, integration order) of each term, and of each fc, fs and vs.
-struct Moves {
+struct BodyDerivatives {
     alphas: Vec<f64>,
     terms: Vec<Vec<(f64, f64)>>,
     frictions: Vec<[f64; 3]>,
@@ -476,7 +490,7 @@ struct Moves {
 fn first_of(samples: &[f64], experiment: &Experiment) -> (f64, f64) {
     let near = &samples[..samples.len().min(FIRST_SAMPLES)];
     #[allow(clippy::cast_precision_loss)]
-    let (count, step) = (near.len() as f64, experiment.record.step() * experiment.every as f64);
+    let (count, step) = (near.len() as f64, experiment.record.step() * experiment.pulses_per_sample as f64);
     let middle = 0.5 * (count - 1.0);
     let mean = near.iter().sum::<f64>() / count.max(1.0);
     #[allow(clippy::cast_precision_loss)]
@@ -491,8 +505,8 @@ fn first_of(samples: &[f64], experiment: &Experiment) -> (f64, f64) {
     (mean - rate * middle * step, rate)
 }
 
-fn difference(up: &Forcing, down: &Forcing, step: f64) -> Forcing {
-    let mut out = up.nothing();
+fn difference(up: &InitialForcing, down: &InitialForcing, step: f64) -> InitialForcing {
+    let mut out = up.zeros_like();
     out.add(1.0 / step, up);
     out.add(-1.0 / step, down);
     out
@@ -512,8 +526,8 @@ impl Spectra {
     }
 
     /// Contribution of a term of an output through its kernels (0) or their derivatives (1).
-    fn own(&self, output: usize, kernels: &[Vec<f64>; 2], which: usize) -> Integrated {
+    fn own(&self, output: usize, kernels: &[Vec<f64>; 2], which: usize) -> IntegratedSignal {
         let (position, velocity) = &self.0[output];
-        Integrated { output: product(position, &kernels[which]), edges: product(velocity, &kernels[which]) }
+        IntegratedSignal { output: product(position, &kernels[which]), edges: product(velocity, &kernels[which]) }
     }
 }

@@ -8,10 +8,10 @@ use crate::parallel::{self, Stop};
 
 /// Fewest rows of one part of a product of long columns, and largest number of parts. Neither depends on the number of
 /// threads, so the sums do not either.
-const PIECE: usize = 1 << 14;
-const PIECES: usize = 16;
+const MIN_PART_ROWS: usize = 1 << 14;
+const MAX_ROW_PARTS: usize = 16;
 /// Width of the column tiles in which a Gram matrix is multiplied.
-const TILE: usize = 64;
+const GRAM_TILE_COLUMNS: usize = 64;
 /// Rows of scattered columns that are gathered for one product. They fit in the cache.
 const LAID_OUT: usize = 1 << 10;
 
@@ -42,8 +42,10 @@ pub fn gram(columns: &[f64], target: &[f64], stop: &Stop) -> Vec<f64> {
     let k = columns.len() / m.max(1);
     let x = MatRef::from_column_major_slice(columns, m, k);
     let y = MatRef::from_column_major_slice(target, m, 1);
-    let mut tiles: Vec<(usize, MatRef<'_, f64>)> =
-        (0..k).step_by(TILE).map(|first| (first, x.subcols(first, TILE.min(k - first)))).collect();
+    let mut tiles: Vec<(usize, MatRef<'_, f64>)> = (0..k)
+        .step_by(GRAM_TILE_COLUMNS)
+        .map(|first| (first, x.subcols(first, GRAM_TILE_COLUMNS.min(k - first))))
+        .collect();
     tiles.push((k, y));
     let rows = pieces(m);
     let pairs = (0..tiles.len()).flat_map(|b| (0..=b).map(move |a| (a, b)));
@@ -78,7 +80,7 @@ pub fn gram(columns: &[f64], target: &[f64], stop: &Stop) -> Vec<f64> {
 
 /// First row and number of rows of each part of a product.
 fn pieces(m: usize) -> Vec<(usize, usize)> {
-    let len = m.div_ceil(PIECES).max(PIECE);
+    let len = m.div_ceil(MAX_ROW_PARTS).max(MIN_PART_ROWS);
     (0..m).step_by(len).map(|from| (from, len.min(m - from))).collect()
 }
 
@@ -106,11 +108,11 @@ pub fn triangular_factor(columns: &[Vec<f64>]) -> Vec<f64> {
 }
 
 /// Singular value decomposition of columns. Values are in descending order.
-pub struct Singular {
+pub struct SingularValues {
     /// Singular vectors on the left, each as long as the columns.
     pub left: Vec<Vec<f64>>,
     /// Singular values. There are as many as the smaller of the number and the length of the columns.
-    pub sizes: Vec<f64>,
+    pub values: Vec<f64>,
     /// Singular vectors on the right, with one element a column.
     pub right: Vec<Vec<f64>>,
 }
@@ -129,13 +131,13 @@ pub struct Singular {
 /// # assert!(run().is_some());
 /// ```
 #[must_use]
-pub fn singular(columns: &[Vec<f64>]) -> Option<Singular> {
+pub fn singular_values(columns: &[Vec<f64>]) -> Option<SingularValues> {
     let m = columns.first().map_or(0, Vec::len);
     let x = Mat::from_fn(m, columns.len(), |i, j| columns[j][i]);
     let found = x.thin_svd().ok()?;
     let vectors = |of: MatRef<'_, f64>| of.col_iter().map(|column| column.iter().copied().collect()).collect();
     let sizes = found.S().column_vector().iter().copied().collect();
-    Some(Singular { left: vectors(found.U()), sizes, right: vectors(found.V()) })
+    Some(SingularValues { left: vectors(found.U()), values: sizes, right: vectors(found.V()) })
 }
 
 /// Inner products of every left with every right column of equal length, row-major left × right.

@@ -2,17 +2,17 @@
 
 use crate::error::Result;
 use crate::parallel::{self, Stop};
-use crate::simd::{dot, widest, Kernel};
+use crate::simd::{dispatch_simd, dot, Kernel};
 
 /// Rows of one block of a triangular factorization. They fit in the cache.
-const ROWS: usize = 1 << 10;
+const QR_BLOCK_ROWS: usize = 1 << 10;
 
 /// Directions that are projected out between two checks for cancellation.
 const AT_ONCE: usize = 16;
 
 /// Range of squared norms in factorizations. Beyond it sums of squares overflow or lose accuracy.
-const LEAST: f64 = 1e-280;
-const MOST: f64 = 1e280;
+const MIN_SQUARED_NORM: f64 = 1e-280;
+const MAX_SQUARED_NORM: f64 = 1e280;
 
 /// Upper triangle R of [R; rows] by Householder reflections, column by column. False if a square is out of range.
 struct Reflections<'a> {
@@ -32,7 +32,7 @@ impl Kernel for Reflections<'_> {
             if square == 0.0 && reflected.iter().all(|v| *v == 0.0) {
                 continue;
             }
-            if !(LEAST..=MOST).contains(&square) {
+            if !(MIN_SQUARED_NORM..=MAX_SQUARED_NORM).contains(&square) {
                 return false;
             }
             let first = reflected[0];
@@ -59,18 +59,18 @@ pub(crate) fn triangular_factor(columns: &[Vec<f64>]) -> Option<Vec<f64>> {
     let k = columns.len();
     let m = columns.iter().map(Vec::len).max().unwrap_or(0);
     // R of the processed rows on top, the next rows below.
-    let mut stacked: Vec<Vec<f64>> = vec![Vec::with_capacity(k + ROWS.min(m)); k];
+    let mut stacked: Vec<Vec<f64>> = vec![Vec::with_capacity(k + QR_BLOCK_ROWS.min(m)); k];
     stacked.iter_mut().for_each(|column| column.resize(k, 0.0));
-    for from in (0..m).step_by(ROWS) {
+    for from in (0..m).step_by(QR_BLOCK_ROWS) {
         for (j, (column, given)) in stacked.iter_mut().zip(columns).enumerate() {
             // A reflection leaves its own vector below the triangle.
             column.truncate(k);
             column.iter_mut().skip(j + 1).for_each(|v| *v = 0.0);
-            let rows = given.get(from..given.len().min(from + ROWS)).unwrap_or_default();
+            let rows = given.get(from..given.len().min(from + QR_BLOCK_ROWS)).unwrap_or_default();
             column.extend_from_slice(rows);
-            column.resize(k + ROWS.min(m - from), 0.0);
+            column.resize(k + QR_BLOCK_ROWS.min(m - from), 0.0);
         }
-        if !widest(Reflections { columns: &mut stacked }) {
+        if !dispatch_simd(Reflections { columns: &mut stacked }) {
             return None;
         }
     }
@@ -108,14 +108,14 @@ impl Kernel for Projection<'_> {
 
 /// Remove the components along an orthonormal basis from a column of equal length. O(k m).
 pub fn project_out(basis: &[Vec<f64>], column: &mut [f64]) {
-    widest(Projection { basis, column, times: 1 });
+    dispatch_simd(Projection { basis, column, times: 1 });
 }
 
 /// Add a column to an orthonormal basis unless its relative distance from the span is below `share`. O(k m).
 pub fn extend_orthonormal(basis: &mut Vec<Vec<f64>>, mut column: Vec<f64>, share: f64) {
     let whole = norm(&column);
     // Two passes are enough (Kahan, Parlett).
-    widest(Projection { basis, column: &mut column, times: 2 });
+    dispatch_simd(Projection { basis, column: &mut column, times: 2 });
     let left = norm(&column);
     if left > share * whole && left.is_finite() {
         column.iter_mut().for_each(|v| *v /= left);
@@ -183,5 +183,5 @@ impl Kernel for Norm<'_> {
 /// Euclidean norm of a column whose squares do not overflow.
 #[must_use]
 pub fn norm(column: &[f64]) -> f64 {
-    widest(Norm(column))
+    dispatch_simd(Norm(column))
 }

@@ -39,7 +39,7 @@ pub fn inverse(matrix: &[f64], n: usize) -> Result<Vec<f64>> {
 }
 
 /// LU factorization of an equilibrated square matrix, whose rows and columns may differ in scale by any factor.
-pub struct Scaled {
+pub struct EquilibratedLu {
     /// Largest element of each row, then of each column.
     rows: Vec<f64>,
     columns: Vec<f64>,
@@ -47,7 +47,7 @@ pub struct Scaled {
     factor: Option<FullPivLU<f64, Dyn, Dyn>>,
 }
 
-impl Scaled {
+impl EquilibratedLu {
     /// Factorization of a row-major k × k matrix.
     ///
     /// # Errors
@@ -118,13 +118,13 @@ impl Scaled {
 /// assert_eq!(ftlm::linalg::small::scaled_inverse(&[], 0), Ok(vec![]));
 /// ```
 pub fn scaled_inverse(matrix: &[f64], k: usize) -> Result<Vec<f64>> {
-    Ok(Scaled::new(matrix, k)?.inverse())
+    Ok(EquilibratedLu::new(matrix, k)?.inverse())
 }
 
 /// Index of element (i, j), j ≤ i, of a symmetric matrix stored by its lower rows.
 #[inline(always)]
 #[must_use]
-pub const fn packed(i: usize, j: usize) -> usize {
+pub const fn packed_index(i: usize, j: usize) -> usize {
     i * (i + 1) / 2 + j
 }
 
@@ -149,24 +149,24 @@ pub fn solve_lanes<const L: usize>(gram: &mut [Lanes<L>], rhs: &mut [Lanes<L>], 
 
 #[inline(always)]
 fn solve_sized<const L: usize>(k: usize, gram: &mut [Lanes<L>], rhs: &mut [Lanes<L>], needed: usize) -> [bool; L] {
-    let (gram, rhs) = (&mut gram[..packed(k, 0)], &mut rhs[..k]);
+    let (gram, rhs) = (&mut gram[..packed_index(k, 0)], &mut rhs[..k]);
     let mut singular = [false; L];
     for i in 0..k {
-        let mut pivot = gram[packed(i, i)];
+        let mut pivot = gram[packed_index(i, i)];
         for j in 0..i {
             // Row i of L D, then of L.
-            let mut sum = gram[packed(i, j)];
+            let mut sum = gram[packed_index(i, j)];
             for l in 0..j {
-                let (a, b) = (gram[packed(i, l)], gram[packed(j, l)]);
+                let (a, b) = (gram[packed_index(i, l)], gram[packed_index(j, l)]);
                 for n in 0..L {
                     sum[n] -= a[n] * b[n];
                 }
             }
-            gram[packed(i, j)] = sum;
+            gram[packed_index(i, j)] = sum;
         }
         for j in 0..i {
-            let (u, inverse) = (gram[packed(i, j)], gram[packed(j, j)]);
-            let row = &mut gram[packed(i, j)];
+            let (u, inverse) = (gram[packed_index(i, j)], gram[packed_index(j, j)]);
+            let row = &mut gram[packed_index(i, j)];
             for n in 0..L {
                 row[n] = u[n] * inverse[n];
                 pivot[n] -= u[n] * row[n];
@@ -180,10 +180,10 @@ fn solve_sized<const L: usize>(k: usize, gram: &mut [Lanes<L>], rhs: &mut [Lanes
             all &= fits;
             singular[n] |= !fits && i < needed;
         }
-        gram[packed(i, i)] = inverse;
+        gram[packed_index(i, i)] = inverse;
         let mut value = rhs[i];
         for j in 0..i {
-            let (row, z) = (gram[packed(i, j)], rhs[j]);
+            let (row, z) = (gram[packed_index(i, j)], rhs[j]);
             for n in 0..L {
                 value[n] -= row[n] * z[n];
             }
@@ -191,7 +191,7 @@ fn solve_sized<const L: usize>(k: usize, gram: &mut [Lanes<L>], rhs: &mut [Lanes
         rhs[i] = value;
         if !all {
             for n in (0..L).filter(|&n| inverse[n] == 0.0) {
-                (0..i).for_each(|j| gram[packed(i, j)][n] = 0.0);
+                (0..i).for_each(|j| gram[packed_index(i, j)][n] = 0.0);
                 rhs[i][n] = 0.0;
             }
         }
@@ -199,10 +199,10 @@ fn solve_sized<const L: usize>(k: usize, gram: &mut [Lanes<L>], rhs: &mut [Lanes
     for i in (0..k).rev() {
         let mut value = rhs[i];
         for n in 0..L {
-            value[n] *= gram[packed(i, i)][n];
+            value[n] *= gram[packed_index(i, i)][n];
         }
         for j in i + 1..k {
-            let (row, x) = (gram[packed(j, i)], rhs[j]);
+            let (row, x) = (gram[packed_index(j, i)], rhs[j]);
             for n in 0..L {
                 value[n] -= row[n] * x[n];
             }

@@ -31,13 +31,13 @@ impl Control {
         let mut slot = self.checkpoint.lock().unwrap_or_else(PoisonError::into_inner);
         if let Some(missed) = slot.take() {
             checkpoint.part.rows.extend(missed.part.rows);
-            checkpoint.anew |= missed.anew;
+            checkpoint.replaces_previous |= missed.replaces_previous;
         }
         *slot = Some(checkpoint);
     }
 
     /// Take the latest checkpoint, if there is a new one.
-    pub fn take(&self) -> Option<Checkpoint> {
+    pub fn take_checkpoint(&self) -> Option<Checkpoint> {
         self.checkpoint.lock().unwrap_or_else(PoisonError::into_inner).take()
     }
 
@@ -46,7 +46,7 @@ impl Control {
         self.stop.check()
     }
 
-    pub(crate) fn stopped(&self) -> bool {
+    pub(crate) fn is_stopped(&self) -> bool {
         self.stop.is_set()
     }
 
@@ -59,11 +59,11 @@ impl Control {
 
 /// Position within a range of batches.
 #[derive(Debug, Clone, Copy, PartialEq)]
-pub struct Place {
+pub struct BatchPosition {
     /// Number of the batch. Earlier batches of the range are complete.
-    pub round: u64,
+    pub batch: u64,
     /// Number of its open candidates that have been evaluated, in evaluation order.
-    pub followed: u64,
+    pub evaluated_count: u64,
     /// End and length of the current chunk of candidates, 0 if the batch has not been screened.
     pub end: u64,
     /// See `end`.
@@ -74,16 +74,16 @@ pub struct Place {
     pub order: u64,
 }
 
-impl Place {
+impl BatchPosition {
     /// Return the position before a batch.
-    pub(crate) fn start(round: u64) -> Self {
-        Self { round, followed: 0, end: 0, size: 0, limit: f64::INFINITY, order: 0 }
+    pub(crate) fn start(batch: u64) -> Self {
+        Self { batch, evaluated_count: 0, end: 0, size: 0, limit: f64::INFINITY, order: 0 }
     }
 
     /// Whether the position is consistent.
-    pub(crate) fn sound(&self) -> bool {
+    pub(crate) fn is_valid(&self) -> bool {
         let begun = self.end == 0 || (self.size > 0 && self.limit >= 0.0);
-        begun && self.followed <= self.end
+        begun && self.evaluated_count <= self.end
     }
 
     /// Whether the position is before a batch, or in one with enough open candidates and this digest.
@@ -96,15 +96,15 @@ impl Place {
 #[derive(Debug, Clone, PartialEq)]
 pub struct Checkpoint {
     /// Position of the checkpoint.
-    pub place: Place,
+    pub place: BatchPosition,
     /// Whether this is the first checkpoint since the range was started. It then replaces any earlier result.
-    pub anew: bool,
+    pub replaces_previous: bool,
     /// Partial result so far. A checkpoint that is taken holds only the rows found since the previous one. A checkpoint
     /// to resume from must hold all rows.
     pub part: Part,
 }
 
 /// Error for a checkpoint, partial result or verdict of another search.
-pub(crate) fn another(what: String) -> Error {
+pub(crate) fn mismatch_error(what: String) -> Error {
     Error::Structure { what, remedy: "start the search again".into() }
 }

@@ -9,7 +9,7 @@ use rayon::prelude::*;
 use crate::equation::{Structure, Term};
 use crate::error::{check_finite, check_length, Error, Result};
 use crate::fractional::kernels::block_pulse_kernel;
-use crate::order_search::candidate::simulation::March;
+use crate::order_search::candidate::simulation::BlockSimulation;
 use crate::order_search::control::Control;
 use crate::order_search::options::Norm;
 use crate::order_search::result::Verdict;
@@ -17,7 +17,7 @@ use crate::parallel::{pool, PerThread};
 use crate::regressors::{Key, Record};
 
 /// Maximum memory of regressors cached between calls [bytes]. A converged population reuses them.
-const KEPT_BYTES: usize = 256 << 20;
+const MAX_CACHE_BYTES: usize = 256 << 20;
 
 /// Candidate with an order and a coefficient for each term.
 #[derive(Debug, Clone, PartialEq)]
@@ -39,7 +39,7 @@ pub struct Points {
     norm: Norm,
     samples: usize,
     /// Cache by record: the kernel of an own-output term, the integral of any other signal.
-    kept: HashMap<Key, Vec<Vec<f64>>>,
+    cache: HashMap<Key, Vec<Vec<f64>>>,
 }
 
 impl Points {
@@ -69,7 +69,7 @@ impl Points {
             check_length("signals of a record", first.len(), record.len())?;
         }
         let samples = records.iter().map(Record::m).sum();
-        Ok(Self { records, output, signals, inputs, norm, samples, kept: HashMap::new() })
+        Ok(Self { records, output, signals, inputs, norm, samples, cache: HashMap::new() })
     }
 
     /// Output error of every candidate, summed over the records: Σ|e|, or RMSE.
@@ -113,12 +113,12 @@ impl Points {
             structures.push((fits && smooth).then_some(structure));
         }
         let pool = pool(threads)?;
-        self.fetch(&structures, &pool);
+        self.fill_cache(&structures, &pool);
         // Raw sums: Σ|e|, or Σe².
         #[allow(clippy::cast_precision_loss)]
         let samples = self.samples as f64;
         let raw_limit = if self.norm == Norm::L1 { limit } else { limit * limit * samples };
-        let marches = PerThread::<March>::new(&pool);
+        let marches = PerThread::<BlockSimulation>::new(&pool);
         let this = &*self;
         let raw: Vec<f64> = pool.install(|| {
             structures
@@ -139,7 +139,7 @@ impl Points {
     }
 
     /// Compute the regressors that are not in the cache.
-    fn fetch(&mut self, structures: &[Option<Structure>], pool: &rayon::ThreadPool) {
+    fn fill_cache(&mut self, structures: &[Option<Structure>], pool: &rayon::ThreadPool) {
         let each = self.samples * std::mem::size_of::<f64>();
         let mut wanted: Vec<(Key, usize, f64)> = Vec::new();
         for structure in structures.iter().flatten() {
@@ -150,10 +150,10 @@ impl Points {
         }
         wanted.sort_unstable_by_key(|a| a.0);
         wanted.dedup_by(|a, b| a.0 == b.0);
-        if (self.kept.len() + wanted.len()) * each > KEPT_BYTES {
-            self.kept.clear();
+        if (self.cache.len() + wanted.len()) * each > MAX_CACHE_BYTES {
+            self.cache.clear();
         }
-        wanted.retain(|(key, _, _)| !self.kept.contains_key(key));
+        wanted.retain(|(key, _, _)| !self.cache.contains_key(key));
         let (records, output) = (&self.records, self.output);
         let made: Vec<Vec<Vec<f64>>> = pool.install(|| {
             wanted
@@ -172,7 +172,7 @@ impl Points {
                 })
                 .collect()
         });
-        self.kept.extend(wanted.into_iter().map(|(key, _, _)| key).zip(made));
+        self.cache.extend(wanted.into_iter().map(|(key, _, _)| key).zip(made));
     }
 
     /// Raw error of a candidate on all records. `None` above the limit, or if the simulation diverges.
@@ -181,7 +181,7 @@ impl Points {
         structure: &Structure,
         coefficients: &[f64],
         limit: f64,
-        march: &mut March,
+        march: &mut BlockSimulation,
         control: &Control,
     ) -> Option<f64> {
         let mut sum = 0.0;
@@ -189,13 +189,13 @@ impl Points {
             let columns: Vec<(bool, &[f64], f64)> = (0..structure.terms.len())
                 .filter_map(|k| {
                     let signal = structure.terms[k].signal;
-                    let kept = self.kept.get(&Key::integral(signal, structure.integration(k)))?;
+                    let kept = self.cache.get(&Key::integral(signal, structure.integration(k)))?;
                     Some((signal == self.output, &kept[r][..], coefficients[k]))
                 })
                 .collect();
             let side = |own: bool| columns.iter().filter(move |term| term.0 == own).map(|&(_, column, c)| (column, c));
             let target = record.signal(self.output);
-            match march.run(target, side(true), side(false), self.norm, sum, limit, control) {
+            match march.accumulate_error(target, side(true), side(false), self.norm, sum, limit, control) {
                 // A NaN limit excludes all.
                 Verdict::Score(raw) if raw <= limit => sum = raw,
                 _ => return None,

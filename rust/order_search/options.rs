@@ -82,12 +82,12 @@ pub struct Options {
     /// Initial terms of each record.
     pub initial: Initial,
     /// Number of rows in the table, at least one.
-    pub keep: usize,
+    pub top: usize,
     /// Number of threads, 1 to `MAX_THREADS`. The result is bitwise identical for any number.
     pub threads: usize,
     /// Whether to stop evaluating a candidate once its bound or partial sum excludes it. `false` evaluates all
     /// candidates completely and serves as oracle.
-    pub early_stopping: bool,
+    pub pruning: bool,
     /// Memory of regressors, their products, test vectors and the layout of an order law [bytes].
     pub memory: u64,
 }
@@ -99,9 +99,9 @@ impl Default for Options {
             norm: Norm::L1,
             estimator: Estimator::LeastSquares,
             initial: Initial::Rest,
-            keep: 20,
+            top: 20,
             threads: 1,
-            early_stopping: true,
+            pruning: true,
             memory: BANK_LIMIT,
         }
     }
@@ -120,7 +120,7 @@ impl Options {
     /// assert!(Options { top: 0, ..Options::default() }.check().is_err());
     /// ```
     pub fn check(&self) -> Result<()> {
-        if self.keep == 0 {
+        if self.top == 0 {
             return Err(out_of_range("keep", 0.0, "[1, ∞)", "keep at least one row"));
         }
         match self.estimator {
@@ -158,8 +158,8 @@ impl Options {
     }
 
     /// Whether candidates are ranked by simulation with zero initial conditions and least-squares coefficients.
-    pub(crate) fn scored_by_free_runs(&self) -> bool {
-        self.early_stopping
+    pub(crate) fn ranks_by_simulation(&self) -> bool {
+        self.pruning
             && self.estimator == Estimator::LeastSquares
             && self.criterion == Criterion::OutputError
             && self.initial == Initial::Rest
@@ -167,8 +167,8 @@ impl Options {
 
     /// Whether a candidate's score follows from the Gram matrix alone. This is the squared equation error with zero
     /// initial conditions.
-    pub(crate) fn scored_by_products(&self) -> bool {
-        self.early_stopping
+    pub(crate) fn ranks_by_gram_matrix(&self) -> bool {
+        self.pruning
             && !self.refines()
             && self.criterion == Criterion::EquationError
             && self.norm == Norm::L2
@@ -180,7 +180,7 @@ fn out_of_range(name: &str, value: f64, range: &str, remedy: &str) -> Error {
     Error::OutOfRange { name: name.into(), value, range: range.into(), remedy: remedy.into() }
 }
 
-const VALUE: u128 = size_of::<f64>() as u128;
+const BYTES_PER_VALUE: u128 = size_of::<f64>() as u128;
 
 /// Sum of the memory needed.
 #[derive(Debug, Default)]
@@ -202,14 +202,14 @@ impl Budget {
         let width = index.keys().len() as u128;
         let own = Bank::own(index, output) as u128;
         let refined = options.refines();
-        let bounded = options.early_stopping && !options.scored_by_products() && vectors > 0;
+        let bounded = options.pruning && !options.ranks_by_gram_matrix() && vectors > 0;
         let mut largest = 0;
         for record in records {
             let m = record.m();
-            let bank = VALUE * m as u128 * (width + own);
+            let bank = BYTES_PER_VALUE * m as u128 * (width + own);
             largest = bank.max(largest);
             // Add the target.
-            self.bytes += bank + VALUE * m as u128;
+            self.bytes += bank + BYTES_PER_VALUE * m as u128;
             if refined {
                 let spectrum = (size_of::<Bin>() * (fast_length(2 * m) / 2 + 1)) as u128;
                 self.bytes += spectrum * (width + own + 1);
@@ -222,19 +222,19 @@ impl Budget {
                 // Real and imaginary parts with every column and the target, before and after regrouping, four numbers
                 // per own column, and the vectors.
                 let vectors = vectors as u128;
-                self.bytes += VALUE * vectors * (4 * (width + 1) + 4 * own + 2 * m as u128);
+                self.bytes += BYTES_PER_VALUE * vectors * (4 * (width + 1) + 4 * own + 2 * m as u128);
             }
         }
         // Products of all columns and the target: per record for the initial terms, summed over records, and
         // temporaries.
-        let products = VALUE * (3 + records.len() as u128) * (width + 1).pow(2);
+        let products = BYTES_PER_VALUE * (3 + records.len() as u128) * (width + 1).pow(2);
         // Only one bank for initial coefficients exists at a time.
         self.bytes += products + if refined { largest } else { 0 };
         self.columns += index.keys().len();
     }
 
     /// Memory that remains of a limit [bytes].
-    pub(crate) fn left(&self, limit: u64) -> u64 {
+    pub(crate) fn remaining_bytes(&self, limit: u64) -> u64 {
         u128::from(limit).saturating_sub(self.bytes).try_into().unwrap_or(u64::MAX)
     }
 
@@ -260,10 +260,10 @@ mod tests {
     #[test]
     fn what_is_left_of_a_limit_is_never_below_nothing() {
         let mut budget = Budget::default();
-        assert_eq!(budget.left(u64::MAX), u64::MAX);
+        assert_eq!(budget.remaining_bytes(u64::MAX), u64::MAX);
         budget.add_layout(1000);
-        assert_eq!([999, 1000, 1500].map(|limit| budget.left(limit)), [0, 0, 500]);
+        assert_eq!([999, 1000, 1500].map(|limit| budget.remaining_bytes(limit)), [0, 0, 500]);
         budget.add_layout(u128::from(u64::MAX));
-        assert_eq!(budget.left(u64::MAX), 0);
+        assert_eq!(budget.remaining_bytes(u64::MAX), 0);
     }
 }

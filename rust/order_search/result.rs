@@ -3,7 +3,7 @@
 use crate::order_search::options::Norm;
 
 /// Maximum failures listed individually. The others are only counted.
-pub(crate) const LISTED: usize = 100;
+pub(crate) const MAX_LISTED_FAILURES: usize = 100;
 
 /// Reason why a candidate has no score.
 #[derive(Debug, Clone, Copy, PartialEq, Eq, PartialOrd, Ord)]
@@ -51,9 +51,9 @@ pub struct Counts {
     /// Number of complete evaluations that did not enter the table.
     pub beaten: u64,
     /// Number of candidates excluded by a lower bound, without simulation.
-    pub bounded: u64,
+    pub excluded_by_bound: u64,
     /// Number of candidates excluded together with their whole box, without a bound of their own.
-    pub boxed: u64,
+    pub excluded_by_box: u64,
     /// Number of evaluations stopped early because their partial sum exceeded the limit.
     pub stopped: u64,
     /// Number of candidates with linearly dependent regressors.
@@ -105,7 +105,7 @@ impl Part {
         self.counts.add(&other.counts);
         self.failures.extend(other.failures);
         self.failures.sort_unstable();
-        self.failures.truncate(LISTED);
+        self.failures.truncate(MAX_LISTED_FAILURES);
     }
 
     /// Index and raw score of each row, as later batches need them.
@@ -132,8 +132,8 @@ impl Counts {
             (&mut self.candidates, other.candidates),
             (&mut self.kept, other.kept),
             (&mut self.beaten, other.beaten),
-            (&mut self.bounded, other.bounded),
-            (&mut self.boxed, other.boxed),
+            (&mut self.excluded_by_bound, other.excluded_by_bound),
+            (&mut self.excluded_by_box, other.excluded_by_box),
             (&mut self.stopped, other.stopped),
             (&mut self.singular, other.singular),
             (&mut self.diverged, other.diverged),
@@ -144,8 +144,8 @@ impl Counts {
 
     /// Number of candidates with an outcome. At the end of a search it is the total number.
     #[must_use]
-    pub fn done(&self) -> u64 {
-        [self.kept, self.beaten, self.bounded, self.stopped, self.singular, self.diverged]
+    pub fn processed_count(&self) -> u64 {
+        [self.kept, self.beaten, self.excluded_by_bound, self.stopped, self.singular, self.diverged]
             .iter()
             .fold(0, |sum, n| sum.saturating_add(*n))
     }
@@ -158,32 +158,32 @@ fn trim(rows: &mut Vec<Row>, keep: usize) {
 }
 
 /// Best rows so far, and the limit they imply.
-pub(crate) struct Kept {
+pub(crate) struct TopRows {
     pub(crate) rows: Vec<Row>,
     keep: usize,
     /// Raw score above which no candidate can enter the table.
     pub(crate) limit: f64,
 }
 
-impl Kept {
+impl TopRows {
     pub(crate) fn new(keep: usize, limit: f64) -> Self {
         Self { rows: Vec::new(), keep, limit }
     }
 
     /// Insert rows and drop those beyond the best.
-    pub(crate) fn take(&mut self, rows: impl Iterator<Item = Row>) {
+    pub(crate) fn insert_rows(&mut self, rows: impl Iterator<Item = Row>) {
         self.rows.extend(rows);
         trim(&mut self.rows, self.keep);
     }
 
     /// Whether this row is in the table.
-    pub(crate) fn holds(&self, row: &Row) -> bool {
+    pub(crate) fn contains(&self, row: &Row) -> bool {
         let place = self.rows.partition_point(|r| r.score.total_cmp(&row.score).then(r.index.cmp(&row.index)).is_lt());
         self.rows.get(place).is_some_and(|r| r.index == row.index)
     }
 
     /// Lower the limit to the score of the worst row if `stopping` is set and the table is full.
-    pub(crate) fn lower(&mut self, stopping: bool) {
+    pub(crate) fn lower_limit(&mut self, stopping: bool) {
         if stopping && self.rows.len() == self.keep {
             self.limit = self.limit.min(self.rows[self.keep - 1].score);
         }

@@ -20,7 +20,7 @@ const MOST_VALUES: usize = 1 << 30;
 pub enum RecordArg<'py> {
     /// With nonzero initial conditions: flags of sensor filter transients, initial levels of the signals, and filter
     /// responses to an impulse and its derivatives as rows.
-    Begun(
+    WithInitialState(
         f64,
         PyReadonlyArray2<'py, f64>,
         Option<PyReadonlyArray1<'py, f64>>,
@@ -44,13 +44,13 @@ pub enum InitialArg {
 
 /// One-dimensional array as a vector. Return an error for a value that is not finite.
 pub fn vector(name: &str, array: &PyReadonlyArray1<'_, f64>) -> PyResult<Vec<f64>> {
-    let values = copied(name, array)?;
+    let values = copy_vector(name, array)?;
     check_finite(name, &values)?;
     Ok(values)
 }
 
 /// One-dimensional array as a vector, without a check of its values.
-pub fn copied(name: &str, array: &PyReadonlyArray1<'_, f64>) -> PyResult<Vec<f64>> {
+pub fn copy_vector(name: &str, array: &PyReadonlyArray1<'_, f64>) -> PyResult<Vec<f64>> {
     check_points(&format!("length of {name}"), array.len())?;
     Ok(array.as_array().iter().copied().collect())
 }
@@ -69,7 +69,7 @@ pub fn rows(array: &PyReadonlyArray2<'_, f64>) -> PyResult<Vec<Vec<f64>>> {
 
 pub fn record(argument: &RecordArg<'_>) -> PyResult<Record> {
     let (step, signals, filter, begun) = match argument {
-        RecordArg::Begun(step, signals, filter, begun) => (step, signals, filter, Some(begun)),
+        RecordArg::WithInitialState(step, signals, filter, begun) => (step, signals, filter, Some(begun)),
         RecordArg::Plain(step, signals, filter) => (step, signals, filter, None),
     };
     let filter = filter.as_ref().map(|f| vector("filter", f)).transpose()?;
@@ -77,7 +77,7 @@ pub fn record(argument: &RecordArg<'_>) -> PyResult<Record> {
     Ok(match begun {
         Some((held, levels, answers)) => {
             let answers = answers.as_ref().map(rows).transpose()?.unwrap_or_default();
-            record.begun(held.to_vec(), levels, answers)?
+            record.with_initial_state(held.to_vec(), levels, answers)?
         }
         None => record,
     })
@@ -133,7 +133,7 @@ pub fn matrix<'py>(py: Python<'py>, values: Vec<f64>, rows: usize) -> PyResult<B
 }
 
 /// Vectors of equal length as the rows of an array.
-pub fn stacked<'py>(py: Python<'py>, vectors: &[Vec<f64>]) -> PyResult<Bound<'py, PyArray2<f64>>> {
+pub fn stack_rows<'py>(py: Python<'py>, vectors: &[Vec<f64>]) -> PyResult<Bound<'py, PyArray2<f64>>> {
     matrix(py, vectors.concat(), vectors.len())
 }
 
@@ -218,11 +218,11 @@ impl<T> IntoIterator for List<T> {
 }
 
 /// Lists of lists as vectors of vectors.
-pub fn nested<T>(lists: List<List<T>>) -> Vec<Vec<T>> {
+pub fn to_vectors<T>(lists: List<List<T>>) -> Vec<Vec<T>> {
     lists.into_iter().map(Vec::from).collect()
 }
 
 /// Vectors of vectors as lists of lists.
-pub fn lists<T>(vectors: Vec<Vec<T>>) -> List<List<T>> {
+pub fn to_lists<T>(vectors: Vec<Vec<T>>) -> List<List<T>> {
     vectors.into_iter().map(List::from).collect()
 }

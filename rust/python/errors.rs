@@ -35,19 +35,19 @@ fn raise(class: &str, message: String) -> PyErr {
 ///
 /// Every `#[pyfunction]` and every method converts its arguments and then makes one call of this or of
 /// [`run_attached`]. `tests/rust/bindings.rs` checks that.
-pub fn detached<T: Send>(py: Python<'_>, work: impl FnOnce() -> Result<T, Error> + Send) -> PyResult<T> {
-    Ok(py.detach(|| caught(work))?)
+pub fn run_detached<T: Send>(py: Python<'_>, work: impl FnOnce() -> Result<T, Error> + Send) -> PyResult<T> {
+    Ok(py.detach(|| catch_panic(work))?)
 }
 
 /// Entry to the core for work of microseconds, where detaching would cost more: runs attached to Python.
 ///
 /// A panic becomes InternalError.
-pub fn attached<T>(work: impl FnOnce() -> Result<T, Error>) -> PyResult<T> {
-    Ok(caught(work)?)
+pub fn run_attached<T>(work: impl FnOnce() -> Result<T, Error>) -> PyResult<T> {
+    Ok(catch_panic(work)?)
 }
 
 /// Run `work` and convert a panic to [`Error::Internal`].
-pub fn caught<T>(work: impl FnOnce() -> Result<T, Error>) -> Result<T, Error> {
+pub fn catch_panic<T>(work: impl FnOnce() -> Result<T, Error>) -> Result<T, Error> {
     catch_unwind(AssertUnwindSafe(work)).unwrap_or_else(|panic| {
         let what = panic
             .downcast_ref::<&str>()

@@ -23,13 +23,13 @@ const MEMORY_TOLERANCE: f64 = 1e-10;
 /// Most sweeps of the friction solve. One is enough for decoupled joints, a few for coupled ones.
 const FRICTION_SWEEPS: usize = 60;
 /// Rounding error relative to the largest rate change by friction.
-const ROUNDING: f64 = 1e-12;
+const RATE_ROUNDING_RATIO: f64 = 1e-12;
 
 /// Most substeps of a sample. More would take seconds each.
 const MOST_SUBSTEPS: f64 = 1e6;
 
 /// Number of signals of the arm's equations: θ₁₁, θ₁₂, θ₂₁, θ₂₂, I₁, I₂.
-pub const SIGNALS: usize = 6;
+pub const SIGNAL_COUNT: usize = 6;
 
 /// Equations and friction of the arm.
 #[derive(Debug, Clone, PartialEq)]
@@ -215,7 +215,7 @@ impl Arm {
         }
         let mut rate = times(&self.solve, &right);
         if self.coulomb != [0.0; 2] {
-            self.rub(&mut rate);
+            self.apply_friction(&mut rate);
         }
         for operator in &mut self.operators {
             operator.value += operator.now * rate[operator.signal];
@@ -239,7 +239,7 @@ impl Arm {
     }
 
     /// Apply Coulomb friction: iterate over the friction laws of the joints until both agree.
-    fn rub(&mut self, rate: &mut [f64; 4]) {
+    fn apply_friction(&mut self, rate: &mut [f64; 4]) {
         let columns = self.columns();
         let free = *rate;
         let mut friction = self.friction;
@@ -250,7 +250,7 @@ impl Arm {
                 let (hub, other) = (2 * k, 1 - k);
                 let without = free[hub] - columns[other][hub] * friction[other];
                 let most = columns[k][hub] * self.coulomb[k];
-                let (sign, _, phase) = pulse(self.rate[hub], without, most, ROUNDING * most);
+                let (sign, _, phase) = pulse(self.rate[hub], without, most, RATE_ROUNDING_RATIO * most);
                 let next = self.coulomb[k] * sign;
                 change = change.max((next - friction[k]).abs());
                 friction[k] = next;
@@ -289,12 +289,12 @@ impl Operator {
             let q = 1.0 - self.order;
             let scale = libm::pow(h, q) / libm::tgamma(q + 2.0);
             (self.before, self.now) = (q * scale, scale);
-            self.weights = decayed(rates, q, h);
+            self.weights = past_weights(rates, q, h);
         } else {
             let q = 2.0 - self.order;
             let scale = libm::pow(h, q - 1.0) / libm::tgamma(q + 1.0);
             // ∫ e^{−s(t−τ)} θ″ dτ = θ′(t) − s z(t).
-            let weights = decayed(rates, q, h);
+            let weights = past_weights(rates, q, h);
             self.before = weights.iter().sum::<f64>() - scale;
             self.now = scale;
             self.weights = weights.iter().zip(rates.rates()).map(|(w, s)| -w * s).collect();
@@ -303,7 +303,7 @@ impl Operator {
 }
 
 /// Weights of the kernel at lags beyond a substep.
-fn decayed(rates: &Rates, q: f64, h: f64) -> Vec<f64> {
+fn past_weights(rates: &Rates, q: f64, h: f64) -> Vec<f64> {
     rates.weights(q).iter().zip(rates.rates()).map(|(w, s)| w * libm::exp(-s * h)).collect()
 }
 
@@ -343,8 +343,8 @@ fn accelerations(parameters: &Parameters) -> Result<(Vec<Operator>, [[f64; 2]; 4
         // Terms on the left count with a negative sign on the right.
         let terms = structure.terms.iter().zip(&equation.coefficients).map(|(t, &c)| (t.signal, t.order, c));
         for (signal, order, c) in std::iter::once((row, alpha, -1.0)).chain(terms) {
-            if signal >= SIGNALS {
-                let what = format!("an equation of the arm names signal {signal}, but it has {SIGNALS}");
+            if signal >= SIGNAL_COUNT {
+                let what = format!("an equation of the arm names signal {signal}, but it has {SIGNAL_COUNT}");
                 return Err(Error::Structure { what, remedy: "number four angles and two currents from 0".into() });
             }
             if signal >= 4 {

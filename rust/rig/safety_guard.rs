@@ -273,7 +273,7 @@ impl Guard {
 
     /// Currents of the last command \[A\].
     #[must_use]
-    pub fn written(&self) -> [f64; 2] {
+    pub fn last_currents(&self) -> [f64; 2] {
         self.written
     }
 
@@ -285,7 +285,7 @@ impl Guard {
 
     /// Total number of missed deadlines.
     #[must_use]
-    pub fn missed(&self) -> u64 {
+    pub fn missed_deadlines(&self) -> u64 {
         self.missed_in_all
     }
 
@@ -316,11 +316,11 @@ impl Guard {
                 let (degrees, limit) = (bends[j].to_degrees(), s.deflection_limit[j].to_degrees());
                 self.fail(Fault::Deflection { stage: j + 1, degrees, limit });
             }
-            self.follow(j, reading.counts[j]);
-            self.bends(j, reading.analog[j]);
+            self.check_encoder(j, reading.counts[j]);
+            self.check_gauge(j, reading.analog[j]);
         }
         self.previous = Some(reading.counts);
-        self.deadline(late);
+        self.check_deadline(late);
         if let Some(filters) = &mut self.filters {
             for (filter, bend) in filters.iter_mut().zip(&mut bends) {
                 *bend = filter.step(*bend);
@@ -380,7 +380,7 @@ impl Guard {
         }
     }
 
-    fn follow(&mut self, j: usize, counts: i32) {
+    fn check_encoder(&mut self, j: usize, counts: i32) {
         let Some(previous) = self.previous else { return };
         let moved = i64::from(counts) - i64::from(previous[j]);
         let s = &self.settings;
@@ -402,7 +402,7 @@ impl Guard {
     }
 
     /// Noise alone changes the reading of a working gauge. Without noise, a changed torque does.
-    fn bends(&mut self, j: usize, volts: f64) {
+    fn check_gauge(&mut self, j: usize, volts: f64) {
         let (s, gauge) = (&self.settings, &mut self.gauges[j]);
         #[allow(clippy::float_cmp)]
         if gauge.volts != volts {
@@ -416,7 +416,7 @@ impl Guard {
         }
     }
 
-    fn deadline(&mut self, late: f64) {
+    fn check_deadline(&mut self, late: f64) {
         let s = &self.settings;
         if late > s.step {
             self.missed += 1;

@@ -282,7 +282,7 @@ pub struct Pace {
 }
 
 /// Time before a deadline that is spent spinning. The system's sleep ends late by some tens of microseconds.
-const AWAKE: Duration = Duration::from_micros(120);
+const SPIN_WAIT: Duration = Duration::from_micros(120);
 
 /// Longest sampling interval in real time \[s\], one day, so that times do not overflow.
 const LONGEST_STEP: f64 = 86_400.0;
@@ -312,7 +312,7 @@ impl Pace {
             let now = Instant::now();
             match due.checked_duration_since(now) {
                 None => return now.duration_since(due).as_secs_f64(),
-                Some(left) if left > AWAKE => std::thread::sleep(left - AWAKE),
+                Some(left) if left > SPIN_WAIT => std::thread::sleep(left - SPIN_WAIT),
                 Some(_) => std::hint::spin_loop(),
             }
         }

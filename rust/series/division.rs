@@ -12,30 +12,30 @@ use crate::linalg::small;
 use crate::simd;
 
 /// Length of a block of forward substitution. 64 was the fastest of 16, 32, 64, 128 at m = 2048.
-pub const BLOCK: usize = 64;
+pub const BLOCK_TERMS: usize = 64;
 
 /// Longest half length of blocks that are joined directly, which is faster there and has no transform rounding.
 const JOINED_DIRECTLY: usize = 64;
 
 /// Terms whose sums stay in registers while the products with a tile are subtracted.
-const TILE: usize = 8;
+const TILE_TERMS: usize = 8;
 
 /// `open[i] −= Σ_s series[start − s + i]·solved[s]`, s from 0 on, with the same operations for every term.
 #[inline(always)]
 fn take_off(open: &mut [f64], series: &[f64], start: usize, solved: &[f64]) {
     let mut at = start;
-    let mut tiles = open.chunks_exact_mut(2 * TILE);
+    let mut tiles = open.chunks_exact_mut(2 * TILE_TERMS);
     for tile in &mut tiles {
-        let mut sums = [0.0; 2 * TILE];
+        let mut sums = [0.0; 2 * TILE_TERMS];
         sums.copy_from_slice(tile);
         for (s, &y) in solved.iter().enumerate() {
-            let part = &series[at - s..at - s + 2 * TILE];
-            for i in 0..2 * TILE {
+            let part = &series[at - s..at - s + 2 * TILE_TERMS];
+            for i in 0..2 * TILE_TERMS {
                 sums[i] -= part[i] * y;
             }
         }
         tile.copy_from_slice(&sums);
-        at += 2 * TILE;
+        at += 2 * TILE_TERMS;
     }
     let rest = tiles.into_remainder();
     for (s, &y) in solved.iter().enumerate() {
@@ -58,22 +58,22 @@ impl simd::Kernel for Substitution<'_> {
     #[inline(always)]
     fn run(self) {
         let mut open = self.block;
-        while open.len() >= TILE {
-            let (tile, later) = open.split_at_mut(TILE);
+        while open.len() >= TILE_TERMS {
+            let (tile, later) = open.split_at_mut(TILE_TERMS);
             // With a constant length the loop is unrolled and its values stay in registers.
-            let mut head = [0.0; TILE];
-            let known = self.divisor.len().min(TILE);
+            let mut head = [0.0; TILE_TERMS];
+            let known = self.divisor.len().min(TILE_TERMS);
             head[..known].copy_from_slice(&self.divisor[..known]);
-            let mut solved = [0.0; TILE];
+            let mut solved = [0.0; TILE_TERMS];
             solved.copy_from_slice(tile);
-            for k in 0..TILE {
+            for k in 0..TILE_TERMS {
                 solved[k] *= self.inverse;
-                for i in k + 1..TILE {
+                for i in k + 1..TILE_TERMS {
                     solved[i] -= head[i - k] * solved[k];
                 }
             }
             tile.copy_from_slice(&solved);
-            take_off(later, self.divisor, TILE, &solved);
+            take_off(later, self.divisor, TILE_TERMS, &solved);
             open = later;
         }
         for k in 0..open.len() {
@@ -174,7 +174,7 @@ impl Division {
 
     /// Number of solved terms.
     #[must_use]
-    pub fn solved(&self) -> usize {
+    pub fn solved_terms(&self) -> usize {
         self.solved
     }
 
@@ -205,11 +205,11 @@ impl Division {
     /// Number of terms of each series that the next [`Division::advance`] reads.
     #[must_use]
     pub fn reads(&self) -> usize {
-        let hi = (self.solved + BLOCK).min(self.m);
+        let hi = (self.solved + BLOCK_TERMS).min(self.m);
         if hi == self.m {
             return hi - self.solved;
         }
-        (2 * (BLOCK << (hi / BLOCK).trailing_zeros())).min(self.m)
+        (2 * (BLOCK_TERMS << (hi / BLOCK_TERMS).trailing_zeros())).min(self.m)
     }
 
     /// Total number of terms.
@@ -230,7 +230,7 @@ impl Division {
     /// First half of [`Division::advance`]: next block of the quotients, by forward substitution.
     pub fn solve_block<'a>(&mut self, inverse: &[f64], series: impl Fn(usize, usize, usize) -> &'a [f64]) {
         let lo = self.solved;
-        let hi = (lo + BLOCK).min(self.m);
+        let hi = (lo + BLOCK_TERMS).min(self.m);
         self.substitute(inverse, &series, lo, hi);
         self.solved = hi;
     }
@@ -241,20 +241,20 @@ impl Division {
         if hi == self.m {
             return;
         }
-        let lo = hi.saturating_sub(BLOCK);
-        let blocks = hi / BLOCK;
+        let lo = hi.saturating_sub(BLOCK_TERMS);
+        let blocks = hi / BLOCK_TERMS;
         let level = blocks.trailing_zeros() as usize;
-        let half = BLOCK << level;
+        let half = BLOCK_TERMS << level;
         let end = (hi + half).min(self.m);
         if half <= JOINED_DIRECTLY {
             for i in 0..n {
                 for j in 0..n {
                     let a = series(i, j, (2 * half).min(self.m));
                     // Split borrows: the solved part of j contributes to the open part of i.
-                    let mut solved = [0.0; BLOCK];
+                    let mut solved = [0.0; BLOCK_TERMS];
                     solved[..hi - lo].copy_from_slice(&self.rest[j][lo..hi]);
                     let open = &mut self.rest[i][hi..end];
-                    simd::widest(Join { series: a, solved: &solved[..hi - lo], open });
+                    simd::dispatch_simd(Join { series: a, solved: &solved[..hi - lo], open });
                 }
             }
             return;
@@ -270,7 +270,7 @@ impl Division {
             time[half..].fill(0.0);
             let bins = plan.bins().max(self.spectra[j].len());
             self.spectra[j].resize(bins, zero);
-            plan.forward(time, &mut self.spectra[j][..plan.bins()], &mut self.workspace);
+            plan.transform(time, &mut self.spectra[j][..plan.bins()], &mut self.workspace);
         }
         for i in 0..n {
             let product = &mut self.product[..plan.bins()];
@@ -298,7 +298,7 @@ impl Division {
         let n = self.n;
         if n == 1 {
             let (divisor, block) = (series(0, 0, hi - lo), &mut self.rest[0][lo..hi]);
-            simd::widest(Substitution { divisor, inverse: inverse[0], block });
+            simd::dispatch_simd(Substitution { divisor, inverse: inverse[0], block });
             return;
         }
         let mut values = vec![0.0; n];
@@ -322,7 +322,7 @@ impl Division {
 
     fn prepare<'a>(&mut self, level: usize, series: &impl Fn(usize, usize, usize) -> &'a [f64]) {
         while self.levels.len() <= level {
-            let plan = fft::plan(2 * (BLOCK << self.levels.len()));
+            let plan = fft::plan(2 * (BLOCK_TERMS << self.levels.len()));
             self.levels.push(Level { plan, ready: false, spectra: Vec::new() });
         }
         let Level { plan, ready, spectra } = &mut self.levels[level];
@@ -337,7 +337,7 @@ impl Division {
             time[..a.len()].copy_from_slice(a);
             time[a.len()..].fill(0.0);
             spectrum.resize(plan.bins(), Bin::new(0.0, 0.0));
-            plan.forward(time, spectrum, &mut self.workspace);
+            plan.transform(time, spectrum, &mut self.workspace);
         }
         *ready = true;
     }
@@ -415,7 +415,7 @@ impl<'a> Solver<'a> {
     ///
     /// # Errors
     /// As [`Solver::new`].
-    pub fn keeping(matrix: Vec<Vec<Vec<f64>>>) -> Result<Solver<'static>> {
+    pub fn from_matrix(matrix: Vec<Vec<Vec<f64>>>) -> Result<Solver<'static>> {
         Solver::of(Cow::Owned(matrix))
     }
 

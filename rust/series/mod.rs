@@ -22,8 +22,8 @@ pub mod naive;
 pub mod product;
 pub mod running_sums;
 
-pub use division::{divide, reciprocal, solve, Division, Solver, BLOCK};
+pub use division::{divide, reciprocal, solve, Division, Solver, BLOCK_TERMS};
 #[cfg(feature = "oracles")]
 pub use naive::{divide_naive, multiply_naive};
 pub use product::{multiply, Buffers, Kernel, SumOfProducts};
-pub use running_sums::{running_sums, Recursion, Source, ABREAST, MAX_SUMS};
+pub use running_sums::{running_sums, Recursion, Source, MAX_SUMS, RIGHT_SIDE_LANES};

@@ -5,7 +5,7 @@ use std::cell::RefCell;
 use crate::fft::{self, Bin, Plan, Workspace};
 
 /// Longest shorter factor of a direct product. Direct products are faster there and have no transform rounding.
-const DIRECT: usize = 64;
+const MAX_DIRECT_TERMS: usize = 64;
 
 /// Product mod z^m by definition. O(m²).
 pub(super) fn direct(a: &[f64], b: &[f64], m: usize) -> Vec<f64> {
@@ -25,23 +25,23 @@ pub(super) fn direct(a: &[f64], b: &[f64], m: usize) -> Vec<f64> {
 #[must_use]
 pub fn multiply(a: &[f64], b: &[f64], m: usize) -> Vec<f64> {
     let (a, b) = (&a[..a.len().min(m)], &b[..b.len().min(m)]);
-    if a.len().min(b.len()) <= DIRECT {
+    if a.len().min(b.len()) <= MAX_DIRECT_TERMS {
         return direct(a, b, m);
     }
     let kernel = Kernel::with_length(a, a.len() + b.len());
     let mut out = vec![0.0; m];
-    spare(kernel.plan.len(), |buffers| kernel.apply(b, &mut out, buffers));
+    with_thread_buffers(kernel.plan.len(), |buffers| kernel.apply(b, &mut out, buffers));
     out
 }
 
 /// Longest transform whose buffers a thread reuses.
-const SPARE: usize = 1 << 17;
+const MAX_REUSED_BUFFER_POINTS: usize = 1 << 17;
 
 thread_local!(static BUFFERS: RefCell<Buffers> = RefCell::default());
 
 /// Run `work` on reused buffers of this thread, or on new ones for long transforms. `work` must not call this function.
-fn spare<R>(points: usize, work: impl FnOnce(&mut Buffers) -> R) -> R {
-    if points <= SPARE {
+fn with_thread_buffers<R>(points: usize, work: impl FnOnce(&mut Buffers) -> R) -> R {
+    if points <= MAX_REUSED_BUFFER_POINTS {
         BUFFERS.with_borrow_mut(work)
     } else {
         work(&mut Buffers::default())
@@ -73,16 +73,16 @@ impl Kernel {
     #[must_use]
     pub fn with_length(series: &[f64], total: usize) -> Self {
         let plan = fft::plan(fft::fast_length(total));
-        spare(plan.len(), |buffers| Self::planned(plan.clone(), series, buffers))
+        with_thread_buffers(plan.len(), |buffers| Self::from_plan(plan.clone(), series, buffers))
     }
 
     /// [`Kernel::new`] with buffers of the caller.
     #[must_use]
     pub(crate) fn made_with(series: &[f64], buffers: &mut Buffers) -> Self {
-        Self::planned(fft::plan(fft::fast_length(2 * series.len())), series, buffers)
+        Self::from_plan(fft::plan(fft::fast_length(2 * series.len())), series, buffers)
     }
 
-    fn planned(plan: Plan, series: &[f64], buffers: &mut Buffers) -> Self {
+    fn from_plan(plan: Plan, series: &[f64], buffers: &mut Buffers) -> Self {
         let spectrum = vec![Bin::new(0.0, 0.0); plan.bins()];
         let mut made = Self { plan, spectrum };
         made.read(series.iter().copied(), buffers);
@@ -101,7 +101,7 @@ impl Kernel {
         time.clear();
         time.extend(series);
         time.resize(self.plan.len(), 0.0);
-        self.plan.forward(time, &mut self.spectrum, workspace);
+        self.plan.transform(time, &mut self.spectrum, workspace);
     }
 
     /// First `out.len()` terms of the product with `signal`. Neither may be longer than the cached length.
@@ -111,7 +111,7 @@ impl Kernel {
         buffers.time.resize(self.plan.len(), 0.0);
         buffers.spectrum.resize(self.plan.bins(), Bin::new(0.0, 0.0));
         let spectrum = &mut buffers.spectrum[..self.plan.bins()];
-        self.plan.forward(&mut buffers.time, spectrum, &mut buffers.workspace);
+        self.plan.transform(&mut buffers.time, spectrum, &mut buffers.workspace);
         for (x, k) in spectrum.iter_mut().zip(&self.spectrum) {
             *x *= k;
         }

@@ -7,16 +7,16 @@
 
 use crate::error::{check_length, Error, Result};
 use crate::linalg::small;
-use crate::simd::{widest, Kernel};
+use crate::simd::{dispatch_simd, Kernel};
 
 /// Highest order of an integral. Transforms are as fast for higher orders.
 pub const MAX_SUMS: usize = 6;
 
 /// Right-hand sides solved side by side. A single one would wait for the latency of its last term.
-pub const ABREAST: usize = 4;
+pub const RIGHT_SIDE_LANES: usize = 4;
 
 /// Terms of one chunk, so that its inputs stay in the cache.
-const BLOCK: usize = 256;
+const CHUNK_TERMS: usize = 256;
 
 /// Weights of the running sums Q^0 … Q^η in I^η of pulse means.
 ///
@@ -95,7 +95,7 @@ impl Recursion {
             for (l, weight) in running_sums(order, step).iter().enumerate() {
                 own[(i * (sums + 1) + l) * n + j] += c * weight;
             }
-            leading[i * n + j] -= c * crate::fractional::kernels::first(whole(order), step);
+            leading[i * n + j] -= c * crate::fractional::kernels::first_coefficient(order_to_float(order), step);
         }
         Ok(Self { n, sums, step, own, inverse: small::inverse(&leading, n)? })
     }
@@ -114,23 +114,23 @@ impl Recursion {
             }
         }
         if self.n > 1 {
-            return Ok(lists.iter().map(|sources| self.many(m, sources)).collect());
+            return Ok(lists.iter().map(|sources| self.solve_coupled(m, sources)).collect());
         }
         let solve = match self.sums {
-            0 => Self::abreast::<1>,
-            1 => Self::abreast::<2>,
-            2 => Self::abreast::<3>,
-            3 => Self::abreast::<4>,
-            4 => Self::abreast::<5>,
-            5 => Self::abreast::<6>,
-            _ => Self::abreast::<7>,
+            0 => Self::solve_one_unknown::<1>,
+            1 => Self::solve_one_unknown::<2>,
+            2 => Self::solve_one_unknown::<3>,
+            3 => Self::solve_one_unknown::<4>,
+            4 => Self::solve_one_unknown::<5>,
+            5 => Self::solve_one_unknown::<6>,
+            _ => Self::solve_one_unknown::<7>,
         };
-        let solved = lists.chunks(ABREAST).flat_map(|part| solve(self, m, part));
+        let solved = lists.chunks(RIGHT_SIDE_LANES).flat_map(|part| solve(self, m, part));
         Ok(solved.map(|answer| vec![answer]).collect())
     }
 
     /// One unknown for up to [`RIGHT_SIDE_LANES`] right-hand sides. L is the number of sums plus one.
-    fn abreast<const L: usize>(&self, m: usize, lists: &[Vec<Source>]) -> Vec<Vec<f64>> {
+    fn solve_one_unknown<const L: usize>(&self, m: usize, lists: &[Vec<Source>]) -> Vec<Vec<f64>> {
         let mut own = [0.0; L];
         own.copy_from_slice(&self.own[..L]);
         let driven: Vec<Vec<(Vec<f64>, &[f64])>> = lists
@@ -138,12 +138,12 @@ impl Recursion {
             .map(|list| list.iter().map(|source| (self.weights(source), source.series)).collect())
             .collect();
         let mut out = vec![vec![0.0; m]; lists.len()];
-        let mut states = [[0.0; ABREAST]; L];
-        let mut drive = vec![[[0.0; ABREAST]; L]; BLOCK.min(m)];
-        let mut answer = vec![[0.0; ABREAST]; BLOCK.min(m)];
-        for start in (0..m).step_by(BLOCK) {
-            let length = BLOCK.min(m - start);
-            drive[..length].fill([[0.0; ABREAST]; L]);
+        let mut states = [[0.0; RIGHT_SIDE_LANES]; L];
+        let mut drive = vec![[[0.0; RIGHT_SIDE_LANES]; L]; CHUNK_TERMS.min(m)];
+        let mut answer = vec![[0.0; RIGHT_SIDE_LANES]; CHUNK_TERMS.min(m)];
+        for start in (0..m).step_by(CHUNK_TERMS) {
+            let length = CHUNK_TERMS.min(m - start);
+            drive[..length].fill([[0.0; RIGHT_SIDE_LANES]; L]);
             for (lane, sources) in driven.iter().enumerate() {
                 for (weights, series) in sources {
                     for (given, value) in drive.iter_mut().zip(&series[start..start + length]) {
@@ -152,7 +152,7 @@ impl Recursion {
                 }
             }
             let (drive, answer) = (&drive[..length], &mut answer[..length]);
-            widest(Block { own: &own, inverse: self.inverse[0], states: &mut states, drive, answer });
+            dispatch_simd(Block { own: &own, inverse: self.inverse[0], states: &mut states, drive, answer });
             for (lane, series) in out.iter_mut().enumerate() {
                 series[start..start + length].iter_mut().zip(&*answer).for_each(|(value, y)| *value = y[lane]);
             }
@@ -165,7 +165,7 @@ impl Recursion {
         running_sums(source.order, self.step).iter().map(|w| w * source.weight).collect()
     }
 
-    fn many(&self, m: usize, sources: &[Source]) -> Vec<Vec<f64>> {
+    fn solve_coupled(&self, m: usize, sources: &[Source]) -> Vec<Vec<f64>> {
         let (n, stride) = (self.n, self.sums + 1);
         // Inputs of each sum, term by term, then equation by equation.
         let mut drive = vec![0.0; m * n * stride];
@@ -205,9 +205,9 @@ impl Recursion {
 struct Block<'a, const L: usize> {
     own: &'a [f64; L],
     inverse: f64,
-    states: &'a mut [[f64; ABREAST]; L],
-    drive: &'a [[[f64; ABREAST]; L]],
-    answer: &'a mut [[f64; ABREAST]],
+    states: &'a mut [[f64; RIGHT_SIDE_LANES]; L],
+    drive: &'a [[[f64; RIGHT_SIDE_LANES]; L]],
+    answer: &'a mut [[f64; RIGHT_SIDE_LANES]],
 }
 
 impl<const L: usize> Kernel for Block<'_, L> {
@@ -219,16 +219,16 @@ impl<const L: usize> Kernel for Block<'_, L> {
         for (given, y) in self.drive.iter().zip(self.answer) {
             let mut open = given[0];
             for l in 1..L {
-                for w in 0..ABREAST {
+                for w in 0..RIGHT_SIDE_LANES {
                     open[w] += given[l][w] + states[l][w];
                 }
             }
-            let mut above = [0.0; ABREAST];
-            for w in 0..ABREAST {
+            let mut above = [0.0; RIGHT_SIDE_LANES];
+            for w in 0..RIGHT_SIDE_LANES {
                 y[w] = self.inverse * open[w];
             }
             for l in (1..L).rev() {
-                for w in 0..ABREAST {
+                for w in 0..RIGHT_SIDE_LANES {
                     states[l][w] += given[l][w] + self.own[l] * y[w] + above[w];
                 }
                 above = states[l];
@@ -239,6 +239,6 @@ impl<const L: usize> Kernel for Block<'_, L> {
 }
 
 #[allow(clippy::cast_precision_loss)]
-fn whole(order: usize) -> f64 {
+fn order_to_float(order: usize) -> f64 {
     order as f64
 }

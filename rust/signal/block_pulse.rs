@@ -110,7 +110,7 @@ fn slice_integral(samples: &[f64], between: Intersample, j: usize, a: f64, b: f6
 /// # }
 /// ```
 #[allow(clippy::cast_possible_truncation, clippy::cast_sign_loss, clippy::cast_precision_loss)]
-pub fn delayed(samples: &[f64], delay: f64, before: f64) -> Result<Vec<f64>> {
+pub fn delay_samples(samples: &[f64], delay: f64, before: f64) -> Result<Vec<f64>> {
     if !(delay >= 0.0 && delay.is_finite()) {
         return Err(Error::OutOfRange {
             name: "delay".into(),
@@ -153,14 +153,14 @@ pub fn point_samples(means: &[f64]) -> Vec<f64> {
 }
 
 /// Pulse means in the stencil of one sample.
-const STENCIL: usize = 4;
+const STENCIL_PULSES: usize = 4;
 /// Pulses after a jump within which samples are corrected. Beyond, the error of spreading the jump falls with the
 /// square of the step, like all other errors of the scheme.
-const REACH: f64 = 16.0;
+const KINK_RANGE_PULSES: f64 = 16.0;
 
 /// Jump of a held signal near a sample time. Lengths in pulses.
 #[derive(Debug, Clone, Copy, PartialEq)]
-struct Near {
+struct NearbyJump {
     /// Time from the jump to the sample, negative for a later jump.
     before: f64,
     /// First pulse of the stencil, relative to the pulse of the jump.
@@ -172,9 +172,9 @@ struct Near {
 
 /// Nonuniform sample times on a grid of pulses, with the interpolation weights.
 #[derive(Debug, Clone, PartialEq)]
-pub struct Readings {
+pub struct SampleInterpolation {
     first: Vec<usize>,
-    weights: Vec<[f64; STENCIL]>,
+    weights: Vec<[f64; STENCIL_PULSES]>,
     places: Vec<f64>,
 }
 
@@ -182,10 +182,10 @@ pub struct Readings {
 #[derive(Debug, Clone, Default, PartialEq)]
 pub struct Jumps {
     starts: Vec<usize>,
-    near: Vec<Near>,
+    near: Vec<NearbyJump>,
 }
 
-impl Readings {
+impl SampleInterpolation {
     /// Interpolation at these positions, in pulses from the start of the first one, among m pulses.
     ///
     /// # Errors
@@ -203,8 +203,8 @@ impl Readings {
     /// ```
     #[allow(clippy::cast_possible_truncation, clippy::cast_sign_loss, clippy::cast_precision_loss)]
     pub fn new(places: Vec<f64>, m: usize) -> Result<Self> {
-        if m < STENCIL {
-            return Err(Error::Length { name: "pulses around a reading".into(), expected: STENCIL, found: m });
+        if m < STENCIL_PULSES {
+            return Err(Error::Length { name: "pulses around a reading".into(), expected: STENCIL_PULSES, found: m });
         }
         check_finite("times of readings", &places)?;
         if let Some(&value) = places.iter().find(|&&p| !(0.0..=m as f64).contains(&p)) {
@@ -216,9 +216,9 @@ impl Readings {
                 remedy,
             });
         }
-        let half = STENCIL / 2;
+        let half = STENCIL_PULSES / 2;
         let first: Vec<usize> =
-            places.iter().map(|p| ((p + 0.5) as usize).saturating_sub(half).min(m - STENCIL)).collect();
+            places.iter().map(|p| ((p + 0.5) as usize).saturating_sub(half).min(m - STENCIL_PULSES)).collect();
         let weights = places.iter().zip(&first).map(|(p, &f)| stencil(p - f as f64)).collect();
         Ok(Self { first, weights, places })
     }
@@ -237,8 +237,8 @@ impl Readings {
 
     /// Samples of a smooth signal from its pulse means.
     #[must_use]
-    pub fn read(&self, means: &[f64]) -> Vec<f64> {
-        let value = |(&first, weights): (&usize, &[f64; STENCIL])| -> f64 {
+    pub fn interpolate(&self, means: &[f64]) -> Vec<f64> {
+        let value = |(&first, weights): (&usize, &[f64; STENCIL_PULSES])| -> f64 {
             weights.iter().zip(&means[first..]).map(|(w, v)| w * v).sum()
         };
         self.first.iter().zip(&self.weights).map(value).collect()
@@ -250,13 +250,13 @@ impl Readings {
     pub fn jumps(&self, at: &[f64], sizes: &[f64]) -> Jumps {
         let mut out = Jumps { starts: vec![0], near: Vec::new() };
         for (&place, &first) in self.places.iter().zip(&self.first) {
-            let from = at.partition_point(|&p| p < place - REACH);
-            let to = at.partition_point(|&p| p < (first + STENCIL) as f64);
+            let from = at.partition_point(|&p| p < place - KINK_RANGE_PULSES);
+            let to = at.partition_point(|&p| p < (first + STENCIL_PULSES) as f64);
             for (&p, &size) in
                 at[from..to.max(from)].iter().zip(sizes.iter().skip(from)).filter(|(_, size)| **size != 0.0)
             {
                 let pulse = p.floor();
-                out.near.push(Near {
+                out.near.push(NearbyJump {
                     before: place - p,
                     first: first as isize - pulse as isize,
                     share: p - pulse,
@@ -271,14 +271,14 @@ impl Readings {
     /// Corrections of the samples of I^η of a held signal: exact response to the jumps minus that in the pulse means.
     #[must_use]
     #[allow(clippy::cast_precision_loss)]
-    pub fn corners(&self, jumps: &Jumps, eta: f64, step: f64) -> Vec<f64> {
+    pub fn kink_corrections(&self, jumps: &Jumps, eta: f64, step: f64) -> Vec<f64> {
         let scale = libm::pow(step, eta);
         let (corner, mean) = (scale / libm::tgamma(eta + 1.0), scale / libm::tgamma(eta + 2.0));
         // Mean response over the n-th pulse after a jump at the start of a pulse.
-        let longest = jumps.near.iter().map(|near| near.first).max().unwrap_or(0).max(0) + STENCIL as isize;
+        let longest = jumps.near.iter().map(|near| near.first).max().unwrap_or(0).max(0) + STENCIL_PULSES as isize;
         let powers: Vec<f64> = (0..=longest + 1).map(|n| libm::pow(n as f64, eta + 1.0)).collect();
         let of_pulse = |n: isize| usize::try_from(n).map_or(0.0, |n| mean * (powers[n + 1] - powers[n]));
-        let lacking = |near: &Near, weights: &[f64; STENCIL]| {
+        let lacking = |near: &NearbyJump, weights: &[f64; STENCIL_PULSES]| {
             let there = match near.before {
                 before if before < 0.0 => 0.0,
                 before if eta == 0.0 && before == 0.0 => corner,
@@ -298,17 +298,17 @@ impl Readings {
 /// Weights of four pulse means for the value at x pulses from the start of the first one: slopes of the Lagrange
 /// polynomials through the integral at the five edges.
 #[allow(clippy::cast_precision_loss)]
-fn stencil(x: f64) -> [f64; STENCIL] {
+fn stencil(x: f64) -> [f64; STENCIL_PULSES] {
     let slope = |m: usize| -> f64 {
-        let others: Vec<f64> = (0..=STENCIL).filter(|&j| j != m).map(|j| j as f64).collect();
+        let others: Vec<f64> = (0..=STENCIL_PULSES).filter(|&j| j != m).map(|j| j as f64).collect();
         let below: f64 = others.iter().map(|j| m as f64 - j).product();
         let skipping =
             |i: usize| others.iter().enumerate().filter(|(j, _)| *j != i).map(|(_, v)| x - v).product::<f64>();
         (0..others.len()).map(skipping).sum::<f64>() / below
     };
-    let mut weights = [0.0; STENCIL];
+    let mut weights = [0.0; STENCIL_PULSES];
     let mut sum = 0.0;
-    for k in (0..STENCIL).rev() {
+    for k in (0..STENCIL_PULSES).rev() {
         sum += slope(k + 1);
         weights[k] = sum;
     }

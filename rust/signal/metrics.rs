@@ -62,7 +62,7 @@ pub struct Correlation {
 }
 
 /// Correlation times in the truncated sum (Sokal's windowing). A longer window adds only noise.
-const WINDOW: f64 = 6.0;
+const WINDOW_CORRELATION_TIMES: f64 = 6.0;
 
 /// Correlations up to `lags` of x with y, each run about its own mean. O(N log N).
 ///
@@ -98,14 +98,15 @@ pub fn correlation(x: &[Vec<f64>], y: &[Vec<f64>], lags: usize) -> Result<Correl
     }
     // Correlations beyond a quarter of a run are estimated from too few samples.
     let reach = lags.max(shortest / 4);
-    let (cross, own_x, own_y) = (pooled(x, y, reach), pooled(x, x, reach), pooled(y, y, reach));
+    let (cross, own_x, own_y) =
+        (pool_covariances(x, y, reach), pool_covariances(x, x, reach), pool_covariances(y, y, reach));
     let (power_x, power_y) = (own_x[reach], own_y[reach]);
     let scale = (power_x * power_y).sqrt();
     let over = |value: f64, by: f64| if by > 0.0 { value / by } else { 0.0 };
     let values = cross[reach - lags..=reach + lags].iter().map(|c| over(*c, scale)).collect();
     let count = x.iter().map(Vec::len).sum::<usize>() as f64;
     let (mut sum, mut time, mut window) = (1.0, 1.0, 0);
-    while window < shortest / 4 && (window as f64) < WINDOW * time {
+    while window < shortest / 4 && (window as f64) < WINDOW_CORRELATION_TIMES * time {
         window += 1;
         let (rx, ry) = (over(own_x[reach + window], power_x), over(own_y[reach + window], power_y));
         sum += 2.0 * rx * ry;
@@ -117,17 +118,17 @@ pub fn correlation(x: &[Vec<f64>], y: &[Vec<f64>], lags: usize) -> Result<Correl
 }
 
 /// Covariances Σ x(t + k) y(t), k = −lags … lags, about the means, summed over runs.
-fn pooled(x: &[Vec<f64>], y: &[Vec<f64>], lags: usize) -> Vec<f64> {
+fn pool_covariances(x: &[Vec<f64>], y: &[Vec<f64>], lags: usize) -> Vec<f64> {
     let mut sums = vec![0.0; 2 * lags + 1];
     for (a, b) in x.iter().zip(y) {
-        let found = covariances(&centred(a), &centred(b), lags);
+        let found = covariances(&subtract_mean(a), &subtract_mean(b), lags);
         sums.iter_mut().zip(found).for_each(|(s, c)| *s += c);
     }
     sums
 }
 
 #[allow(clippy::cast_precision_loss)]
-fn centred(x: &[f64]) -> Vec<f64> {
+fn subtract_mean(x: &[f64]) -> Vec<f64> {
     let mean = x.iter().sum::<f64>() / (x.len().max(1)) as f64;
     x.iter().map(|v| v - mean).collect()
 }
@@ -141,7 +142,7 @@ pub fn covariances(x: &[f64], y: &[f64], lags: usize) -> Vec<f64> {
         let mut time = vec![0.0; plan.len()];
         time[..signal.len()].copy_from_slice(signal);
         let mut spectrum = vec![fft::Bin::new(0.0, 0.0); plan.bins()];
-        plan.forward(&mut time, &mut spectrum, &mut workspace);
+        plan.transform(&mut time, &mut spectrum, &mut workspace);
         spectrum
     };
     let (mut product, other) = (spectrum_of(x), spectrum_of(y));

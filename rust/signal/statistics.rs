@@ -1,18 +1,18 @@
 //! Statistics of series: robust noise scale, autocovariance, whiteness test, autoregressive noise models.
 
 use crate::fft::{plan, Bin, Workspace};
-use crate::simd::{dot, widest, Kernel};
+use crate::simd::{dispatch_simd, dot, Kernel};
 
 /// Median absolute deviation of a normal variable, in units of its standard deviation.
-pub const MAD: f64 = 0.674_489_750_196_081_7;
+pub const NORMAL_MAD_PER_SIGMA: f64 = 0.674_489_750_196_081_7;
 /// Huber's threshold in standard deviations. Under normal noise the efficiency is 95 % of that of least squares.
-pub const BEND: f64 = 1.345;
+pub const HUBER_THRESHOLD: f64 = 1.345;
 /// 99 % quantile of a normal variable. The test rejects one in a hundred true models.
 const NORMAL_99: f64 = 2.326_347_874_040_840_8;
 /// Default number of lags of a whiteness test.
-pub const LAGS: usize = 25;
+pub const WHITENESS_LAGS: usize = 25;
 /// Most values that are summed serially before pairwise summation.
-const TOGETHER: usize = 128;
+const MAX_SERIAL_SUM_VALUES: usize = 128;
 
 /// Inner product of two rows of one length.
 struct Inner<'a>(&'a [f64], &'a [f64]);
@@ -29,7 +29,7 @@ impl Kernel for Inner<'_> {
 /// Dot product Σ a·b of rows of equal length, vectorized.
 #[must_use]
 pub fn inner(a: &[f64], b: &[f64]) -> f64 {
-    widest(Inner(a, b))
+    dispatch_simd(Inner(a, b))
 }
 
 /// Pairwise sum of values. Rounding errors grow with the logarithm of their number.
@@ -38,7 +38,7 @@ pub fn sum(values: &[f64]) -> f64 {
     if values.len() < 8 {
         return values.iter().sum();
     }
-    if values.len() > TOGETHER {
+    if values.len() > MAX_SERIAL_SUM_VALUES {
         let half = values.len() / 2 / 8 * 8;
         return sum(&values[..half]) + sum(&values[half..]);
     }
@@ -77,7 +77,7 @@ pub fn robust_deviation(values: &[f64]) -> f64 {
     if values.is_empty() {
         return 0.0;
     }
-    median(values.iter().map(|v| v.abs()).collect()) / MAD
+    median(values.iter().map(|v| v.abs()).collect()) / NORMAL_MAD_PER_SIGMA
 }
 
 /// Median of values, NaN if there are none.
@@ -168,7 +168,7 @@ const LEAST_CIRCLE: usize = 4096;
 /// ```
 #[must_use]
 #[allow(clippy::cast_precision_loss)]
-pub fn coloured(series: &[&[f64]], most: usize) -> (Vec<f64>, f64) {
+pub fn whitening_filter(series: &[&[f64]], most: usize) -> (Vec<f64>, f64) {
     let counts: Vec<usize> = series.iter().map(|x| x.iter().filter(|v| !v.is_nan()).count()).collect();
     let most = most.min(counts.iter().min().copied().unwrap_or(0) / SAMPLES_A_COEFFICIENT);
     let (mut covariance, pairs) = autocovariances(series, most);
@@ -206,14 +206,14 @@ pub fn coloured(series: &[&[f64]], most: usize) -> (Vec<f64>, f64) {
 
 /// Autocovariances at lags 0 to `count` − 1 of an autoregression with this filter and innovation variance.
 #[must_use]
-pub fn covariances(filter: &[f64], power: f64, count: usize) -> Vec<f64> {
+pub fn filter_autocovariances(filter: &[f64], power: f64, count: usize) -> Vec<f64> {
     // The circle of frequencies is so fine that wrapped-around covariances have decayed.
     let size = power_above(2 * count + 8 * filter.len()).max(LEAST_CIRCLE);
     let plan = plan(size);
     let mut time = filter.to_vec();
     time.resize(size, 0.0);
     let (mut spectrum, mut workspace) = (vec![Bin::new(0.0, 0.0); plan.bins()], Workspace::new());
-    plan.forward(&mut time, &mut spectrum, &mut workspace);
+    plan.transform(&mut time, &mut spectrum, &mut workspace);
     spectrum.iter_mut().for_each(|bin| *bin = Bin::new(power / bin.norm_sqr(), 0.0));
     plan.inverse(&mut spectrum, &mut time, &mut workspace);
     time.truncate(count);
@@ -224,7 +224,7 @@ pub fn covariances(filter: &[f64], power: f64, count: usize) -> Vec<f64> {
 ///
 /// The Toeplitz matrix is embedded in a circulant matrix.
 #[must_use]
-pub fn weighted(rows: &[&[f64]], covariances: &[f64]) -> Vec<Vec<f64>> {
+pub fn multiply_toeplitz(rows: &[&[f64]], covariances: &[f64]) -> Vec<Vec<f64>> {
     let count = covariances.len();
     let size = power_above(2 * count);
     let plan = plan(size);
@@ -234,13 +234,13 @@ pub fn weighted(rows: &[&[f64]], covariances: &[f64]) -> Vec<Vec<f64>> {
         time[size - lag] = covariances[lag];
     }
     let (mut circle, mut workspace) = (vec![Bin::new(0.0, 0.0); plan.bins()], Workspace::new());
-    plan.forward(&mut time, &mut circle, &mut workspace);
+    plan.transform(&mut time, &mut circle, &mut workspace);
     let mut spectrum = circle.clone();
     rows.iter()
         .map(|row| {
             time[..count].copy_from_slice(row);
             time[count..].fill(0.0);
-            plan.forward(&mut time, &mut spectrum, &mut workspace);
+            plan.transform(&mut time, &mut spectrum, &mut workspace);
             // The spectrum of an even sequence is real.
             spectrum.iter_mut().zip(&circle).for_each(|(bin, of)| *bin *= of.re);
             plan.inverse(&mut spectrum, &mut time, &mut workspace);

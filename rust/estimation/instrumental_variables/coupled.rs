@@ -7,22 +7,23 @@
 //! the sensitivity of the simulation to that coefficient. A fixed point of the iteration is therefore a stationary
 //! point of the weighted output error.
 
-use super::prefilter::grows;
+use super::prefilter::is_unstable;
 use super::solution::{
-    dot, equations, initial_terms, long_run, orthonormal, unmoved, Dropped, Instruments, Settings, Solution,
+    add_long_run_covariance, dot, equations, has_converged, initial_terms, orthonormalize_instruments, Dropped,
+    RecordInstruments, Settings, Solution,
 };
 use crate::equation::Structure;
 use crate::error::Result;
-use crate::linalg::small::Scaled;
+use crate::linalg::small::EquilibratedLu;
 use crate::regressors::Record;
 use crate::series::{Buffers, Kernel};
 use crate::series_system::System;
 
 /// Maximum number of halvings of a step that increases the cost.
-const SHORTENED: usize = 8;
+const MAX_STEP_HALVINGS: usize = 8;
 
 /// Increase of the cost (−2 log-likelihood) that counts as none: the likelihood ratio differs from 1 by a millionth.
-const EQUAL: f64 = 1e-6;
+const COST_TOLERANCE: f64 = 1e-6;
 
 /// Equations to refine: structures, fixed coefficients, exponents and exclusions of their initial terms.
 pub struct Problem<'a> {
@@ -42,7 +43,7 @@ pub struct Problem<'a> {
 
 /// Joint estimate of all equations.
 #[derive(Debug, Clone, PartialEq)]
-pub struct Ended {
+pub struct CoupledEstimate {
     /// Per equation: coefficients of its terms, then of its initial terms record by record.
     pub solutions: Vec<Solution>,
     /// Per equation: covariance of its free coefficients, row-major, robust to colored residuals.
@@ -57,16 +58,16 @@ pub struct Ended {
 
 /// Free coefficient: (equation, term), or (equation, record, position) of an initial term.
 #[derive(Debug, Clone, Copy, PartialEq)]
-enum Unknown {
+enum FreeCoefficient {
     Term(usize, usize),
     Initial(usize, usize, usize),
 }
 
 /// Coefficients of all equations, and their covariances if requested.
-type Stepped = (Vec<Solution>, Vec<Vec<f64>>);
+type StepResult = (Vec<Solution>, Vec<Vec<f64>>);
 
 /// Simulation of every record with one set of coefficients, and its cost.
-struct Point {
+struct Iterate {
     /// Outputs of the simulation, by record and equation.
     responses: Vec<Vec<Vec<f64>>>,
     /// Weight 1/σ² of each output.
@@ -82,10 +83,10 @@ impl Problem<'_> {
     ///
     /// # Errors
     /// [`crate::error::Error::Singular`] if the instruments do not identify the coefficients of all equations together.
-    pub fn refine(&self, start: &[Solution], settings: Settings) -> Result<Option<Ended>> {
-        let unknowns = self.unknowns();
+    pub fn refine(&self, start: &[Solution], settings: Settings) -> Result<Option<CoupledEstimate>> {
+        let unknowns = self.free_coefficients();
         let mut solutions = start.to_vec();
-        let Some(mut point) = self.point(&solutions)? else { return Ok(None) };
+        let Some(mut point) = self.evaluate(&solutions)? else { return Ok(None) };
         let (mut iterations, mut converged) = (0, false);
         while !converged && iterations < settings.iterations {
             let Some((next, _)) = self.step(&solutions, &point, &unknowns, false)? else { return Ok(None) };
@@ -94,17 +95,17 @@ impl Problem<'_> {
                 .iter()
                 .zip(&next)
                 .zip(self.structures)
-                .all(|((a, b), s)| unmoved(a, b, s.terms.len(), settings.tolerance));
+                .all(|((a, b), s)| has_converged(a, b, s.terms.len(), settings.tolerance));
             let mut share = 1.0;
             let mut taken = false;
-            for _ in 0..SHORTENED {
+            for _ in 0..MAX_STEP_HALVINGS {
                 let tried: Vec<Solution> = solutions
                     .iter()
                     .zip(&next)
                     .map(|(a, b)| a.iter().zip(b).map(|(a, b)| a + share * (b - a)).collect())
                     .collect();
-                match self.point(&tried)? {
-                    Some(found) if found.cost <= point.cost + EQUAL => {
+                match self.evaluate(&tried)? {
+                    Some(found) if found.cost <= point.cost + COST_TOLERANCE => {
                         (solutions, point, taken) = (tried, found, true);
                         break;
                     }
@@ -117,16 +118,16 @@ impl Problem<'_> {
             }
         }
         let Some((_, covariances)) = self.step(&solutions, &point, &unknowns, true)? else { return Ok(None) };
-        Ok(Some(Ended { solutions, covariances, cost: point.cost, iterations, converged }))
+        Ok(Some(CoupledEstimate { solutions, covariances, cost: point.cost, iterations, converged }))
     }
 
-    fn unknowns(&self) -> Vec<Unknown> {
+    fn free_coefficients(&self) -> Vec<FreeCoefficient> {
         let mut out = Vec::new();
         for (i, fixed) in self.fixed.iter().enumerate() {
-            out.extend((0..fixed.len()).filter(|&k| fixed[k].is_none()).map(|k| Unknown::Term(i, k)));
+            out.extend((0..fixed.len()).filter(|&k| fixed[k].is_none()).map(|k| FreeCoefficient::Term(i, k)));
             for r in 0..self.records.len() {
                 let kept = (0..self.exponents[i].len()).filter(|&e| !self.dropped[i].contains(&(r, e)));
-                out.extend(kept.map(|e| Unknown::Initial(i, r, e)));
+                out.extend(kept.map(|e| FreeCoefficient::Initial(i, r, e)));
             }
         }
         out
@@ -134,7 +135,7 @@ impl Problem<'_> {
 
     /// Simulate all records and compute the cost; None if an output exceeds ten times the measured amplitude.
     #[allow(clippy::cast_precision_loss)]
-    fn point(&self, solutions: &[Solution]) -> Result<Option<Point>> {
+    fn evaluate(&self, solutions: &[Solution]) -> Result<Option<Iterate>> {
         let equations = equations(self.structures, solutions);
         let mut responses = Vec::with_capacity(self.records.len());
         let mut sums = vec![0.0; equations.len()];
@@ -157,17 +158,17 @@ impl Problem<'_> {
         // With noise-free data the residuals are rounding errors, which are weighted like noise.
         let variances: Vec<f64> = sums.iter().map(|s| (s / n).max(f64::MIN_POSITIVE)).collect();
         let cost = variances.iter().map(|v| n * libm::log(*v)).sum();
-        Ok(Some(Point { responses, weights: variances.iter().map(|v| 1.0 / v).collect(), cost }))
+        Ok(Some(Iterate { responses, weights: variances.iter().map(|v| 1.0 / v).collect(), cost }))
     }
 
     /// New coefficients of all equations, with covariances if requested; None if the inverse matrix is unstable.
     fn step(
         &self,
         solutions: &[Solution],
-        point: &Point,
-        unknowns: &[Unknown],
+        point: &Iterate,
+        unknowns: &[FreeCoefficient],
         with_covariance: bool,
-    ) -> Result<Option<Stepped>> {
+    ) -> Result<Option<StepResult>> {
         let (n, k) = (self.structures.len(), unknowns.len());
         let equations = equations(self.structures, solutions);
         let mut parts = Vec::with_capacity(self.records.len());
@@ -175,7 +176,7 @@ impl Problem<'_> {
         for (r, record) in self.records.iter().enumerate() {
             let m = record.m();
             let inverse = System::new(&equations, record)?.inverse()?;
-            if inverse.iter().flatten().any(|series| grows(series)) {
+            if inverse.iter().flatten().any(|series| is_unstable(series)) {
                 return Ok(None);
             }
             let filters: Vec<Vec<Kernel>> =
@@ -214,23 +215,23 @@ impl Problem<'_> {
                     }
                 }
                 for (e, &exponent) in self.exponents[i].iter().enumerate() {
-                    if unknowns.contains(&Unknown::Initial(i, r, e)) {
+                    if unknowns.contains(&FreeCoefficient::Initial(i, r, e)) {
                         let column = through(i, &record.initial_term(exponent));
                         psi.push(column.clone());
                         phi.push(column);
                     }
                 }
                 places.extend((0..k).filter(|&a| match unknowns[a] {
-                    Unknown::Term(equation, _) => equation == i,
-                    Unknown::Initial(equation, run, _) => equation == i && run == r,
+                    FreeCoefficient::Term(equation, _) => equation == i,
+                    FreeCoefficient::Initial(equation, run, _) => equation == i && run == r,
                 }));
             }
             parts.push((phi, target));
-            instruments.push(Instruments { columns: psi, places });
+            instruments.push(RecordInstruments { columns: psi, unknown_indices: places });
         }
-        orthonormal(&mut instruments, k)?;
+        orthonormalize_instruments(&mut instruments, k)?;
         let (mut cross, mut rhs) = (vec![0.0; k * k], vec![0.0; k]);
-        for ((phi, target), Instruments { columns, places }) in parts.iter().zip(&instruments) {
+        for ((phi, target), RecordInstruments { columns, unknown_indices: places }) in parts.iter().zip(&instruments) {
             for (instrument, &a) in columns.iter().zip(places) {
                 rhs[a] += dot(instrument, target);
                 for (regressor, &b) in phi.iter().zip(places) {
@@ -238,13 +239,13 @@ impl Problem<'_> {
                 }
             }
         }
-        let solved = Scaled::new(&cross, k)?;
+        let solved = EquilibratedLu::new(&cross, k)?;
         let x = solved.solve(&rhs);
         let mut next: Vec<Solution> = solutions.to_vec();
         for (&unknown, &value) in unknowns.iter().zip(&x) {
             match unknown {
-                Unknown::Term(i, term) => next[i][term] = value,
-                Unknown::Initial(i, r, e) => {
+                FreeCoefficient::Term(i, term) => next[i][term] = value,
+                FreeCoefficient::Initial(i, r, e) => {
                     next[i][self.structures[i].terms.len() + r * self.exponents[i].len() + e] = value;
                 }
             }
@@ -253,7 +254,7 @@ impl Problem<'_> {
         if with_covariance {
             let (mut meat, inverse) = (vec![0.0; k * k], solved.inverse());
             for (((phi, target), made), record) in parts.iter().zip(&instruments).zip(self.records) {
-                let Instruments { columns: psi, places } = made;
+                let RecordInstruments { columns: psi, unknown_indices: places } = made;
                 let mut rest = target.clone();
                 for (column, &place) in phi.iter().zip(places) {
                     rest.iter_mut().zip(column).for_each(|(e, v)| *e -= x[place] * v);
@@ -263,12 +264,13 @@ impl Problem<'_> {
                     .iter()
                     .map(|p| (0..m).map(|t| (0..n).map(|j| p[j * m + t] * rest[j * m + t]).sum()).collect())
                     .collect();
-                long_run(&scores, places, &mut meat, k);
+                add_long_run_covariance(&scores, places, &mut meat, k);
             }
             let half = |i: usize, j: usize| -> f64 { (0..k).map(|b| meat[i * k + b] * inverse[j * k + b]).sum() };
             for i in 0..n {
-                let own: Vec<usize> =
-                    (0..k).filter(|&a| matches!(unknowns[a], Unknown::Term(equation, _) if equation == i)).collect();
+                let own: Vec<usize> = (0..k)
+                    .filter(|&a| matches!(unknowns[a], FreeCoefficient::Term(equation, _) if equation == i))
+                    .collect();
                 let block = own.iter().flat_map(|&a| own.iter().map(move |&b| (a, b)));
                 covariances.push(block.map(|(a, b)| (0..k).map(|c| inverse[a * k + c] * half(c, b)).sum()).collect());
             }

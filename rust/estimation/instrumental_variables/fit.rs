@@ -5,8 +5,8 @@
 
 use super::coupled;
 use super::prefilter::{damped_inverse, low_pass, power_frequency, unit};
-use super::single::{divisor, step, Scratch, Shelf, Source};
-use super::solution::{dot, equations, initial_terms, unmoved, Dropped, Settings, Solution};
+use super::single::{divisor, step, EquationSpectra, Scratch, Source};
+use super::solution::{dot, equations, has_converged, initial_terms, Dropped, Settings, Solution};
 use crate::equation::{Initial, Structure};
 use crate::error::{check_length, Error, Result};
 use crate::estimation::least_squares;
@@ -16,11 +16,11 @@ use crate::series_system::System;
 
 /// Cutoff frequencies of the low-pass prefilters of the initial guesses, relative to the bandwidth of the output.
 /// None: unfiltered record.
-const PREFILTERS: [Option<f64>; 4] = [None, Some(1.0), Some(2.0), Some(4.0)];
+const PREFILTER_CUTOFF_RATIOS: [Option<f64>; 4] = [None, Some(1.0), Some(2.0), Some(4.0)];
 
 /// Increase of the output error above which a step is halved, at most [`MAX_STEP_HALVINGS`] times in a row.
-const WORSE: f64 = 1.2;
-const SHORTENED: usize = 4;
+const MAX_ERROR_RATIO: f64 = 1.2;
+const MAX_STEP_HALVINGS: usize = 4;
 
 /// Coefficient estimates of one equation.
 #[derive(Debug, Clone, PartialEq)]
@@ -95,15 +95,15 @@ pub fn fit(
     if structures.is_empty() {
         return Err(Error::Length { name: "equations".into(), expected: 1, found: 0 });
     }
-    let clean: Vec<Record> = records.iter().map(Record::cleaned).collect();
+    let clean: Vec<Record> = records.iter().map(Record::clean_record).collect();
     let exponents: Vec<Vec<f64>> = structures.iter().map(|s| s.initial_exponents(initial)).collect();
     let problem = Problem::new(records, &clean, structures, (fixed, initial), &exponents)?;
-    let mut best: Option<Ended> = None;
+    let mut best: Option<RefinementResult> = None;
     let mut failure = None;
     // Best refinement of all equations together. Whether the separate estimates are stable depends on the initial
     // guess.
-    let mut together: Option<coupled::Ended> = None;
-    for multiple in PREFILTERS {
+    let mut together: Option<coupled::CoupledEstimate> = None;
+    for multiple in PREFILTER_CUTOFF_RATIOS {
         // An initial guess that fails does not affect the others.
         match problem.start(multiple).and_then(|solutions| {
             let ended = problem.iterate(solutions.clone(), settings)?;
@@ -112,7 +112,7 @@ pub fn fit(
             Ok((start, ended)) => {
                 if structures.len() > 1 {
                     for from in [&ended.solutions, &start] {
-                        let Some(found) = problem.together(from, settings)? else { continue };
+                        let Some(found) = problem.refine_together(from, settings)? else { continue };
                         if together.as_ref().is_none_or(|t| found.cost < t.cost) {
                             together = Some(found);
                         }
@@ -130,7 +130,7 @@ pub fn fit(
         return Err(failure.unwrap_or_else(|| Error::Diverged { what: "free run of every start".into(), index: 0 }));
     };
     if let Some(found) = together {
-        ended = Ended {
+        ended = RefinementResult {
             error: ended.error,
             solutions: found.solutions,
             covariances: found.covariances,
@@ -164,12 +164,12 @@ struct Problem<'a> {
     /// Initial terms that are excluded, per equation.
     dropped: Vec<Dropped>,
     /// Spectra that do not change between iterations, by equation and record.
-    shelves: Vec<Vec<Shelf<'a>>>,
+    spectra: Vec<Vec<EquationSpectra<'a>>>,
     substitutes: Vec<Vec<Vec<Option<Kernel>>>>,
 }
 
 /// Result of the refinement from one initial guess.
-struct Ended {
+struct RefinementResult {
     error: f64,
     solutions: Vec<Solution>,
     covariances: Vec<Vec<f64>>,
@@ -190,15 +190,15 @@ impl<'a> Problem<'a> {
             Ok(least_squares::fit(records, structure, fixed, initial)?.dropped)
         };
         let dropped = structures.iter().zip(fixed).map(plain).collect::<Result<Vec<Dropped>>>()?;
-        let of_equation = |(structure, exponents): (&Structure, &Vec<f64>)| -> Vec<Shelf<'a>> {
-            records.iter().map(|record| Shelf::new(record, structure, exponents)).collect()
+        let of_equation = |(structure, exponents): (&Structure, &Vec<f64>)| -> Vec<EquationSpectra<'a>> {
+            records.iter().map(|record| EquationSpectra::new(record, structure, exponents)).collect()
         };
-        let shelves: Vec<Vec<Shelf<'a>>> = structures.iter().zip(exponents).map(of_equation).collect();
-        let substituted = |shelves: &Vec<Shelf<'a>>| -> Vec<Vec<Option<Kernel>>> {
-            shelves.iter().zip(clean).map(|(shelf, clean)| shelf.clean(clean, |_| true)).collect()
+        let shelves: Vec<Vec<EquationSpectra<'a>>> = structures.iter().zip(exponents).map(of_equation).collect();
+        let substituted = |shelves: &Vec<EquationSpectra<'a>>| -> Vec<Vec<Option<Kernel>>> {
+            shelves.iter().zip(clean).map(|(shelf, clean)| shelf.substitute_spectra(clean, |_| true)).collect()
         };
         let substitutes = shelves.iter().map(substituted).collect();
-        Ok(Self { records, clean, structures, fixed, exponents, dropped, shelves, substitutes })
+        Ok(Self { records, clean, structures, fixed, exponents, dropped, spectra: shelves, substitutes })
     }
 
     /// Two-stage least squares: one step with the noise-free signals as instruments.
@@ -208,7 +208,7 @@ impl<'a> Problem<'a> {
         let mut scratch = Scratch::default();
         let mut solutions = Vec::with_capacity(self.structures.len());
         for (i, (structure, fixed)) in self.structures.iter().zip(self.fixed).enumerate() {
-            let pairs = self.shelves[i].iter().zip(&self.substitutes[i]);
+            let pairs = self.spectra[i].iter().zip(&self.substitutes[i]);
             let sources: Vec<Source<'_>> = pairs.map(|(shelf, clean)| shelf.source(|k| clean[k].as_ref())).collect();
             let low_passed = |r: &Record, multiple: f64| {
                 low_pass(multiple * power_frequency(r.signal(structure.output), r.step()), r)
@@ -221,19 +221,19 @@ impl<'a> Problem<'a> {
         Ok(solutions)
     }
 
-    fn iterate(&self, mut solutions: Vec<Solution>, settings: Settings) -> Result<Ended> {
+    fn iterate(&self, mut solutions: Vec<Solution>, settings: Settings) -> Result<RefinementResult> {
         let mut scratch = Scratch::default();
         let mut best = (f64::INFINITY, solutions.clone());
         let (mut iterations, mut converged, mut shortened) = (0, false, 0);
         loop {
-            let (responses, damped) = coupled(self.clean, self.structures, self.exponents, &solutions)?;
+            let (responses, damped) = simulate_coupled(self.clean, self.structures, self.exponents, &solutions)?;
             let error = output_error(self.records, self.structures, &responses);
             if error < best.0 {
                 best = (error, solutions.clone());
                 shortened = 0;
             }
             let last = converged || iterations == settings.iterations;
-            if !last && shortened < SHORTENED && (error.is_nan() || error > WORSE * best.0) {
+            if !last && shortened < MAX_STEP_HALVINGS && (error.is_nan() || error > MAX_ERROR_RATIO * best.0) {
                 // The step is too long: move half-way back to the best iterate.
                 for (x, y) in solutions.iter_mut().flatten().zip(best.1.iter().flatten()) {
                     *x = 0.5 * (*x + y);
@@ -249,20 +249,20 @@ impl<'a> Problem<'a> {
             }
             let (next, covariances) = self.step(&solutions, &responses, last, &mut scratch)?;
             if last {
-                return Ok(Ended { error, solutions, covariances, iterations, converged, damped });
+                return Ok(RefinementResult { error, solutions, covariances, iterations, converged, damped });
             }
             iterations += 1;
             converged = solutions
                 .iter()
                 .zip(&next)
                 .zip(self.structures)
-                .all(|((a, b), s)| unmoved(a, b, s.terms.len(), settings.tolerance));
+                .all(|((a, b), s)| has_converged(a, b, s.terms.len(), settings.tolerance));
             solutions = next;
         }
     }
 
     /// Refine all equations together; None if they cannot be refined together.
-    fn together(&self, start: &[Solution], settings: Settings) -> Result<Option<coupled::Ended>> {
+    fn refine_together(&self, start: &[Solution], settings: Settings) -> Result<Option<coupled::CoupledEstimate>> {
         let problem = coupled::Problem {
             records: self.records,
             clean: self.clean,
@@ -300,13 +300,14 @@ impl<'a> Problem<'a> {
         let mut out = (Vec::new(), Vec::new());
         for (i, fixed) in self.fixed.iter().enumerate() {
             let driven = |signal: usize| self.structures.iter().any(|e| e.output == signal);
-            let pairs = self.shelves[i].iter().zip(&simulated);
-            let made: Vec<Vec<Option<Kernel>>> = pairs.map(|(shelf, record)| shelf.clean(record, driven)).collect();
+            let pairs = self.spectra[i].iter().zip(&simulated);
+            let made: Vec<Vec<Option<Kernel>>> =
+                pairs.map(|(shelf, record)| shelf.substitute_spectra(record, driven)).collect();
             let terms = &self.structures[i].terms;
             let sources: Vec<Source<'_>> = (0..made.len())
                 .map(|r| {
                     let of = |k: usize| if driven(terms[k].signal) { &made[r][k] } else { &self.substitutes[i][r][k] };
-                    self.shelves[i][r].source(|k| of(k).as_ref())
+                    self.spectra[i][r].source(|k| of(k).as_ref())
                 })
                 .collect();
             let filters = sources
@@ -337,7 +338,7 @@ fn output_error(records: &[Record], structures: &[Structure], responses: &[Vec<V
 }
 
 /// Simulate all equations together on every record, with damping if they are unstable.
-fn coupled(
+fn simulate_coupled(
     clean: &[Record],
     structures: &[Structure],
     exponents: &[Vec<f64>],
@@ -355,7 +356,7 @@ fn coupled(
                 response.iter().all(|v| v.abs() <= 10.0 * measured.max(f64::MIN_POSITIVE))
             })
         };
-        let (outputs, grown) = System::new(&equations, record)?.bounded(&initial, bounded)?;
+        let (outputs, grown) = System::new(&equations, record)?.respond_stabilized(&initial, bounded)?;
         damped |= grown;
         out.push(outputs);
     }

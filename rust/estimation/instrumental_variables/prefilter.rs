@@ -11,7 +11,7 @@ use crate::regressors::Record;
 use crate::series::{self, reciprocal, Buffers, Kernel};
 
 /// Ratio of the peaks of the second and first half above which a response counts as unstable.
-const GROWTH: f64 = 2.0;
+const INSTABILITY_PEAK_RATIO: f64 = 2.0;
 
 /// Return 1/D mod z^m, or 1/D(ρz) with the largest ρ = e^{−γ/m}, γ = 0, 4, 8, …, that is stable.
 ///
@@ -24,7 +24,7 @@ pub fn damped_inverse(divisor: &[f64]) -> Result<(Vec<f64>, bool)> {
     let m = divisor.len();
     let one = unit(m);
     let quotient = series::divide(&one, divisor)?;
-    if !grows(&quotient) {
+    if !is_unstable(&quotient) {
         return Ok((quotient, false));
     }
     let finite = quotient.iter().all(|q| q.is_finite());
@@ -32,9 +32,10 @@ pub fn damped_inverse(divisor: &[f64]) -> Result<(Vec<f64>, bool)> {
     loop {
         let rho = libm::exp(-gamma / m as f64);
         // 1/D(ρz) is the series of 1/D at ρz, unless that series overflows.
-        let damped = if finite { read_at(rho, &quotient) } else { series::divide(&one, &read_at(rho, divisor))? };
+        let damped =
+            if finite { scale_argument(rho, &quotient) } else { series::divide(&one, &scale_argument(rho, divisor))? };
         // At γ = 64 m only the first term of D remains.
-        if !grows(&damped) || gamma > 64.0 * m as f64 {
+        if !is_unstable(&damped) || gamma > 64.0 * m as f64 {
             return Ok((damped, true));
         }
         gamma *= 2.0;
@@ -42,7 +43,7 @@ pub fn damped_inverse(divisor: &[f64]) -> Result<(Vec<f64>, bool)> {
 }
 
 /// Return the coefficients of a(ρz) for the series a(z).
-fn read_at(rho: f64, series: &[f64]) -> Vec<f64> {
+fn scale_argument(rho: f64, series: &[f64]) -> Vec<f64> {
     let mut power = 1.0;
     series
         .iter()
@@ -54,12 +55,12 @@ fn read_at(rho: f64, series: &[f64]) -> Vec<f64> {
         .collect()
 }
 
-pub(super) fn grows(response: &[f64]) -> bool {
+pub(super) fn is_unstable(response: &[f64]) -> bool {
     let (first, second) = response.split_at(response.len() / 2);
     let peak =
         |part: &[f64]| part.iter().fold(0.0_f64, |a, v| if v.is_finite() { a.max(v.abs()) } else { f64::INFINITY });
     let later = peak(second);
-    later.is_infinite() || later > GROWTH * peak(first)
+    later.is_infinite() || later > INSTABILITY_PEAK_RATIO * peak(first)
 }
 
 /// Frequency [rad/s] below which 90 % of a signal's power lies.
@@ -106,13 +107,13 @@ pub(super) fn unit(m: usize) -> Vec<f64> {
 }
 
 /// Resonators of [`project`] per decade and input. Their damping ratio makes neighbors overlap.
-const RESONATORS: usize = 8;
+const RESONATORS_PER_DECADE: usize = 8;
 const RESONATOR_DAMPING: f64 = 0.2;
 
 /// Relative norm below which the remaining columns of [`project`] are linearly dependent and excluded. The responses
 /// have almost no component along such directions, noise has as much as along any other, and rounding errors (10⁻¹¹ for
 /// columns of a thousand pulses) would determine them.
-const SPANNED: f64 = 1e-6;
+const BASIS_RANK_TOLERANCE: f64 = 1e-6;
 
 /// Return a record with noise-free substitutes ([`project`]) for all signals except the inputs.
 ///
@@ -121,13 +122,14 @@ const SPANNED: f64 = 1e-6;
 pub fn with_projections(record: Record, inputs: &[bool], at_rest: bool, stop: &Stop) -> Result<Record> {
     let known: Vec<usize> = (0..record.len()).filter(|&s| inputs.get(s).copied().unwrap_or(false)).collect();
     // One basis for all signals; none where all are inputs.
-    let basis = if known.len() < record.len() { excited(&record, &known, at_rest, stop)? } else { Vec::new() };
+    let basis =
+        if known.len() < record.len() { input_response_basis(&record, &known, at_rest, stop)? } else { Vec::new() };
     let clean = (0..record.len()).map(|s| {
         let signal = record.signal(s);
         if known.contains(&s) {
             signal.to_vec()
         } else {
-            along(&basis, signal)
+            project_on_basis(&basis, signal)
         }
     });
     let clean = clean.collect();
@@ -143,11 +145,11 @@ pub fn with_projections(record: Record, inputs: &[bool], at_rest: bool, stop: &S
 /// # Errors
 /// [`Error::Structure`] without an input or for a record of fewer than 8 pulses.
 pub fn project(record: &Record, signal: usize, inputs: &[usize], at_rest: bool) -> Result<Vec<f64>> {
-    Ok(along(&excited(record, inputs, at_rest, &Stop::default())?, record.signal(signal)))
+    Ok(project_on_basis(&input_response_basis(record, inputs, at_rest, &Stop::default())?, record.signal(signal)))
 }
 
 /// Project a signal on an orthonormal basis.
-fn along(basis: &[Vec<f64>], signal: &[f64]) -> Vec<f64> {
+fn project_on_basis(basis: &[Vec<f64>], signal: &[f64]) -> Vec<f64> {
     let mut out = vec![0.0; signal.len()];
     for direction in basis {
         let along = dot(direction, signal);
@@ -158,7 +160,7 @@ fn along(basis: &[Vec<f64>], signal: &[f64]) -> Vec<f64> {
 
 /// Orthonormal basis of the integrals of the inputs and their responses through resonators.
 #[allow(clippy::cast_precision_loss)]
-fn excited(record: &Record, inputs: &[usize], at_rest: bool, stop: &Stop) -> Result<Vec<Vec<f64>>> {
+fn input_response_basis(record: &Record, inputs: &[usize], at_rest: bool, stop: &Stop) -> Result<Vec<Vec<f64>>> {
     let (m, h) = (record.m(), record.step());
     if m < 8 || inputs.is_empty() {
         return Err(Error::Structure {
@@ -170,7 +172,7 @@ fn excited(record: &Record, inputs: &[usize], at_rest: bool, stop: &Stop) -> Res
     let (low, high) = (std::f64::consts::PI / duration, std::f64::consts::PI / (4.0 * h));
     let decades = libm::log10(high / low);
     #[allow(clippy::cast_possible_truncation, clippy::cast_sign_loss)]
-    let count = ((decades * RESONATORS as f64) as usize).clamp(2, (m / (8 * inputs.len())).max(2));
+    let count = ((decades * RESONATORS_PER_DECADE as f64) as usize).clamp(2, (m / (8 * inputs.len())).max(2));
     let mut columns = Vec::new();
     if !at_rest {
         columns.extend([0.0, 1.0].map(|e| record.initial_term(e)));
@@ -202,5 +204,5 @@ fn excited(record: &Record, inputs: &[usize], at_rest: bool, stop: &Stop) -> Res
             }));
         }
     }
-    orthonormal_basis(columns, SPANNED, stop)
+    orthonormal_basis(columns, BASIS_RANK_TOLERANCE, stop)
 }

@@ -5,11 +5,13 @@
 //! iterated.
 
 use super::prefilter::damped_inverse;
-use super::solution::{dot, long_run, orthonormal, unmoved, Instruments, Settings, Solution};
+use super::solution::{
+    add_long_run_covariance, dot, has_converged, orthonormalize_instruments, RecordInstruments, Settings, Solution,
+};
 use crate::equation::Structure;
 use crate::error::Result;
 use crate::fractional::kernels;
-use crate::linalg::small::Scaled;
+use crate::linalg::small::EquilibratedLu;
 use crate::parallel::Stop;
 use crate::regressors::Record;
 use crate::series::{multiply, Buffers, Kernel, SumOfProducts};
@@ -31,16 +33,16 @@ pub struct Source<'a> {
 }
 
 /// Spectra of one record and equation that do not depend on the solution.
-pub(super) struct Shelf<'a> {
+pub(super) struct EquationSpectra<'a> {
     record: &'a Record,
     output: usize,
-    terms: Vec<Shelved>,
+    terms: Vec<TermSpectra>,
     initial: Vec<Kernel>,
     target: Kernel,
 }
 
 /// Spectra of one term: kernel of I^η, its spectrum, and the spectrum of the measured I^η s.
-struct Shelved {
+struct TermSpectra {
     signal: usize,
     eta: f64,
     kernel: Vec<f64>,
@@ -48,9 +50,9 @@ struct Shelved {
     measured: Kernel,
 }
 
-impl Shelved {
+impl TermSpectra {
     /// Spectrum of I^η of the given signal.
-    fn of(&self, signal: &[f64]) -> Kernel {
+    fn integral_spectrum(&self, signal: &[f64]) -> Kernel {
         if self.eta == 0.0 {
             Kernel::new(signal)
         } else {
@@ -59,14 +61,14 @@ impl Shelved {
     }
 }
 
-impl<'a> Shelf<'a> {
+impl<'a> EquationSpectra<'a> {
     pub(super) fn new(record: &'a Record, structure: &Structure, exponents: &[f64]) -> Self {
         let term = |k: usize| {
             let (signal, eta) = (structure.terms[k].signal, structure.integration(k));
             let kernel = kernels::kernel(eta, record.m(), record.step());
             let spectrum = Kernel::new(&kernel);
             let measured = Kernel::new(&record.integral(signal, eta));
-            Shelved { signal, eta, kernel, spectrum, measured }
+            TermSpectra { signal, eta, kernel, spectrum, measured }
         };
         Self {
             record,
@@ -80,14 +82,18 @@ impl<'a> Shelf<'a> {
     /// Spectra of the terms of other signals than the output, with the signals of `substitute`.
     ///
     /// None for signals that are not `wanted` or that equal the measured ones.
-    pub(super) fn clean(&self, substitute: &Record, wanted: impl Fn(usize) -> bool) -> Vec<Option<Kernel>> {
+    pub(super) fn substitute_spectra(
+        &self,
+        substitute: &Record,
+        wanted: impl Fn(usize) -> bool,
+    ) -> Vec<Option<Kernel>> {
         let other = |s: usize| s != self.output && wanted(s) && substitute.signal(s) != self.record.signal(s);
-        self.terms.iter().map(|t| other(t.signal).then(|| t.of(substitute.signal(t.signal)))).collect()
+        self.terms.iter().map(|t| other(t.signal).then(|| t.integral_spectrum(substitute.signal(t.signal)))).collect()
     }
 
     /// Source of a step with the given substitute spectra; measured spectra for terms without one.
     pub(super) fn source<'b>(&'b self, clean: impl Fn(usize) -> Option<&'b Kernel>) -> Source<'b> {
-        let own = |t: &Shelved| t.signal == self.output;
+        let own = |t: &TermSpectra| t.signal == self.output;
         let terms = || self.terms.iter();
         Source {
             own: terms().map(|t| own(t).then_some((&t.kernel[..], &t.spectrum))).collect(),
@@ -181,12 +187,14 @@ pub fn step(
             phi.push(column);
             places.push(free.len() + place);
         }
-        filtered.push(Filtered { phi, target });
-        instruments.push(Instruments { columns: psi, places });
+        filtered.push(FilteredRegression { phi, target });
+        instruments.push(RecordInstruments { columns: psi, unknown_indices: places });
     }
-    orthonormal(&mut instruments, k)?;
+    orthonormalize_instruments(&mut instruments, k)?;
     let (mut cross, mut rhs) = (vec![0.0; k * k], vec![0.0; k]);
-    for (Filtered { phi, target }, Instruments { columns, places }) in filtered.iter().zip(&instruments) {
+    for (FilteredRegression { phi, target }, RecordInstruments { columns, unknown_indices: places }) in
+        filtered.iter().zip(&instruments)
+    {
         for (instrument, &a) in columns.iter().zip(places) {
             rhs[a] += dot(instrument, target);
             for (regressor, &b) in phi.iter().zip(places) {
@@ -194,7 +202,7 @@ pub fn step(
             }
         }
     }
-    let solved = Scaled::new(&cross, k)?;
+    let solved = EquilibratedLu::new(&cross, k)?;
     let x = solved.solve(&rhs);
     let mut solution: Solution = fixed.iter().map(|f| f.unwrap_or(0.0)).collect();
     for (&j, &value) in free.iter().zip(&x) {
@@ -208,7 +216,7 @@ pub fn step(
     if with_covariance {
         let mut meat = vec![0.0; k * k];
         for (part, instruments) in filtered.iter().zip(&instruments) {
-            long_run(&part.scores(instruments, &x), &instruments.places, &mut meat, k);
+            add_long_run_covariance(&part.scores(instruments, &x), &instruments.unknown_indices, &mut meat, k);
         }
         let (n, inverse) = (free.len(), solved.inverse());
         covariance = vec![0.0; n * n];
@@ -228,16 +236,16 @@ pub fn step(
 }
 
 /// Regressors and target of one record after the prefilter.
-struct Filtered {
+struct FilteredRegression {
     phi: Vec<Vec<f64>>,
     target: Vec<f64>,
 }
 
-impl Filtered {
+impl FilteredRegression {
     /// Scores ψ e at a solution, one row per instrument.
-    fn scores(&self, instruments: &Instruments, x: &[f64]) -> Vec<Vec<f64>> {
+    fn scores(&self, instruments: &RecordInstruments, x: &[f64]) -> Vec<Vec<f64>> {
         let mut rest = self.target.clone();
-        for (column, &place) in self.phi.iter().zip(&instruments.places) {
+        for (column, &place) in self.phi.iter().zip(&instruments.unknown_indices) {
             rest.iter_mut().zip(column).for_each(|(e, v)| *e -= x[place] * v);
         }
         instruments.columns.iter().map(|p| p.iter().zip(&rest).map(|(p, e)| p * e).collect()).collect()
@@ -291,7 +299,7 @@ pub fn refine(
             responses.push(response);
         }
         let (next, _) = step(sources, &filters, &responses, fixed, dropped, false, scratch)?;
-        let still = unmoved(&solution, &next, fixed.len(), settings.tolerance);
+        let still = has_converged(&solution, &next, fixed.len(), settings.tolerance);
         solution = next;
         if still {
             return Ok((solution, made, true));

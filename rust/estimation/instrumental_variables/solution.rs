@@ -9,7 +9,7 @@ use crate::equation::{Equation, Structure};
 use crate::error::{Error, Result};
 
 /// Largest number of iterations accepted: an iteration that has not converged by then cycles.
-const MOST_STEPS: usize = 1000;
+const MAX_ITERATIONS: usize = 1000;
 
 /// Termination criteria of the iteration.
 #[derive(Debug, Clone, Copy, PartialEq)]
@@ -41,11 +41,11 @@ impl Settings {
         let refuse = |name: &str, value: f64, range: &str, remedy: &str| {
             Err(Error::OutOfRange { name: name.into(), value, range: range.into(), remedy: remedy.into() })
         };
-        if self.iterations > MOST_STEPS {
+        if self.iterations > MAX_ITERATIONS {
             #[allow(clippy::cast_precision_loss)]
             let steps = self.iterations as f64;
             let remedy = "what has not stood still by then goes round";
-            return refuse("steps of instrumental variables", steps, &format!("[0, {MOST_STEPS}]"), remedy);
+            return refuse("steps of instrumental variables", steps, &format!("[0, {MAX_ITERATIONS}]"), remedy);
         }
         if !(self.tolerance >= 0.0 && self.tolerance.is_finite()) {
             let remedy = "give the relative change at which the steps end";
@@ -86,7 +86,7 @@ pub(super) fn initial_terms(
 }
 
 /// Return true if every coefficient changed by at most `tolerance` relative to its magnitude.
-pub(super) fn unmoved(before: &[f64], after: &[f64], terms: usize, tolerance: f64) -> bool {
+pub(super) fn has_converged(before: &[f64], after: &[f64], terms: usize, tolerance: f64) -> bool {
     let largest = after[..terms].iter().fold(0.0_f64, |a, v| a.max(v.abs()));
     before[..terms].iter().zip(after).all(|(a, b)| (a - b).abs() <= tolerance * b.abs().max(1e-9 * largest))
 }
@@ -105,19 +105,19 @@ pub(super) fn dot(a: &[f64], b: &[f64]) -> f64 {
 }
 
 /// Instruments of one record: columns, and the index of the free coefficient of each.
-pub(super) struct Instruments {
+pub(super) struct RecordInstruments {
     pub(super) columns: Vec<Vec<f64>>,
-    pub(super) places: Vec<usize>,
+    pub(super) unknown_indices: Vec<usize>,
 }
 
-impl Instruments {
-    fn of(&self, place: usize) -> Option<&Vec<f64>> {
-        self.places.iter().position(|p| *p == place).map(|at| &self.columns[at])
+impl RecordInstruments {
+    fn column_of(&self, place: usize) -> Option<&Vec<f64>> {
+        self.unknown_indices.iter().position(|p| *p == place).map(|at| &self.columns[at])
     }
 }
 
 /// Relative norm of an instrument outside the span of the previous ones below which it is linearly dependent.
-const SPANNED: f64 = 1e-13;
+const RANK_TOLERANCE: f64 = 1e-13;
 
 /// Orthonormalize the instruments of all records, one column over all records for each of k free coefficients.
 ///
@@ -129,21 +129,21 @@ const SPANNED: f64 = 1e-13;
 ///
 /// # Errors
 /// [`Error::Singular`] if a column depends linearly on the previous ones.
-pub(super) fn orthonormal(records: &mut [Instruments], k: usize) -> Result<()> {
+pub(super) fn orthonormalize_instruments(records: &mut [RecordInstruments], k: usize) -> Result<()> {
     let mut held = vec![0; k];
-    records.iter().flat_map(|r| &r.places).for_each(|&place| held[place] += 1);
+    records.iter().flat_map(|r| &r.unknown_indices).for_each(|&place| held[place] += 1);
     let singular = |place| Error::Singular { index: place, count: k };
     // Coefficients of a single record come first: columns of different records are already orthogonal.
     for record in &mut *records {
-        for at in (0..record.places.len()).filter(|&at| held[record.places[at]] == 1) {
+        for at in (0..record.unknown_indices.len()).filter(|&at| held[record.unknown_indices[at]] == 1) {
             let mut column = [std::mem::take(&mut record.columns[at])];
-            let spanned = twice(&mut column, |column| {
-                for before in (0..at).filter(|&before| held[record.places[before]] == 1) {
-                    remove(&mut column[0], &record.columns[before], None);
+            let spanned = orthonormalize_column(&mut column, |column| {
+                for before in (0..at).filter(|&before| held[record.unknown_indices[before]] == 1) {
+                    subtract_projection(&mut column[0], &record.columns[before], None);
                 }
             });
             if !spanned {
-                return Err(singular(record.places[at]));
+                return Err(singular(record.unknown_indices[at]));
             }
             [record.columns[at]] = column;
         }
@@ -151,20 +151,21 @@ pub(super) fn orthonormal(records: &mut [Instruments], k: usize) -> Result<()> {
     let shared: Vec<usize> = (0..k).filter(|&place| held[place] > 1).collect();
     for (n, &place) in shared.iter().enumerate() {
         // The column of a coefficient is empty in records without it.
-        let mut pieces: Vec<Vec<f64>> = records.iter().map(|r| r.of(place).cloned().unwrap_or_default()).collect();
-        let spanned = twice(&mut pieces, |pieces| {
+        let mut pieces: Vec<Vec<f64>> =
+            records.iter().map(|r| r.column_of(place).cloned().unwrap_or_default()).collect();
+        let spanned = orthonormalize_column(&mut pieces, |pieces| {
             for (piece, record) in pieces.iter_mut().zip(&*records).filter(|(piece, _)| !piece.is_empty()) {
-                for (column, _) in record.columns.iter().zip(&record.places).filter(|(_, p)| held[**p] == 1) {
-                    remove(piece, column, None);
+                for (column, _) in record.columns.iter().zip(&record.unknown_indices).filter(|(_, p)| held[**p] == 1) {
+                    subtract_projection(piece, column, None);
                 }
             }
             for &before in &shared[..n] {
-                let pairs = records.iter().map(|r| r.of(before)).zip(&*pieces);
+                let pairs = records.iter().map(|r| r.column_of(before)).zip(&*pieces);
                 let along =
                     pairs.map(|(q, piece)| q.filter(|_| !piece.is_empty()).map_or(0.0, |q| dot(q, piece))).sum();
                 for (piece, record) in pieces.iter_mut().zip(&*records).filter(|(piece, _)| !piece.is_empty()) {
-                    if let Some(q) = record.of(before) {
-                        remove(piece, q, Some(along));
+                    if let Some(q) = record.column_of(before) {
+                        subtract_projection(piece, q, Some(along));
                     }
                 }
             }
@@ -173,7 +174,7 @@ pub(super) fn orthonormal(records: &mut [Instruments], k: usize) -> Result<()> {
             return Err(singular(place));
         }
         for (record, piece) in records.iter_mut().zip(pieces) {
-            if let Some(at) = record.places.iter().position(|p| *p == place) {
+            if let Some(at) = record.unknown_indices.iter().position(|p| *p == place) {
                 record.columns[at] = piece;
             }
         }
@@ -182,7 +183,7 @@ pub(super) fn orthonormal(records: &mut [Instruments], k: usize) -> Result<()> {
 }
 
 /// Subtract `along` times a unit direction from a column; by default its whole projection.
-fn remove(column: &mut [f64], direction: &[f64], along: Option<f64>) {
+fn subtract_projection(column: &mut [f64], direction: &[f64], along: Option<f64>) {
     let along = along.unwrap_or_else(|| dot(direction, column));
     column.iter_mut().zip(direction).for_each(|(v, q)| *v -= along * q);
 }
@@ -190,12 +191,12 @@ fn remove(column: &mut [f64], direction: &[f64], along: Option<f64>) {
 /// Orthogonalize a column by `clear`, twice if its norm drops by half, and normalize it.
 ///
 /// Return false if the remainder is at rounding level.
-fn twice(pieces: &mut [Vec<f64>], clear: impl Fn(&mut [Vec<f64>])) -> bool {
-    let whole = size(pieces);
+fn orthonormalize_column(pieces: &mut [Vec<f64>], clear: impl Fn(&mut [Vec<f64>])) -> bool {
+    let whole = stacked_norm(pieces);
     let (mut before, mut left) = (whole, whole);
     for _ in 0..2 {
         clear(pieces);
-        left = size(pieces);
+        left = stacked_norm(pieces);
         // Rounding errors along the previous columns grow by the factor by which the column has shrunk.
         if left > 0.5 * before {
             break;
@@ -204,17 +205,17 @@ fn twice(pieces: &mut [Vec<f64>], clear: impl Fn(&mut [Vec<f64>])) -> bool {
     }
     let scale = 1.0 / left;
     pieces.iter_mut().flatten().for_each(|v| *v *= scale);
-    left > SPANNED * whole && scale.is_finite() && left.is_finite()
+    left > RANK_TOLERANCE * whole && scale.is_finite() && left.is_finite()
 }
 
-fn size(pieces: &[Vec<f64>]) -> f64 {
+fn stacked_norm(pieces: &[Vec<f64>]) -> f64 {
     pieces.iter().map(|p| dot(p, p)).sum::<f64>().sqrt()
 }
 
 /// Add the long-run covariance of the summed scores to a k × k matrix, with Bartlett weights
 /// (doi:10.2307/1913610). Filtered residuals are not white if other measured outputs enter the equation.
 #[allow(clippy::cast_precision_loss, clippy::cast_possible_truncation, clippy::cast_sign_loss)]
-pub(super) fn long_run(scores: &[Vec<f64>], places: &[usize], meat: &mut [f64], k: usize) {
+pub(super) fn add_long_run_covariance(scores: &[Vec<f64>], places: &[usize], meat: &mut [f64], k: usize) {
     let m = scores.first().map_or(0, Vec::len);
     let lags = ((4.0 * libm::cbrt(m as f64)) as usize).min(m.saturating_sub(1));
     for (left, &a) in scores.iter().zip(places) {

@@ -5,7 +5,7 @@ use crate::error::{check_length, Error, Result};
 use crate::estimation::output_error::{
     fit_until, Coordinate, Experiment, FreeModel, Monomial, Point, Settings, Status,
 };
-use crate::friction::{self, FreeLaw, FrictionModel, Start};
+use crate::friction::{self, FreeFrictionLaw, FrictionModel, Start};
 use crate::linalg::dense;
 use crate::parallel::Stop;
 use crate::signal::statistics::inner;
@@ -18,7 +18,7 @@ pub struct Problem {
     /// The equations and the coordinates of the optimization.
     pub model: FreeModel,
     /// Friction laws by index of their equation.
-    pub frictions: Vec<(usize, FreeLaw)>,
+    pub frictions: Vec<(usize, FreeFrictionLaw)>,
 }
 
 impl Problem {
@@ -26,7 +26,7 @@ impl Problem {
     ///
     /// # Errors
     /// [`Error::Length`], [`Error::Structure`] for an unknown coefficient or equation, or crossed bounds.
-    pub fn new(outputs: Vec<String>, mut model: FreeModel, frictions: Vec<(usize, FreeLaw)>) -> Result<Self> {
+    pub fn new(outputs: Vec<String>, mut model: FreeModel, frictions: Vec<(usize, FreeFrictionLaw)>) -> Result<Self> {
         check_length("outputs", model.equations.len(), outputs.len())?;
         let (orders, coefficients) = (model.order_bounds.len(), model.coordinates.len());
         let refuse = |what: String, remedy: &str| Err(Error::Structure { what, remedy: remedy.into() });
@@ -92,26 +92,26 @@ impl Problem {
 
     /// True if an equation is unstable at a point and free initial terms may compensate the growth.
     #[must_use]
-    pub fn grows(&self, point: &Point) -> bool {
-        self.frictions.is_empty() && !self.model.initial.at_rest() && self.model.grows(point)
+    pub fn is_unstable(&self, point: &Point) -> bool {
+        self.frictions.is_empty() && !self.model.initial.is_at_rest() && self.model.is_unstable(point)
     }
 
     /// Minimize the cost by Levenberg–Marquardt; if `steady`, a stable iterate does not become unstable.
     ///
     /// # Errors
     /// As [`fit_until`] and, with friction, [`friction::fit_until`].
-    pub fn descend(
+    pub fn minimize(
         &self,
         experiments: &[Experiment],
-        start: &Place,
+        start: &Iterate,
         settings: Settings,
         steady: bool,
         stop: &Stop,
-    ) -> Result<Attempt> {
+    ) -> Result<OptimizationResult> {
         if self.frictions.is_empty() {
             let found = fit_until(&self.model, experiments, &start.point, settings, steady, stop)?;
-            return Ok(Attempt {
-                place: Place { point: found.point, states: Vec::new() },
+            return Ok(OptimizationResult {
+                iterate: Iterate { point: found.point, states: Vec::new() },
                 cost: found.cost,
                 residuals: found.residuals,
                 jacobian: found.jacobian,
@@ -127,15 +127,15 @@ impl Problem {
             order_bounds: self.model.order_bounds.clone(),
             coordinates: self.model.coordinates.clone(),
             initial: self.model.initial.clone(),
-            filtered: friction::passing(experiments),
+            filtered: friction::filtered_outputs(experiments),
         };
-        let Place { point: Point { orders, coefficients, inputs }, states } = start.clone();
+        let Iterate { point: Point { orders, coefficients, inputs }, states } = start.clone();
         let start = Start { orders, coefficients, inputs, states };
         let found = friction::fit_until(&model, experiments, &start, settings, stop)?;
         let point = Point { orders: found.orders, coefficients: found.coefficients, inputs: found.inputs };
-        Ok(Attempt {
+        Ok(OptimizationResult {
             initial: found.states.iter().map(|states| vec![states.clone()]).collect(),
-            place: Place { point, states: found.states },
+            iterate: Iterate { point, states: found.states },
             cost: found.cost,
             residuals: found.residuals,
             jacobian: found.jacobian,
@@ -147,7 +147,7 @@ impl Problem {
 
 /// Iterate of an optimization: parameters and initial states.
 #[derive(Debug, Clone, Default, PartialEq)]
-pub struct Place {
+pub struct Iterate {
     /// Free orders, coefficients and input parameters.
     pub point: Point,
     /// Initial states of each run with friction; empty if unknown.
@@ -156,9 +156,9 @@ pub struct Place {
 
 /// Result of an optimization.
 #[derive(Debug, Clone, PartialEq)]
-pub struct Attempt {
+pub struct OptimizationResult {
     /// The final iterate.
-    pub place: Place,
+    pub iterate: Iterate,
     /// Half the weighted sum of squared residuals.
     pub cost: f64,
     /// Vector of weighted residuals, ordered by run, then by output.
@@ -173,19 +173,19 @@ pub struct Attempt {
     pub status: Status,
 }
 
-impl Attempt {
+impl OptimizationResult {
     /// Result before any optimization, with infinite cost.
     #[must_use]
-    pub fn unrun(place: Place) -> Self {
+    pub fn initial_result(iterate: Iterate) -> Self {
         let (cost, evaluations, status) = (f64::INFINITY, 0, Status::Exhausted);
         let (residuals, jacobian, initial) = (Vec::new(), Vec::new(), Vec::new());
-        Self { place, cost, residuals, jacobian, initial, evaluations, status }
+        Self { iterate, cost, residuals, jacobian, initial, evaluations, status }
     }
 
     /// Cost per residual: 1 at the noise floor if the weights are right.
     #[must_use]
     #[allow(clippy::cast_precision_loss)]
-    pub fn level(&self) -> f64 {
+    pub fn cost_per_residual(&self) -> f64 {
         2.0 * self.cost / self.residuals.len() as f64
     }
 
@@ -193,34 +193,34 @@ impl Attempt {
     ///
     /// An optimization that stopped at the limit of its domain has not converged.
     #[must_use]
-    pub fn converged(&self) -> bool {
+    pub fn has_converged(&self) -> bool {
         self.status == Status::Converged
     }
 
     /// All parameters: orders, coefficients, input parameters.
     #[must_use]
     pub fn values(&self) -> Vec<f64> {
-        let Point { orders, coefficients, inputs } = &self.place.point;
+        let Point { orders, coefficients, inputs } = &self.iterate.point;
         [orders.as_slice(), coefficients, inputs].concat()
     }
 
     /// Iterate with other parameter values and the same states.
     #[must_use]
-    pub fn at(&self, values: &[f64]) -> Place {
-        let point = &self.place.point;
+    pub fn iterate_at(&self, values: &[f64]) -> Iterate {
+        let point = &self.iterate.point;
         let (orders, rest) = values.split_at(point.orders.len());
         let (coefficients, inputs) = rest.split_at(point.coefficients.len());
         let point = Point { orders: orders.into(), coefficients: coefficients.into(), inputs: inputs.into() };
-        Place { point, states: self.place.states.clone() }
+        Iterate { point, states: self.iterate.states.clone() }
     }
 }
 
 /// Smallest difference between the highest order of an equation and the orders of its autoregressive terms.
-const LEAST_INTEGRATION: f64 = 1e-3;
+const MIN_INTEGRATION_ORDER: f64 = 1e-3;
 /// Rounding error of the difference of two orders, each rounded to 1e-9. Orders of other signals may equal the highest.
-const ROUNDED: f64 = 2e-9;
+const ORDER_ROUNDING_TOLERANCE: f64 = 2e-9;
 /// Relative singular value below which a constraint normal is linearly dependent.
-const ALONG: f64 = 1e-9;
+const DIRECTION_RANK_TOLERANCE: f64 = 1e-9;
 
 /// Affine constraint a·x + b ≥ m.
 struct Constraint {
@@ -236,7 +236,7 @@ impl Problem {
     ///
     /// # Errors
     /// [`Error::Length`].
-    pub fn feasible(&self, at: &[f64], towards: &[f64]) -> Result<Vec<f64>> {
+    pub fn last_feasible_point(&self, at: &[f64], towards: &[f64]) -> Result<Vec<f64>> {
         check_length("values to go from", self.size(), at.len())?;
         check_length("values to go to", self.size(), towards.len())?;
         let constraints = self.constraints();
@@ -250,7 +250,9 @@ impl Problem {
         let mut step: Vec<f64> = towards.iter().zip(at).map(|(b, a)| b - a).collect();
         let mut active = vec![false; constraints.len()];
         loop {
-            let blocked = |i: usize| room[i] <= ROUNDED && inner(&constraints[i].normal, &step) < -1e-15 && !active[i];
+            let blocked = |i: usize| {
+                room[i] <= ORDER_ROUNDING_TOLERANCE && inner(&constraints[i].normal, &step) < -1e-15 && !active[i]
+            };
             let more: Vec<usize> = (0..constraints.len()).filter(|&i| blocked(i)).collect();
             if more.is_empty() {
                 break;
@@ -258,10 +260,12 @@ impl Problem {
             more.iter().for_each(|&i| active[i] = true);
             let kept = constraints.iter().zip(&active).filter(|(_, active)| **active);
             let normals: Vec<Vec<f64>> = kept.map(|(c, _)| c.normal.clone()).collect();
-            let dense::Singular { left: basis, sizes, .. } = dense::singular(&normals)
+            let dense::SingularValues { left: basis, values: sizes, .. } = dense::singular_values(&normals)
                 .ok_or_else(|| Error::Internal { what: "constraints of orders without a basis".into() })?;
             let whole = step.clone();
-            for (direction, _) in basis.iter().zip(&sizes).filter(|(_, size)| **size > ALONG * sizes[0]) {
+            for (direction, _) in
+                basis.iter().zip(&sizes).filter(|(_, size)| **size > DIRECTION_RANK_TOLERANCE * sizes[0])
+            {
                 let along = inner(direction, &whole);
                 step.iter_mut().zip(direction).for_each(|(s, d)| *s -= along * d);
             }
@@ -296,7 +300,7 @@ impl Problem {
                 found.push(Constraint {
                     normal: wide(&|k| of(&equation.order, k) - of(order, k)),
                     offset: equation.order.constant - order.constant,
-                    margin: if own { LEAST_INTEGRATION } else { ROUNDED },
+                    margin: if own { MIN_INTEGRATION_ORDER } else { ORDER_ROUNDING_TOLERANCE },
                 });
                 if own {
                     found.push(Constraint { normal: wide(&|k| of(order, k)), offset: order.constant, margin: 0.0 });
@@ -310,31 +314,31 @@ impl Problem {
 
 /// Candidate of the multistart: optimization result, origin, and origins of merged duplicates.
 #[derive(Debug, Clone, PartialEq)]
-pub struct Runner {
+pub struct Candidate {
     /// Current optimization result.
-    pub attempt: Attempt,
+    pub result: OptimizationResult,
     /// Description of its initial guess.
     pub origin: String,
     /// Origins of merged duplicates.
-    pub alike: Vec<String>,
+    pub duplicates: Vec<String>,
 }
 
-impl Runner {
+impl Candidate {
     /// Candidate before its first optimization.
     #[must_use]
-    pub fn at(place: Place, origin: impl Into<String>) -> Self {
-        Self { attempt: Attempt::unrun(place), origin: origin.into(), alike: Vec::new() }
+    pub fn at(place: Iterate, origin: impl Into<String>) -> Self {
+        Self { result: OptimizationResult::initial_result(place), origin: origin.into(), duplicates: Vec::new() }
     }
 
     /// Candidate with a new optimization result.
     #[must_use]
-    pub fn moved(&self, attempt: Attempt) -> Self {
-        Self { attempt, ..self.clone() }
+    pub fn with_result(&self, attempt: OptimizationResult) -> Self {
+        Self { result: attempt, ..self.clone() }
     }
 
     /// Cost per residual.
     #[must_use]
-    pub fn level(&self) -> f64 {
-        self.attempt.level()
+    pub fn cost_per_residual(&self) -> f64 {
+        self.result.cost_per_residual()
     }
 }

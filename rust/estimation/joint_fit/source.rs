@@ -1,7 +1,7 @@
 //! Source of the runs of a joint fit, sampled on a requested grid.
 
 use crate::error::{check_length, check_points, check_step, Error, Result};
-use crate::estimation::output_error::{Experiment, Instant};
+use crate::estimation::output_error::{Experiment, PointValues};
 use crate::regressors::Record;
 use crate::signal::block_pulse::{pulse_means, Intersample};
 
@@ -23,11 +23,11 @@ pub trait Source {
 #[derive(Debug, Clone, Copy, PartialEq, Eq, Hash)]
 pub struct Sampling {
     /// Block pulses per sampling interval.
-    pub every: usize,
+    pub pulses_per_sample: usize,
     /// Decimation factor of the samples.
     pub decimation: usize,
     /// Number of leading sampling intervals of each run to use; None for all.
-    pub first: Option<usize>,
+    pub leading_intervals: Option<usize>,
 }
 
 impl Sampling {
@@ -36,7 +36,9 @@ impl Sampling {
     /// # Errors
     /// [`Error::OutOfRange`].
     pub fn check(self) -> Result<()> {
-        for (name, number) in [("pulses a sample interval", self.every), ("samples that become one", self.decimation)] {
+        for (name, number) in
+            [("pulses a sample interval", self.pulses_per_sample), ("samples that become one", self.decimation)]
+        {
             check_points(name, number)?;
             if number == 0 {
                 let (value, range) = (0.0, "[1, ∞)".into());
@@ -49,7 +51,7 @@ impl Sampling {
 
 impl Default for Sampling {
     fn default() -> Self {
-        Self { every: 1, decimation: 1, first: None }
+        Self { pulses_per_sample: 1, decimation: 1, leading_intervals: None }
     }
 }
 
@@ -80,7 +82,7 @@ pub struct Signal {
     /// Sample values.
     pub samples: Vec<f64>,
     /// Behavior between the samples.
-    pub between: Intersample,
+    pub intersample: Intersample,
 }
 
 /// Runs of signals sampled at the same uniform times, without gaps and without a sensor filter.
@@ -98,13 +100,13 @@ pub struct Signal {
 /// # }
 /// ```
 #[derive(Debug, Clone, PartialEq)]
-pub struct Sampled {
+pub struct SampledRuns {
     step: f64,
     outputs: Vec<usize>,
     runs: Vec<Vec<Signal>>,
 }
 
-impl Sampled {
+impl SampledRuns {
     /// Runs of one sampling interval, with the signals in the same sequence and the indices of the outputs.
     ///
     /// # Errors
@@ -123,7 +125,7 @@ impl Sampled {
     }
 }
 
-impl Source for Sampled {
+impl Source for SampledRuns {
     #[allow(clippy::cast_precision_loss)]
     fn spans(&self) -> Vec<(f64, f64)> {
         self.runs.iter().map(|run| (self.step, run[0].samples.len() as f64 * self.step)).collect()
@@ -131,29 +133,31 @@ impl Source for Sampled {
 
     #[allow(clippy::cast_precision_loss)]
     fn experiments(&self, sampling: Sampling) -> Result<Vec<Experiment>> {
-        let Sampling { every, decimation, first } = sampling;
+        let Sampling { pulses_per_sample: every, decimation, leading_intervals: first } = sampling;
         let decimation = decimation.max(1);
         let of = |run: &Vec<Signal>| {
             let all = run[0].samples.len() - 1;
             let intervals = first.map_or(all, |first| first.min(all)) / decimation;
             let rows = intervals * decimation + 1;
-            let means = run.iter().map(|s| pulse_means(&s.samples[..rows], intervals * every, s.between));
+            let means = run.iter().map(|s| pulse_means(&s.samples[..rows], intervals * every, s.intersample));
             let step = self.step * decimation as f64 / every.max(1) as f64;
             let record = Record::new(step, means.collect::<Result<_>>()?, None)?;
             let kept = |s: &Signal| s.samples[..rows].iter().copied().step_by(decimation).collect::<Vec<_>>();
-            let instants = run.iter().map(|s| Instant { values: Some(kept(s)), held: s.between == Intersample::Hold });
+            let instants = run
+                .iter()
+                .map(|s| PointValues { values: Some(kept(s)), is_zero_order_hold: s.intersample == Intersample::Hold });
             let instants = instants.collect();
             let samples = self.outputs.iter().map(|&output| kept(&run[output])).collect();
-            Experiment::new(record, every, samples, vec![1.0; self.outputs.len()])?.with_instants(instants)
+            Experiment::new(record, every, samples, vec![1.0; self.outputs.len()])?.with_point_values(instants)
         };
         self.runs.iter().map(of).collect()
     }
 }
 
-impl Recordings for Sampled {
+impl Recordings for SampledRuns {
     fn inputs(&self) -> Vec<Option<Intersample>> {
         let signals = self.runs.first().into_iter().flatten().enumerate();
-        signals.map(|(i, signal)| (!self.outputs.contains(&i)).then_some(signal.between)).collect()
+        signals.map(|(i, signal)| (!self.outputs.contains(&i)).then_some(signal.intersample)).collect()
     }
 
     fn samples(&self, signal: usize) -> Result<Vec<Vec<f64>>> {
@@ -166,7 +170,7 @@ impl Recordings for Sampled {
     fn records(&self, m: usize, inputs: &[f64]) -> Result<Vec<Record>> {
         check_length("free numbers of inputs", 0, inputs.len())?;
         let of = |run: &Vec<Signal>| {
-            let means = run.iter().map(|s| pulse_means(&s.samples, m, s.between)).collect::<Result<_>>()?;
+            let means = run.iter().map(|s| pulse_means(&s.samples, m, s.intersample)).collect::<Result<_>>()?;
             let duration = self.step * (run[0].samples.len() - 1) as f64;
             Record::new(duration / m.max(1) as f64, means, None)
         };

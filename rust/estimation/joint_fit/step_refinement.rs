@@ -1,46 +1,46 @@
 //! Step refinement: the step is halved until the estimate changes by a small part of its standard error.
 
 use super::covariance::covariance;
-use super::objective::{Grid, Weights, FINEST};
-use super::parameter_set::Clock;
-use super::problem::{Attempt, Place};
-use super::reweighting::{settled, Loss, Robust};
+use super::objective::{Objective, Weights, MAX_PULSES_PER_SAMPLE};
+use super::parameter_set::TimeScaling;
+use super::problem::{Iterate, OptimizationResult};
+use super::reweighting::{fit_reweighted, Loss, RobustSummary};
 use crate::error::{Error, Result};
 use crate::estimation::output_error::Status;
 use crate::signal::statistics::inner;
 
 /// Change of an estimate, or of its extrapolation to zero step, below which the refinement has converged.
-const REFINED: f64 = 0.1;
+const MAX_CHANGE_STANDARD_ERRORS: f64 = 0.1;
 /// Increase of the log residuals by halving the step above which other survivors are tried on the finer grid.
-const ROSE: f64 = 5e-4;
+const MAX_LOG_RESIDUAL_INCREASE: f64 = 5e-4;
 
 /// Optimum on the finest grid, and its extrapolation to zero step.
 #[derive(Clone)]
 pub struct Optimum<'a> {
     /// The optimum of the finest grid.
-    pub attempt: Attempt,
+    pub attempt: OptimizationResult,
     /// That grid.
-    pub grid: Grid<'a>,
+    pub grid: Objective<'a>,
     /// Parameters extrapolated to zero step from two grids.
     pub estimate: Vec<f64>,
     /// True if halving the step changed no estimate by more than a tenth of its standard error.
-    pub settled: bool,
+    pub step_converged: bool,
     covariance: Vec<f64>,
 }
 
 /// Optimum with its covariance, noise levels and residuals.
 #[derive(Debug, Clone, PartialEq)]
-pub struct Finished {
+pub struct OptimumStatistics {
     /// The optimum of the finest grid.
-    pub attempt: Attempt,
+    pub attempt: OptimizationResult,
     /// Weights at the optimum.
     pub weights: Weights,
     /// Block pulses per sampling interval of that grid.
-    pub every: usize,
+    pub pulses_per_sample: usize,
     /// Parameters extrapolated to zero step, within bounds.
     pub estimate: Vec<f64>,
     /// True if halving the step changed no estimate by more than a tenth of its standard error.
-    pub settled: bool,
+    pub step_converged: bool,
     /// Row-major covariance of the parameters.
     pub covariance: Vec<f64>,
     /// Standard deviation of the residuals by output; with a robust loss from the median absolute residual.
@@ -48,7 +48,7 @@ pub struct Finished {
     /// Residuals in units of the noise by run and output; NaN for missing samples.
     pub residuals: Vec<Vec<Vec<f64>>>,
     /// Counts of downweighted residuals of a robust loss; None for squares.
-    pub robust: Option<Robust>,
+    pub robust: Option<RobustSummary>,
 }
 
 /// Halve the step until the estimate changes by a small part of its standard error.
@@ -58,24 +58,30 @@ pub struct Finished {
 ///
 /// # Errors
 /// As [`fit_reweighted`] and [`covariance`].
-pub fn refined<'a>(best: Attempt, grid: Grid<'a>, loss: Loss, others: &[Place]) -> Result<Optimum<'a>> {
-    let clock = grid.clock();
+pub fn refine_step<'a>(
+    best: OptimizationResult,
+    grid: Objective<'a>,
+    loss: Loss,
+    others: &[Iterate],
+) -> Result<Optimum<'a>> {
+    let clock = grid.time_scaling();
     let (mut best, mut grid, mut others) = (best, grid, others);
-    let (mut estimate, mut still, mut before) = (best.values(), false, None::<Attempt>);
+    let (mut estimate, mut still, mut before) = (best.values(), false, None::<OptimizationResult>);
     let mut spread = None;
-    while !still && grid.sampling.every < FINEST {
+    while !still && grid.sampling.pulses_per_sample < MAX_PULSES_PER_SAMPLE {
         // Residuals can shrink to the noise on a finer grid, so the weights are iterated again.
         let half = grid.finer()?;
-        let start = expected(&half, &clock, &best, before.as_ref())?;
-        let (finer, fine) = match settled(&start, half.clone(), loss) {
+        let start = extrapolated_start(&half, &clock, &best, before.as_ref())?;
+        let (finer, fine) = match fit_reweighted(&start, half.clone(), loss) {
             // The extrapolated start may have no finite simulation.
-            Err(error) if error != Error::Interrupted => settled(&best.place, half, loss)?,
+            Err(error) if error != Error::Interrupted => fit_reweighted(&best.iterate, half, loss)?,
             found => found?,
         };
-        let rose = likelihood(&finer, &fine) > likelihood(&best, &grid) + ROSE;
+        let rose =
+            negative_log_likelihood(&finer, &fine) > negative_log_likelihood(&best, &grid) + MAX_LOG_RESIDUAL_INCREASE;
         let mut fine = fine;
-        if (finer.status == Status::Wall && before.is_none()) || (rose && !others.is_empty()) {
-            let freed = freed(&finer, &fine, others, loss)?;
+        if (finer.status == Status::DomainLimit && before.is_none()) || (rose && !others.is_empty()) {
+            let freed = best_alternative(&finer, &fine, others, loss)?;
             // The other survivors are tried once.
             others = &[];
             if let Some((other, there)) = freed {
@@ -89,24 +95,24 @@ pub fn refined<'a>(best: Attempt, grid: Grid<'a>, loss: Loss, others: &[Place]) 
         std::mem::swap(&mut grid, &mut fine);
         let (there, here) = (finer.values(), best.values());
         let found = covariance(&finer, &grid)?;
-        let errors = clock.errors(&there, &found);
+        let errors = clock.standard_errors(&there, &found);
         // The scheme is of second order: Richardson extrapolation of two grids gives the limit, a third grid confirms
         // it. Optimizations that did not converge cannot be extrapolated.
         let mut limit = there.clone();
-        if finer.converged() && best.converged() {
-            limit = beyond(&grid, &clock, &there, &here, 3.0)?;
+        if finer.has_converged() && best.has_converged() {
+            limit = extrapolate(&grid, &clock, &there, &here, 3.0)?;
         }
         let moved = |one: &[f64], other: &[f64]| {
-            let ways = clock.told(one).into_iter().zip(clock.told(other));
-            ways.zip(&errors).all(|((a, b), error)| (a - b).abs() <= REFINED * error)
+            let ways = clock.to_scaled(one).into_iter().zip(clock.to_scaled(other));
+            ways.zip(&errors).all(|((a, b), error)| (a - b).abs() <= MAX_CHANGE_STANDARD_ERRORS * error)
         };
         still = moved(&limit, &estimate) || moved(&there, &here);
         estimate = limit;
         (before, best, spread) = (Some(best), finer, Some(found));
     }
     let spread = spread.map_or_else(|| covariance(&best, &grid), Ok)?;
-    let estimate = nearer(&best, &grid, estimate, &clock, still)?;
-    Ok(Optimum { attempt: best, grid, estimate, settled: still, covariance: spread })
+    let estimate = select_limit_or_optimum(&best, &grid, estimate, &clock, still)?;
+    Ok(Optimum { attempt: best, grid, estimate, step_converged: still, covariance: spread })
 }
 
 impl<'a> Optimum<'a> {
@@ -114,46 +120,57 @@ impl<'a> Optimum<'a> {
     ///
     /// # Errors
     /// As [`covariance`].
-    pub fn unrefined(attempt: Attempt, grid: Grid<'a>) -> Result<Self> {
+    pub fn without_refinement(attempt: OptimizationResult, grid: Objective<'a>) -> Result<Self> {
         let covariance = covariance(&attempt, &grid)?;
-        Ok(Self { estimate: attempt.values(), settled: true, covariance, attempt, grid })
+        Ok(Self { estimate: attempt.values(), step_converged: true, covariance, attempt, grid })
     }
 
     /// Compute covariance, noise levels and residuals of the optimum.
     #[must_use]
-    pub fn finished(self) -> Finished {
-        let Self { attempt, grid, estimate, settled, covariance } = self;
-        let robust = grid.weights.shares.is_some();
-        let levels = if robust { grid.scales(&attempt) } else { grid.levels(&attempt) };
+    pub fn into_statistics(self) -> OptimumStatistics {
+        let Self { attempt, grid, estimate, step_converged: settled, covariance } = self;
+        let robust = grid.weights.robust_weights.is_some();
+        let levels = if robust { grid.residual_scales(&attempt) } else { grid.residual_root_mean_squares(&attempt) };
         let inside = |(value, (low, high)): (f64, (f64, f64))| value.clamp(low, high);
-        Finished {
+        OptimumStatistics {
             estimate: estimate.into_iter().zip(grid.problem.bounds()).map(inside).collect(),
             noise: levels.iter().zip(&grid.weights.outputs).map(|(level, weight)| level / weight).collect(),
             residuals: grid.residuals(&attempt),
-            robust: robust.then(|| Robust::of(&grid, &attempt)),
+            robust: robust.then(|| RobustSummary::from_result(&grid, &attempt)),
             weights: grid.weights,
-            every: grid.sampling.every,
+            pulses_per_sample: grid.sampling.pulses_per_sample,
             attempt,
-            settled,
+            step_converged: settled,
             covariance,
         }
     }
 }
 
 /// Extrapolate two grids beyond the finer one, by the difference divided by `share`.
-fn beyond(grid: &Grid<'_>, clock: &Clock, fine: &[f64], coarse: &[f64], share: f64) -> Result<Vec<f64>> {
-    let (fine, coarse) = (clock.told(fine), clock.told(coarse));
+fn extrapolate(
+    grid: &Objective<'_>,
+    clock: &TimeScaling,
+    fine: &[f64],
+    coarse: &[f64],
+    share: f64,
+) -> Result<Vec<f64>> {
+    let (fine, coarse) = (clock.to_scaled(fine), clock.to_scaled(coarse));
     let ahead: Vec<f64> = fine.iter().zip(&coarse).map(|(f, c)| f + (f - c) / share).collect();
-    Ok(clock.untold(&grid.problem.feasible(&fine, &ahead)?))
+    Ok(clock.from_scaled(&grid.problem.last_feasible_point(&fine, &ahead)?))
 }
 
 /// Start on half the step: the optimum is expected to move a quarter as far as at the last halving.
-fn expected(grid: &Grid<'_>, clock: &Clock, best: &Attempt, before: Option<&Attempt>) -> Result<Place> {
+fn extrapolated_start(
+    grid: &Objective<'_>,
+    clock: &TimeScaling,
+    best: &OptimizationResult,
+    before: Option<&OptimizationResult>,
+) -> Result<Iterate> {
     match before {
-        Some(before) if best.converged() && before.converged() => {
-            Ok(best.at(&beyond(grid, clock, &best.values(), &before.values(), 4.0)?))
+        Some(before) if best.has_converged() && before.has_converged() => {
+            Ok(best.iterate_at(&extrapolate(grid, clock, &best.values(), &before.values(), 4.0)?))
         }
-        _ => Ok(best.place.clone()),
+        _ => Ok(best.iterate.clone()),
     }
 }
 
@@ -163,21 +180,21 @@ fn expected(grid: &Grid<'_>, clock: &Clock, best: &Attempt, before: Option<&Atte
 ///
 /// # Errors
 /// [`Error::Interrupted`].
-pub fn freed<'a>(
-    stuck: &Attempt,
-    grid: &Grid<'a>,
-    others: &[Place],
+pub fn best_alternative<'a>(
+    stuck: &OptimizationResult,
+    grid: &Objective<'a>,
+    others: &[Iterate],
     loss: Loss,
-) -> Result<Option<(Attempt, Grid<'a>)>> {
-    let (mut best, mut least) = (None, likelihood(stuck, grid));
+) -> Result<Option<(OptimizationResult, Objective<'a>)>> {
+    let (mut best, mut least) = (None, negative_log_likelihood(stuck, grid));
     for other in others {
-        let there = match settled(other, grid.clone(), loss) {
+        let there = match fit_reweighted(other, grid.clone(), loss) {
             Err(Error::Interrupted) => return Err(Error::Interrupted),
             Err(_) => continue,
             Ok(there) => there,
         };
-        let level = likelihood(&there.0, &there.1);
-        if level < least && !(grid.steady && grid.problem.grows(&there.0.place.point)) {
+        let level = negative_log_likelihood(&there.0, &there.1);
+        if level < least && !(grid.requires_stability && grid.problem.is_unstable(&there.0.iterate.point)) {
             (best, least) = (Some(there), level);
         }
     }
@@ -185,32 +202,42 @@ pub fn freed<'a>(
 }
 
 /// Negative log-likelihood per sample, up to a constant.
-fn likelihood(attempt: &Attempt, grid: &Grid<'_>) -> f64 {
-    grid.levels(attempt).iter().zip(&grid.weights.outputs).map(|(level, w)| libm::log(level.max(1e-300) / w)).sum()
+fn negative_log_likelihood(attempt: &OptimizationResult, grid: &Objective<'_>) -> f64 {
+    grid.residual_root_mean_squares(attempt)
+        .iter()
+        .zip(&grid.weights.outputs)
+        .map(|(level, w)| libm::log(level.max(1e-300) / w))
+        .sum()
 }
 
 /// Select the extrapolated limit or the optimum of the finer grid, whichever fits better on half the step.
 ///
 /// Extrapolation along a straight line leaves a flat curved valley of poorly determined parameters. If the residuals
 /// are linear along the line and the grids agree, the limit is better.
-fn nearer(best: &Attempt, grid: &Grid<'_>, limit: Vec<f64>, clock: &Clock, settled: bool) -> Result<Vec<f64>> {
+fn select_limit_or_optimum(
+    best: &OptimizationResult,
+    grid: &Objective<'_>,
+    limit: Vec<f64>,
+    clock: &TimeScaling,
+    settled: bool,
+) -> Result<Vec<f64>> {
     let here = best.values();
-    let moved: Vec<f64> = clock.told(&limit).iter().zip(clock.told(&here)).map(|(a, b)| a - b).collect();
+    let moved: Vec<f64> = clock.to_scaled(&limit).iter().zip(clock.to_scaled(&here)).map(|(a, b)| a - b).collect();
     let mut way = vec![0.0; best.residuals.len()];
     for (by, column) in clock.step(&here, &moved).iter().zip(&best.jacobian) {
         way.iter_mut().zip(column).for_each(|(sum, slope)| *sum += by * slope);
     }
     let length = |row: &[f64]| inner(row, row).sqrt();
-    if inner(&way, &way) <= REFINED * REFINED {
+    if inner(&way, &way) <= MAX_CHANGE_STANDARD_ERRORS * MAX_CHANGE_STANDARD_ERRORS {
         // Both have the same residuals.
         return Ok(limit);
     }
-    let ahead = best.at(&limit);
+    let ahead = best.iterate_at(&limit);
     if settled {
-        if let Some(there) = grid.evaluated(&ahead)? {
+        if let Some(there) = grid.evaluate(&ahead)? {
             let told = best.residuals.iter().zip(&way).map(|(e, w)| e + w);
             let bent: Vec<f64> = there.residuals.iter().zip(told).map(|(e, told)| e - told).collect();
-            if length(&bent) <= REFINED * length(&way) {
+            if length(&bent) <= MAX_CHANGE_STANDARD_ERRORS * length(&way) {
                 return Ok(limit);
             }
         }
@@ -222,8 +249,8 @@ fn nearer(best: &Attempt, grid: &Grid<'_>, limit: Vec<f64>, clock: &Clock, settl
         Err(_) => return Ok(limit),
     };
     let mut costs = [f64::INFINITY; 2];
-    for (cost, place) in costs.iter_mut().zip([&ahead, &best.place]) {
-        if let Some(there) = finer.evaluated(place)? {
+    for (cost, place) in costs.iter_mut().zip([&ahead, &best.iterate]) {
+        if let Some(there) = finer.evaluate(place)? {
             *cost = there.cost;
         }
     }

@@ -8,7 +8,7 @@ use crate::estimation::output_error::FreeInput;
 use crate::fractional::kernels::{MAX_EXCESS, MIN_INPUT_ORDER};
 
 /// Difference below which two orders are equal.
-const GRAIN: f64 = 1e-9;
+const ORDER_TOLERANCE: f64 = 1e-9;
 
 /// Coefficient of a term: free or fixed.
 #[derive(Debug, Clone, PartialEq)]
@@ -29,7 +29,7 @@ impl Coefficient {
         }
     }
 
-    fn with(&self, values: &BTreeMap<String, f64>) -> Self {
+    fn substitute(&self, values: &BTreeMap<String, f64>) -> Self {
         self.name().and_then(|name| values.get(name)).map_or_else(|| self.clone(), |&value| Self::Known(value))
     }
 }
@@ -50,7 +50,7 @@ pub struct Term {
 impl Term {
     /// Value of factor · coefficient if fixed; None if free.
     #[must_use]
-    pub fn fixed(&self) -> Option<f64> {
+    pub fn fixed_coefficient(&self) -> Option<f64> {
         match self.coefficient {
             Coefficient::Known(value) => Some(self.factor * value),
             Coefficient::Free(_) => None,
@@ -60,7 +60,7 @@ impl Term {
 
 /// Friction parameters fc, fs and vs of the output of an equation, each a factor times a coefficient.
 #[derive(Debug, Clone, PartialEq)]
-pub struct Rubs {
+pub struct FrictionParameters {
     /// fc.
     pub coulomb: (f64, Coefficient),
     /// fs; 0 without a Stribeck effect.
@@ -69,8 +69,8 @@ pub struct Rubs {
     pub speed: (f64, Coefficient),
 }
 
-impl Rubs {
-    pub(super) fn numbers(&self) -> [&(f64, Coefficient); 3] {
+impl FrictionParameters {
+    pub(super) fn parameters(&self) -> [&(f64, Coefficient); 3] {
         [&self.coulomb, &self.stribeck, &self.speed]
     }
 }
@@ -85,13 +85,13 @@ pub struct Equation {
     /// The right-hand side.
     pub terms: Vec<Term>,
     /// Friction on the velocity of the output, if any.
-    pub friction: Option<Rubs>,
+    pub friction: Option<FrictionParameters>,
 }
 
 impl Equation {
     /// Names of the free coefficients in order of appearance, friction last.
     pub fn coefficient_names(&self) -> impl Iterator<Item = &String> {
-        let rubs = self.friction.iter().flat_map(|rubs| rubs.numbers()).filter_map(|(_, number)| number.name());
+        let rubs = self.friction.iter().flat_map(|rubs| rubs.parameters()).filter_map(|(_, number)| number.name());
         self.terms.iter().filter_map(|term| term.coefficient.name()).chain(rubs)
     }
 
@@ -101,12 +101,12 @@ impl Equation {
     }
 
     /// Terms of its own output.
-    pub fn own(&self) -> impl Iterator<Item = &Term> {
+    pub fn autoregressive_terms(&self) -> impl Iterator<Item = &Term> {
         self.terms.iter().filter(|term| term.signal == self.output)
     }
 
     /// Terms of other signals.
-    pub fn driving(&self) -> impl Iterator<Item = &Term> {
+    pub fn input_terms(&self) -> impl Iterator<Item = &Term> {
         self.terms.iter().filter(|term| term.signal != self.output)
     }
 
@@ -127,7 +127,7 @@ impl Equation {
             let fits = if term.signal == self.output {
                 (0.0..alpha).contains(&order)
             } else {
-                order >= MIN_INPUT_ORDER && order < alpha + MAX_EXCESS - GRAIN
+                order >= MIN_INPUT_ORDER && order < alpha + MAX_EXCESS - ORDER_TOLERANCE
             };
             if !fits {
                 let what = format!("order {order} of signal {} beside alpha = {alpha}", term.signal);
@@ -166,7 +166,7 @@ pub struct Hints {
     /// Typical values besides integer orders, by order name.
     pub natural: BTreeMap<String, Vec<f64>>,
     /// Physical lower bound of each ratio of the coefficient law; default 1.
-    pub exceeds: BTreeMap<String, f64>,
+    pub ratio_lower_bounds: BTreeMap<String, f64>,
     /// Coefficients tied by the law to another equation and positive by physics.
     pub positive: BTreeSet<String>,
     /// Approximate physical values of coefficients.
@@ -262,8 +262,8 @@ impl Structure {
     pub fn with_orders(&self, values: &BTreeMap<String, f64>) -> Result<Self> {
         let mut out = self.clone();
         for equation in &mut out.equations {
-            equation.order = equation.order.partly(values);
-            equation.terms.iter_mut().for_each(|term| term.order = term.order.partly(values));
+            equation.order = equation.order.substitute(values);
+            equation.terms.iter_mut().for_each(|term| term.order = term.order.substitute(values));
         }
         out.bounds.retain(|name, _| !values.contains_key(name));
         out.check()?;
@@ -275,10 +275,10 @@ impl Structure {
     pub fn with_coefficients(&self, values: &BTreeMap<String, f64>) -> Self {
         let mut out = self.clone();
         for equation in &mut out.equations {
-            equation.terms.iter_mut().for_each(|term| term.coefficient = term.coefficient.with(values));
+            equation.terms.iter_mut().for_each(|term| term.coefficient = term.coefficient.substitute(values));
             if let Some(rubs) = &mut equation.friction {
                 for (_, number) in [&mut rubs.coulomb, &mut rubs.stribeck, &mut rubs.speed] {
-                    *number = number.with(values);
+                    *number = number.substitute(values);
                 }
             }
         }
@@ -360,7 +360,7 @@ impl Order {
 
     /// Substitute values for some free orders.
     #[must_use]
-    pub fn partly(&self, values: &BTreeMap<String, f64>) -> Self {
+    pub fn substitute(&self, values: &BTreeMap<String, f64>) -> Self {
         let known = self.weights.iter().filter_map(|(name, weight)| values.get(name).map(|value| weight * value));
         let constant = tidy(self.constant + known.sum::<f64>());
         let weights = self.weights.iter().filter(|(name, _)| !values.contains_key(name)).cloned().collect();

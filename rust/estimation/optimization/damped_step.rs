@@ -14,12 +14,12 @@ use crate::linalg::orthogonal::norm;
 use crate::linalg::small::{self, back_substitute};
 
 /// Smallest damping; below it the rounding error of the factor dominates.
-pub(crate) const LEAST_DAMPING: f64 = 1e-12;
+pub(crate) const MIN_DAMPING: f64 = 1e-12;
 
 /// Linearization of a problem at a point: R of [J | e] with J in coordinates and unit columns, and the free parameters.
 ///
 /// Eliminated parameters come first, so that the lower part of R belongs to the others with these projected out.
-pub(crate) struct Linear {
+pub(crate) struct LinearizedProblem {
     r: Vec<f64>,
     /// Parameter of each column.
     order: Vec<usize>,
@@ -28,16 +28,16 @@ pub(crate) struct Linear {
     /// Products of the unit columns with the residuals.
     gradient: Vec<f64>,
     /// Distances from the bounds, in scaled steps.
-    room: Vec<(f64, f64)>,
+    distance_to_bounds: Vec<(f64, f64)>,
     /// True for parameters excluded from the steps.
-    held: Vec<bool>,
+    is_fixed: Vec<bool>,
     /// Number of eliminated parameters.
-    pub(crate) projected: usize,
+    pub(crate) eliminated_count: usize,
     /// Norm of the residuals.
     pub(crate) norm: f64,
 }
 
-impl Linear {
+impl LinearizedProblem {
     pub(crate) fn at<P: Problem>(
         problem: &P,
         point: &P::Point,
@@ -45,15 +45,15 @@ impl Linear {
         residuals: &[f64],
         corners: bool,
     ) -> Self {
-        let (mut order, rest): (Vec<usize>, Vec<usize>) = (0..jacobian.len()).partition(|&i| problem.projected(i));
-        let projected = order.len();
+        let (mut order, rest): (Vec<usize>, Vec<usize>) = (0..jacobian.len()).partition(|&i| problem.is_eliminated(i));
+        let eliminated_count = order.len();
         order.extend(rest);
         let mut columns = Vec::with_capacity(jacobian.len() + 1);
         let mut scales = Vec::with_capacity(jacobian.len());
         for &i in &order {
-            let factor = problem.stretch(point, i);
+            let factor = problem.coordinate_derivative(point, i);
             let mut column: Vec<f64> = jacobian[i].iter().map(|v| v * factor).collect();
-            for (other, slope) in problem.carried(point, i) {
+            for (other, slope) in problem.coupled_derivatives(point, i) {
                 column.iter_mut().zip(&jacobian[other]).for_each(|(v, w)| *v += slope * w);
             }
             let size = norm(&column);
@@ -65,12 +65,12 @@ impl Linear {
         let gradient: Vec<f64> = columns.iter().map(|c| c.iter().zip(residuals).map(|(j, e)| j * e).sum()).collect();
         columns.push(residuals.to_vec());
         let scaled = |(down, up): (f64, f64), scale: f64| (down * scale, up * scale);
-        let room: Vec<(f64, f64)> =
-            order.iter().zip(&scales).map(|(&i, &scale)| scaled(problem.room(point, i), scale)).collect();
-        let held = (room.iter().zip(&gradient).enumerate())
+        let distance_to_bounds: Vec<(f64, f64)> =
+            order.iter().zip(&scales).map(|(&i, &scale)| scaled(problem.distance_to_bounds(point, i), scale)).collect();
+        let is_fixed = (distance_to_bounds.iter().zip(&gradient).enumerate())
             .map(|(place, (&(down, up), &g))| {
                 let out = if g > 0.0 { down <= 0.0 } else { up <= 0.0 };
-                out || scales[place] <= 0.0 || (corners && problem.kinked(point, order[place]))
+                out || scales[place] <= 0.0 || (corners && problem.has_kinks(point, order[place]))
             })
             .collect();
         Self {
@@ -78,45 +78,47 @@ impl Linear {
             order,
             scales,
             gradient,
-            room,
-            held,
-            projected,
+            distance_to_bounds,
+            is_fixed,
+            eliminated_count,
             norm: norm(residuals),
         }
     }
 
     /// Largest gradient component of a free parameter.
-    pub(crate) fn slope(&self) -> f64 {
-        self.gradient.iter().zip(&self.held).filter(|(_, held)| !**held).fold(0.0, |a, (g, _)| a.max(g.abs()))
+    pub(crate) fn max_gradient(&self) -> f64 {
+        self.gradient.iter().zip(&self.is_fixed).filter(|(_, held)| !**held).fold(0.0, |a, (g, _)| a.max(g.abs()))
     }
 
     /// Minimize ‖J s + e‖² + λ‖s‖² over the free parameters within bounds; return the step and its relative decrease of
     /// the cost.
-    pub(crate) fn step(&self, damping: f64) -> (Vec<f64>, f64) {
-        let step = self.within(|held| Some(damped_step(&self.r, held, self.projected, damping))).unwrap_or_default();
-        let falls = self.falls(&step, 0);
+    pub(crate) fn damped_step_and_decrease(&self, damping: f64) -> (Vec<f64>, f64) {
+        let step = self
+            .step_within_bounds(|held| Some(triangular_damped_step(&self.r, held, self.eliminated_count, damping)))
+            .unwrap_or_default();
+        let falls = self.predicted_decrease(&step, 0);
         (step, falls)
     }
 
     /// Step with secant curvature over the parameters that are not eliminated; None if the model has no minimum.
     pub(crate) fn curved_step(&self, damping: f64, curvature: &Curvature) -> Option<(Vec<f64>, f64)> {
-        let step = self.within(|held| self.curved(held, damping, curvature))?;
-        let falls = self.falls(&step, self.projected) - self.bent(&step, curvature);
+        let step = self.step_within_bounds(|held| self.minimize_with_curvature(held, damping, curvature))?;
+        let falls = self.predicted_decrease(&step, self.eliminated_count) - self.curvature_change(&step, curvature);
         Some((step, falls))
     }
 
     /// Relative increase of the cost along a scaled step by the secant curvature.
-    pub(crate) fn bent(&self, step: &[f64], curvature: &Curvature) -> f64 {
-        curvature.along(&self.unscaled(step)) / (self.norm * self.norm).max(f64::MIN_POSITIVE)
+    pub(crate) fn curvature_change(&self, step: &[f64], curvature: &Curvature) -> f64 {
+        curvature.quadratic_form(&self.to_coordinates(step)) / (self.norm * self.norm).max(f64::MIN_POSITIVE)
     }
 
     /// Step of the free parameters within bounds, by an active-set iteration.
-    fn within(&self, step_of: impl Fn(&[bool]) -> Option<Vec<f64>>) -> Option<Vec<f64>> {
-        let mut held = self.held.clone();
+    fn step_within_bounds(&self, step_of: impl Fn(&[bool]) -> Option<Vec<f64>>) -> Option<Vec<f64>> {
+        let mut held = self.is_fixed.clone();
         let mut step = loop {
             let step = step_of(&held)?;
             let out = (0..step.len()).find(|&i| {
-                let (down, up) = self.room[i];
+                let (down, up) = self.distance_to_bounds[i];
                 !held[i] && ((step[i] < 0.0 && down <= 0.0) || (step[i] > 0.0 && up <= 0.0))
             });
             match out {
@@ -124,12 +126,14 @@ impl Linear {
                 None => break step,
             }
         };
-        step.iter_mut().zip(&self.room).for_each(|(s, &(down, up))| *s = s.max(-down.max(0.0)).min(up.max(0.0)));
+        step.iter_mut()
+            .zip(&self.distance_to_bounds)
+            .for_each(|(s, &(down, up))| *s = s.max(-down.max(0.0)).min(up.max(0.0)));
         Some(step)
     }
 
     /// Relative decrease of the cost along a step predicted by JᵀJ, with the columns before `first` projected out.
-    pub(crate) fn falls(&self, step: &[f64], first: usize) -> f64 {
+    pub(crate) fn predicted_decrease(&self, step: &[f64], first: usize) -> f64 {
         let k = step.len();
         let image = |i: usize| (i..k).map(|j| self.r[i * (k + 1) + j] * step[j]).sum::<f64>();
         let (moved, along) = (first..k)
@@ -144,8 +148,8 @@ impl Linear {
         let scaled: Vec<f64> = self.order.iter().zip(&self.scales).map(|(&i, scale)| step[i] * scale).collect();
         let images: Vec<f64> = (0..k)
             .map(|i| {
-                let image = (i.max(self.projected)..k).map(|j| self.r[i * (k + 1) + j] * scaled[j]).sum::<f64>();
-                if i < self.projected {
+                let image = (i.max(self.eliminated_count)..k).map(|j| self.r[i * (k + 1) + j] * scaled[j]).sum::<f64>();
+                if i < self.eliminated_count {
                     0.0
                 } else {
                     image
@@ -153,7 +157,7 @@ impl Linear {
             })
             .collect();
         let mut out = vec![0.0; k];
-        for (place, (&i, scale)) in self.order.iter().zip(&self.scales).enumerate().skip(self.projected) {
+        for (place, (&i, scale)) in self.order.iter().zip(&self.scales).enumerate().skip(self.eliminated_count) {
             out[i] = scale * (0..=place).map(|l| self.r[l * (k + 1) + place] * images[l]).sum::<f64>();
         }
         out
@@ -162,20 +166,20 @@ impl Linear {
     /// Gradient in coordinates, by parameter; 0 for eliminated parameters.
     pub(crate) fn gradient_by_parameter(&self) -> Vec<f64> {
         let mut out = vec![0.0; self.scales.len()];
-        for (place, &i) in self.order.iter().enumerate().skip(self.projected) {
+        for (place, &i) in self.order.iter().enumerate().skip(self.eliminated_count) {
             out[i] = self.gradient[place] * self.scales[place];
         }
         out
     }
 
     /// Minimize the quadratic model with secant curvature and damping; None if it is not positive definite.
-    fn curved(&self, held: &[bool], damping: f64, curvature: &Curvature) -> Option<Vec<f64>> {
+    fn minimize_with_curvature(&self, held: &[bool], damping: f64, curvature: &Curvature) -> Option<Vec<f64>> {
         let k = held.len();
-        let free: Vec<usize> = (self.projected..k).filter(|&i| !held[i]).collect();
+        let free: Vec<usize> = (self.eliminated_count..k).filter(|&i| !held[i]).collect();
         let count = free.len();
         let product = |i: usize, j: usize| {
             let last = i.min(j);
-            (self.projected..=last).map(|l| self.r[l * (k + 1) + i] * self.r[l * (k + 1) + j]).sum::<f64>()
+            (self.eliminated_count..=last).map(|l| self.r[l * (k + 1) + i] * self.r[l * (k + 1) + j]).sum::<f64>()
         };
         let mut matrix = vec![0.0; count * count];
         let mut target = vec![0.0; count];
@@ -184,7 +188,8 @@ impl Linear {
                 let learnt = curvature.at(self.order[i], self.order[j]) / (self.scales[i] * self.scales[j]);
                 matrix[a * count + b] = product(i, j) + learnt + if a == b { damping } else { 0.0 };
             }
-            target[a] = -(self.projected..=i).map(|l| self.r[l * (k + 1) + i] * self.r[l * (k + 1) + k]).sum::<f64>();
+            target[a] =
+                -(self.eliminated_count..=i).map(|l| self.r[l * (k + 1) + i] * self.r[l * (k + 1) + k]).sum::<f64>();
         }
         let solved = small::positive_solve(&matrix, &target)?;
         let mut step = vec![0.0; k];
@@ -193,7 +198,7 @@ impl Linear {
     }
 
     /// Convert a scaled step to the coordinates, by parameter.
-    pub(crate) fn unscaled(&self, step: &[f64]) -> Vec<f64> {
+    pub(crate) fn to_coordinates(&self, step: &[f64]) -> Vec<f64> {
         let mut out = vec![0.0; step.len()];
         for ((&i, s), scale) in self.order.iter().zip(step).zip(&self.scales) {
             out[i] = if *scale > 0.0 { s / scale } else { 0.0 };
@@ -205,7 +210,7 @@ impl Linear {
 /// Minimize ‖R s + e‖² + λ‖s‖² for the triangular factor of [J | e], with 0 for fixed parameters.
 ///
 /// Eliminated parameters have the smallest damping.
-fn damped_step(r: &[f64], held: &[bool], projected: usize, damping: f64) -> Vec<f64> {
+fn triangular_damped_step(r: &[f64], held: &[bool], projected: usize, damping: f64) -> Vec<f64> {
     let (k, free) = (held.len(), (0..held.len()).filter(|&j| !held[j]).collect::<Vec<_>>());
     if free.is_empty() {
         return vec![0.0; k];
@@ -218,7 +223,7 @@ fn damped_step(r: &[f64], held: &[bool], projected: usize, damping: f64) -> Vec<
             for (i, value) in column.iter_mut().enumerate().take(j + 1) {
                 *value = r[i * (k + 1) + j];
             }
-            column[k + at] = if j < projected { LEAST_DAMPING } else { damping }.sqrt();
+            column[k + at] = if j < projected { MIN_DAMPING } else { damping }.sqrt();
             column
         })
         .collect();
@@ -260,70 +265,70 @@ pub trait Problem {
     fn jacobian(&self, point: &Self::Point, evaluation: &Self::Evaluation) -> Result<Vec<Vec<f64>>>;
 
     /// Move a point by steps in the coordinates, within bounds; return it and the largest relative change.
-    fn moved(&self, point: &Self::Point, steps: &[f64]) -> (Self::Point, f64);
+    fn apply_step(&self, point: &Self::Point, steps: &[f64]) -> (Self::Point, f64);
 
     /// Point of an evaluation, with the eliminated linear parameters at their optimum.
-    fn settled(&self, _evaluation: &Self::Evaluation, point: Self::Point) -> Self::Point {
+    fn point_of_evaluation(&self, _evaluation: &Self::Evaluation, point: Self::Point) -> Self::Point {
         point
     }
 
     /// True if every evaluation eliminates a parameter; its steps need no damping.
-    fn projected(&self, _parameter: usize) -> bool {
+    fn is_eliminated(&self, _parameter: usize) -> bool {
         false
     }
 
     /// Derivative of a parameter with respect to its coordinate.
-    fn stretch(&self, _point: &Self::Point, _parameter: usize) -> f64 {
+    fn coordinate_derivative(&self, _point: &Self::Point, _parameter: usize) -> f64 {
         1.0
     }
 
     /// Derivatives of other parameters with respect to the coordinate of a parameter, as (index, derivative).
-    fn carried(&self, _point: &Self::Point, _parameter: usize) -> Vec<(usize, f64)> {
+    fn coupled_derivatives(&self, _point: &Self::Point, _parameter: usize) -> Vec<(usize, f64)> {
         Vec::new()
     }
 
     /// Distance of a parameter from its lower and upper bound, in its coordinate.
-    fn room(&self, _point: &Self::Point, _parameter: usize) -> (f64, f64) {
+    fn distance_to_bounds(&self, _point: &Self::Point, _parameter: usize) -> (f64, f64) {
         (f64::INFINITY, f64::INFINITY)
     }
 
     /// True if the cost can have kinks along a parameter, so that its gradient need not vanish at a minimum.
-    fn kinked(&self, _point: &Self::Point, _parameter: usize) -> bool {
+    fn has_kinks(&self, _point: &Self::Point, _parameter: usize) -> bool {
         false
     }
 
     /// Norm of the signals whose difference the residuals are; it bounds their rounding error.
-    fn size(&self, _evaluation: &Self::Evaluation) -> f64 {
+    fn signal_norm(&self, _evaluation: &Self::Evaluation) -> f64 {
         0.0
     }
 
     /// True if a point is admissible. No step leads from an admissible point to one that is not.
-    fn trusted(&self, _point: &Self::Point) -> bool {
+    fn is_admissible(&self, _point: &Self::Point) -> bool {
         true
     }
 
     /// True if the minimization may extrapolate along valleys. A multistart disables it, to keep distinct optima.
-    fn leaps(&self) -> bool {
+    fn allows_extrapolation(&self) -> bool {
         true
     }
 }
 /// Ratio of the prediction errors at the last step above which the better model is used for the next one.
-const BETTER: f64 = 1.5;
+const MIN_PREDICTION_IMPROVEMENT: f64 = 1.5;
 /// Relative prediction error below which Gauss–Newton is accurate enough.
-const RIGHT: f64 = 0.1;
+const PREDICTION_TOLERANCE: f64 = 0.1;
 
 /// Secant approximation of the second-order part, in the coordinates of the steps.
 pub(crate) struct Curvature {
     count: usize,
     matrix: Vec<f64>,
-    learnt: bool,
-    pub(crate) used: bool,
+    has_update: bool,
+    pub(crate) is_used: bool,
 }
 
 impl Curvature {
     /// Zero matrix for `count` parameters.
     pub(crate) fn new(count: usize) -> Self {
-        Self { count, matrix: vec![0.0; count * count], learnt: false, used: false }
+        Self { count, matrix: vec![0.0; count * count], has_update: false, is_used: false }
     }
 
     /// True if the matrix has `count` rows.
@@ -341,22 +346,24 @@ impl Curvature {
     }
 
     /// Second-order change of twice the cost along a step, by this matrix.
-    pub(crate) fn along(&self, step: &[f64]) -> f64 {
+    pub(crate) fn quadratic_form(&self, step: &[f64]) -> f64 {
         self.times(step).iter().zip(step).map(|(a, s)| a * s).sum()
     }
 
     /// Decide on the use of the matrix by comparing predictions without and with it to the actual decrease.
-    pub(crate) fn judge(&mut self, without: f64, with: f64, fall: f64) {
+    pub(crate) fn select_model(&mut self, without: f64, with: f64, fall: f64) {
         let (missed, missed_with) = ((without - fall).abs(), (with - fall).abs());
-        if self.used {
-            self.used = missed_with <= BETTER * missed;
+        if self.is_used {
+            self.is_used = missed_with <= MIN_PREDICTION_IMPROVEMENT * missed;
         } else {
-            self.used = self.learnt && missed > RIGHT * fall.abs() && BETTER * missed_with < missed;
+            self.is_used = self.has_update
+                && missed > PREDICTION_TOLERANCE * fall.abs()
+                && MIN_PREDICTION_IMPROVEMENT * missed_with < missed;
         }
     }
 
     /// Update the matrix by a step: `change` of the gradient, and `columns`, the part of it due to JᵀJ.
-    pub(crate) fn learn(&mut self, step: &[f64], change: &[f64], columns: &[f64]) {
+    pub(crate) fn update(&mut self, step: &[f64], change: &[f64], columns: &[f64]) {
         let dot = |a: &[f64], b: &[f64]| a.iter().zip(b).map(|(x, y)| x * y).sum::<f64>();
         let wanted: Vec<f64> = change.iter().zip(columns).map(|(y, c)| y - c).collect();
         let scale = dot(change, step);
@@ -365,7 +372,7 @@ impl Curvature {
             return;
         }
         // Sizing: earlier updates must not exceed the curvature observed along this step.
-        let before = self.along(step);
+        let before = self.quadratic_form(step);
         let sizing = if before == 0.0 { 1.0 } else { (dot(step, &wanted) / before).abs().min(1.0) };
         self.matrix.iter_mut().for_each(|v| *v *= sizing);
         let missing: Vec<f64> = wanted.iter().zip(self.times(step)).map(|(w, s)| w - s).collect();
@@ -376,41 +383,41 @@ impl Curvature {
                     (missing[i] * change[j] + change[i] * missing[j]) / scale - twice * change[i] * change[j];
             }
         }
-        self.learnt = self.matrix.iter().all(|v| v.is_finite());
-        if !self.learnt {
+        self.has_update = self.matrix.iter().all(|v| v.is_finite());
+        if !self.has_update {
             *self = Self::new(self.count);
         }
     }
 }
 /// Number of steps that are extrapolated.
-const STEPS: usize = 4;
+const EXTRAPOLATION_STEPS: usize = 4;
 /// Ratio of the norm of the sum of the steps to the sum of their norms below which they have no common direction.
-const STRAIGHT: f64 = 0.8;
+const MIN_STRAIGHTNESS: f64 = 0.8;
 /// Relative decrease of the cost per step above which no extrapolation is needed.
-const CREEPS: f64 = 1e-3;
+const MAX_GAIN_PER_STEP: f64 = 1e-3;
 /// Evaluations after an extrapolation within which the cost must decrease.
-const PATIENCE: usize = 6;
+const MAX_TRIAL_EVALUATIONS: usize = 6;
 /// Factor of the sum of the steps, initially and at most.
-const REACH: f64 = 2.0;
-const FARTHEST: f64 = 16.0;
+const INITIAL_EXTRAPOLATION_FACTOR: f64 = 2.0;
+const MAX_EXTRAPOLATION_FACTOR: f64 = 16.0;
 
 /// Last steps of a minimization, and the point before a trial extrapolation.
-pub(crate) struct Valley<P> {
+pub(crate) struct ValleyExtrapolation<P> {
     steps: Vec<Vec<f64>>,
-    reach: f64,
+    factor: f64,
     /// Point before the extrapolation, its cost, and the number of evaluations.
-    left: Option<(P, f64, usize)>,
+    trial_start: Option<(P, f64, usize)>,
 }
 
-impl<P> Valley<P> {
+impl<P> ValleyExtrapolation<P> {
     /// Extrapolation without recorded steps.
     pub(crate) fn new() -> Self {
-        Self { steps: Vec::new(), reach: REACH, left: None }
+        Self { steps: Vec::new(), factor: INITIAL_EXTRAPOLATION_FACTOR, trial_start: None }
     }
 
     /// Record a step in coordinates and its relative decrease of the cost.
-    pub(crate) fn moved(&mut self, step: &[f64], gain: f64) {
-        if gain > CREEPS {
+    pub(crate) fn record_step(&mut self, step: &[f64], gain: f64) {
+        if gain > MAX_GAIN_PER_STEP {
             self.steps.clear();
         } else {
             self.steps.push(step.to_vec());
@@ -418,42 +425,43 @@ impl<P> Valley<P> {
     }
 
     /// Extrapolation step from the last steps, if they are straight and enough evaluations are left.
-    pub(crate) fn leap(&mut self, evaluations: usize) -> Option<Vec<f64>> {
-        if self.left.is_some() || self.steps.len() < STEPS || evaluations <= PATIENCE {
+    pub(crate) fn propose_step(&mut self, evaluations: usize) -> Option<Vec<f64>> {
+        if self.trial_start.is_some() || self.steps.len() < EXTRAPOLATION_STEPS || evaluations <= MAX_TRIAL_EVALUATIONS
+        {
             return None;
         }
-        let last = self.steps.split_off(self.steps.len() - STEPS);
+        let last = self.steps.split_off(self.steps.len() - EXTRAPOLATION_STEPS);
         self.steps.clear();
         let norm = |v: &[f64]| v.iter().map(|s| s * s).sum::<f64>().sqrt();
         let sum: Vec<f64> = (0..last[0].len()).map(|i| last.iter().map(|step| step[i]).sum()).collect();
-        let straight = norm(&sum) >= STRAIGHT * last.iter().map(|step| norm(step)).sum::<f64>();
-        straight.then(|| sum.iter().map(|s| self.reach * s).collect())
+        let straight = norm(&sum) >= MIN_STRAIGHTNESS * last.iter().map(|step| norm(step)).sum::<f64>();
+        straight.then(|| sum.iter().map(|s| self.factor * s).collect())
     }
 
     /// Begin a trial extrapolation from this point and cost.
-    pub(crate) fn left(&mut self, from: P, cost: f64, evaluations: usize) {
-        self.left = Some((from, cost, evaluations));
+    pub(crate) fn begin_trial(&mut self, from: P, cost: f64, evaluations: usize) {
+        self.trial_start = Some((from, cost, evaluations));
     }
 
     /// Reject the trial extrapolation.
-    pub(crate) fn fell(&mut self) {
-        self.reach = (0.5 * self.reach).max(1.0);
+    pub(crate) fn reject_trial(&mut self) {
+        self.factor = (0.5 * self.factor).max(1.0);
         self.steps.clear();
     }
 
     /// Point to return to if the trial extrapolation failed; also if the search terminates during the trial.
     pub(crate) fn outcome(&mut self, cost: f64, evaluations: usize, ends: bool) -> Option<P> {
-        let (from, least, since) = self.left.take()?;
+        let (from, least, since) = self.trial_start.take()?;
         if cost < least {
-            self.reach = (2.0 * self.reach).min(FARTHEST);
+            self.factor = (2.0 * self.factor).min(MAX_EXTRAPOLATION_FACTOR);
             self.steps.clear();
             return None;
         }
-        if ends || evaluations >= since + PATIENCE {
-            self.fell();
+        if ends || evaluations >= since + MAX_TRIAL_EVALUATIONS {
+            self.reject_trial();
             return Some(from);
         }
-        self.left = Some((from, least, since));
+        self.trial_start = Some((from, least, since));
         None
     }
 }

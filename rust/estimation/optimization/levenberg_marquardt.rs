@@ -12,19 +12,19 @@
 
 pub use super::damped_step::Problem;
 
-use super::damped_step::{Curvature, Linear, Valley, LEAST_DAMPING};
+use super::damped_step::{Curvature, LinearizedProblem, ValleyExtrapolation, MIN_DAMPING};
 use crate::error::{check_length, Error, Result};
 
 /// Damping of the first step: close to Gauss–Newton, but safe for an initial guess that is off by some tens of percent.
-const FIRST_DAMPING: f64 = 1e-3;
+const INITIAL_DAMPING: f64 = 1e-3;
 /// Damping above which a step is at rounding level.
-const LARGEST_DAMPING: f64 = 1e12;
+const MAX_DAMPING: f64 = 1e12;
 /// Factor by which an accurately predicted step decreases the damping and a rejected step increases it.
-const FACTOR: f64 = 10.0;
+const DAMPING_FACTOR: f64 = 10.0;
 /// Ratio of actual to predicted decrease of the cost above which the damping is decreased.
-const FAIR: f64 = 0.25;
+const ACCEPTABLE_GAIN_RATIO: f64 = 0.25;
 /// Rounding error of the residuals relative to the signals, for the convergence test if no step decreases the cost.
-const ROUNDING: f64 = 1e-10;
+const RELATIVE_ROUNDING_ERROR: f64 = 1e-10;
 
 /// Reason of termination.
 #[derive(Debug, Clone, Copy, PartialEq, Eq)]
@@ -36,7 +36,7 @@ pub enum Status {
     /// No step decreases the cost although the gradient is not zero.
     Stalled,
     /// The descent direction leaves the domain of the problem: the value is not finite or not admissible.
-    Wall,
+    DomainLimit,
 }
 
 /// Termination criteria.
@@ -114,7 +114,7 @@ fn cost(residuals: &[f64]) -> f64 {
 /// # Ok(())
 /// # }
 /// ```
-pub fn minimise<P: Problem>(
+pub fn minimize<P: Problem>(
     problem: &P,
     start: P::Point,
     settings: Settings,
@@ -122,41 +122,41 @@ pub fn minimise<P: Problem>(
     let mut search = Search { problem, settings, evaluations: 1, gain: f64::INFINITY, hit: false, corners: false };
     let mut at = search.start(start)?;
     if settings.evaluations == 0 {
-        return Ok(at.ended(1, Status::Exhausted));
+        return Ok(at.into_minimum(1, Status::Exhausted));
     }
-    at.jacobian = search.slopes(&at.point, &at.evaluation)?;
-    let mut valley = Valley::new();
+    at.jacobian = search.checked_jacobian(&at.point, &at.evaluation)?;
+    let mut valley = ValleyExtrapolation::new();
     loop {
         let ended = match search.advance(&mut at)? {
             Advance::Moved(step, gain) => {
-                valley.moved(&step, gain);
+                valley.record_step(&step, gain);
                 None
             }
             Advance::Ended(status) => Some(status),
         };
         if let Some(before) = valley.outcome(at.cost, search.evaluations, ended.is_some()) {
             at = before;
-            search.anew();
+            search.reset_progress();
             continue;
         }
         if let Some(status) = ended {
-            return Ok(at.ended(search.evaluations, status));
+            return Ok(at.into_minimum(search.evaluations, status));
         }
-        let left = if problem.leaps() { settings.evaluations - search.evaluations } else { 0 };
-        if let Some(leap) = valley.leap(left) {
-            if let Some(there) = search.landed(&at, &leap)? {
+        let left = if problem.allows_extrapolation() { settings.evaluations - search.evaluations } else { 0 };
+        if let Some(leap) = valley.propose_step(left) {
+            if let Some(there) = search.evaluate_extrapolation(&at, &leap)? {
                 let from = at.cost;
-                valley.left(std::mem::replace(&mut at, there), from, search.evaluations);
-                search.anew();
+                valley.begin_trial(std::mem::replace(&mut at, there), from, search.evaluations);
+                search.reset_progress();
             } else {
-                valley.fell();
+                valley.reject_trial();
             }
         }
     }
 }
 
 /// State of the iteration: point, evaluation, Jacobian, damping and curvature.
-struct At<P: Problem> {
+struct SearchState<P: Problem> {
     point: P::Point,
     evaluation: P::Evaluation,
     cost: f64,
@@ -168,8 +168,8 @@ struct At<P: Problem> {
     before: Option<(Vec<f64>, Vec<f64>)>,
 }
 
-impl<P: Problem> At<P> {
-    fn ended(self, evaluations: usize, status: Status) -> Minimum<P::Point, P::Evaluation> {
+impl<P: Problem> SearchState<P> {
+    fn into_minimum(self, evaluations: usize, status: Status) -> Minimum<P::Point, P::Evaluation> {
         let Self { point, evaluation, cost, jacobian, .. } = self;
         Minimum { point, evaluation, cost, jacobian, evaluations, status }
     }
@@ -195,7 +195,7 @@ struct Search<'a, P> {
 }
 
 impl<P: Problem> Search<'_, P> {
-    fn slopes(&self, point: &P::Point, evaluation: &P::Evaluation) -> Result<Vec<Vec<f64>>> {
+    fn checked_jacobian(&self, point: &P::Point, evaluation: &P::Evaluation) -> Result<Vec<Vec<f64>>> {
         let jacobian = self.problem.jacobian(point, evaluation)?;
         let rows = self.problem.residuals(evaluation).len();
         jacobian.iter().try_for_each(|column| check_length("column of the Jacobian", rows, column.len()))?;
@@ -203,25 +203,25 @@ impl<P: Problem> Search<'_, P> {
     }
 
     /// Evaluate the initial guess, without derivatives.
-    fn start(&self, start: P::Point) -> Result<At<P>> {
+    fn start(&self, start: P::Point) -> Result<SearchState<P>> {
         let evaluation = self.problem.evaluate(&start)?;
-        let point = self.problem.settled(&evaluation, start);
-        let (cost, trusted) = (cost(self.problem.residuals(&evaluation)), self.problem.trusted(&point));
-        let (damping, curvature) = (FIRST_DAMPING, Curvature::new(0));
-        Ok(At { point, evaluation, cost, jacobian: Vec::new(), trusted, damping, curvature, before: None })
+        let point = self.problem.point_of_evaluation(&evaluation, start);
+        let (cost, trusted) = (cost(self.problem.residuals(&evaluation)), self.problem.is_admissible(&point));
+        let (damping, curvature) = (INITIAL_DAMPING, Curvature::new(0));
+        Ok(SearchState { point, evaluation, cost, jacobian: Vec::new(), trusted, damping, curvature, before: None })
     }
 
     /// Reset the progress of the last steps.
-    fn anew(&mut self) {
+    fn reset_progress(&mut self) {
         (self.gain, self.hit) = (f64::INFINITY, false);
     }
 
     /// Evaluate an extrapolation step; None if it leaves the domain of the problem.
-    fn landed(&mut self, from: &At<P>, leap: &[f64]) -> Result<Option<At<P>>> {
-        let next = self.problem.moved(&from.point, leap).0;
+    fn evaluate_extrapolation(&mut self, from: &SearchState<P>, leap: &[f64]) -> Result<Option<SearchState<P>>> {
+        let next = self.problem.apply_step(&from.point, leap).0;
         self.evaluations += 1;
         let made = self.start(next).and_then(|mut there| {
-            there.jacobian = self.slopes(&there.point, &there.evaluation)?;
+            there.jacobian = self.checked_jacobian(&there.point, &there.evaluation)?;
             Ok(there)
         });
         match made {
@@ -232,7 +232,7 @@ impl<P: Problem> Search<'_, P> {
     }
 
     /// Make one step that decreases the cost, or return the reason of termination.
-    fn advance(&mut self, at: &mut At<P>) -> Result<Advance> {
+    fn advance(&mut self, at: &mut SearchState<P>) -> Result<Advance> {
         let (problem, settings) = (self.problem, self.settings);
         // Cosine of the gradient at convergence; its square is a relative decrease of the cost.
         let flat = settings.tolerance.max(f64::EPSILON).sqrt();
@@ -240,56 +240,67 @@ impl<P: Problem> Search<'_, P> {
             if self.evaluations >= settings.evaluations {
                 return Ok(Advance::Ended(Status::Exhausted));
             }
-            let linear = Linear::at(problem, &at.point, &at.jacobian, problem.residuals(&at.evaluation), self.corners);
+            let linear = LinearizedProblem::at(
+                problem,
+                &at.point,
+                &at.jacobian,
+                problem.residuals(&at.evaluation),
+                self.corners,
+            );
             if at.curvature.is_for(at.jacobian.len()) {
                 if let Some((taken, gradient)) = at.before.take() {
                     let now = linear.gradient_by_parameter();
                     let change: Vec<f64> = now.iter().zip(&gradient).map(|(a, b)| a - b).collect();
-                    at.curvature.learn(&taken, &change, &linear.columns_along(&taken));
+                    at.curvature.update(&taken, &change, &linear.columns_along(&taken));
                 }
             } else {
                 at.curvature = Curvature::new(at.jacobian.len());
             }
-            let slope = linear.slope();
+            let slope = linear.max_gradient();
             let level = slope <= flat * linear.norm;
-            let (newton, falls) = linear.step(LEAST_DAMPING);
-            let nowhere = problem.moved(&at.point, &linear.unscaled(&newton)).1 <= settings.tolerance;
+            let (newton, falls) = linear.damped_step_and_decrease(MIN_DAMPING);
+            let nowhere = problem.apply_step(&at.point, &linear.to_coordinates(&newton)).1 <= settings.tolerance;
             // In a valley a small gradient can still be far from the minimum: check the predicted decrease as well.
             if nowhere || (level && (falls <= settings.tolerance || self.gain <= settings.tolerance)) {
                 return Ok(Advance::Ended(Status::Converged));
             }
             if self.gain <= settings.tolerance && self.hit {
-                return Ok(Advance::Ended(Status::Wall));
+                return Ok(Advance::Ended(Status::DomainLimit));
             }
             self.hit = false;
-            match self.lowered(at, &linear, (slope, level))? {
+            match self.find_descent_step(at, &linear, (slope, level))? {
                 Some(advance) => return Ok(advance),
                 // Fix the parameters with kinks and continue with the others.
-                None => (self.corners, at.damping, self.gain) = (true, FIRST_DAMPING, f64::INFINITY),
+                None => (self.corners, at.damping, self.gain) = (true, INITIAL_DAMPING, f64::INFINITY),
             }
         }
     }
 
     /// Shorten the step until it decreases the cost; None if parameters with kinks must be fixed first.
-    fn lowered(&mut self, at: &mut At<P>, linear: &Linear, (slope, level): (f64, bool)) -> Result<Option<Advance>> {
+    fn find_descent_step(
+        &mut self,
+        at: &mut SearchState<P>,
+        linear: &LinearizedProblem,
+        (slope, level): (f64, bool),
+    ) -> Result<Option<Advance>> {
         let (problem, settings) = (self.problem, self.settings);
         loop {
-            let curved = if at.curvature.used { linear.curved_step(at.damping, &at.curvature) } else { None };
-            if at.curvature.used && curved.is_none() && at.damping <= LARGEST_DAMPING {
-                at.damping *= FACTOR;
+            let curved = if at.curvature.is_used { linear.curved_step(at.damping, &at.curvature) } else { None };
+            if at.curvature.is_used && curved.is_none() && at.damping <= MAX_DAMPING {
+                at.damping *= DAMPING_FACTOR;
                 continue;
             }
-            let first = if curved.is_some() { linear.projected } else { 0 };
-            let (step, falls) = curved.unwrap_or_else(|| linear.step(at.damping));
-            let steps = linear.unscaled(&step);
-            let (next, moved) = problem.moved(&at.point, &steps);
-            if moved <= settings.tolerance || at.damping > LARGEST_DAMPING {
+            let first = if curved.is_some() { linear.eliminated_count } else { 0 };
+            let (step, falls) = curved.unwrap_or_else(|| linear.damped_step_and_decrease(at.damping));
+            let steps = linear.to_coordinates(&step);
+            let (next, moved) = problem.apply_step(&at.point, &steps);
+            if moved <= settings.tolerance || at.damping > MAX_DAMPING {
                 // No step decreases the cost: converged, at rounding level, at the domain limit or at a kink.
-                return Ok(if level || slope <= ROUNDING * problem.size(&at.evaluation) {
+                return Ok(if level || slope <= RELATIVE_ROUNDING_ERROR * problem.signal_norm(&at.evaluation) {
                     Some(Advance::Ended(Status::Converged))
                 } else if self.hit {
-                    Some(Advance::Ended(Status::Wall))
-                } else if !self.corners && (0..linear.scales.len()).any(|i| problem.kinked(&at.point, i)) {
+                    Some(Advance::Ended(Status::DomainLimit))
+                } else if !self.corners && (0..linear.scales.len()).any(|i| problem.has_kinks(&at.point, i)) {
                     None
                 } else {
                     Some(Advance::Ended(Status::Stalled))
@@ -299,7 +310,7 @@ impl<P: Problem> Search<'_, P> {
                 return Ok(Some(Advance::Ended(Status::Exhausted)));
             }
             self.evaluations += 1;
-            let trusts = problem.trusted(&next);
+            let trusts = problem.is_admissible(&next);
             // A step that does not decrease the cost or overflows is shortened.
             let tried = problem.evaluate(&next).and_then(|found| {
                 let reached = cost(problem.residuals(&found));
@@ -309,19 +320,19 @@ impl<P: Problem> Search<'_, P> {
                 if reached >= at.cost {
                     return Ok(None);
                 }
-                let settled = problem.settled(&found, next.clone());
-                Ok(Some((self.slopes(&settled, &found)?, found, reached, settled)))
+                let settled = problem.point_of_evaluation(&found, next.clone());
+                Ok(Some((self.checked_jacobian(&settled, &found)?, found, reached, settled)))
             });
             match tried {
                 Ok(Some((slopes, found, reached, next))) => {
                     self.gain = (at.cost - reached) / at.cost.max(f64::MIN_POSITIVE);
                     (at.point, at.evaluation, at.cost, at.jacobian, at.trusted) =
                         (next, found, reached, slopes, trusts);
-                    let told = linear.falls(&step, first);
-                    at.curvature.judge(told, told - linear.bent(&step, &at.curvature), self.gain);
+                    let told = linear.predicted_decrease(&step, first);
+                    at.curvature.select_model(told, told - linear.curvature_change(&step, &at.curvature), self.gain);
                     at.before = Some((steps.clone(), linear.gradient_by_parameter()));
-                    if self.gain >= FAIR * falls {
-                        at.damping = (at.damping / FACTOR).max(LEAST_DAMPING);
+                    if self.gain >= ACCEPTABLE_GAIN_RATIO * falls {
+                        at.damping = (at.damping / DAMPING_FACTOR).max(MIN_DAMPING);
                     }
                     return Ok(Some(Advance::Moved(steps, self.gain)));
                 }
@@ -329,7 +340,7 @@ impl<P: Problem> Search<'_, P> {
                 Err(Error::Diverged { .. } | Error::LeadingZero { .. }) => self.hit = true,
                 Err(error) => return Err(error),
             }
-            at.damping *= FACTOR;
+            at.damping *= DAMPING_FACTOR;
         }
     }
 }

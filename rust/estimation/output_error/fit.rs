@@ -2,13 +2,13 @@
 
 use std::cell::RefCell;
 
-use super::evaluation_cache::Shelf;
+use super::evaluation_cache::EvaluationCache;
 use super::experiment::Experiment;
-use super::parameterization::{Clock, Coordinate, FreeInput, FreeModel, Point};
+use super::parameterization::{Coordinate, FreeInput, FreeModel, Point, TimeUnit};
 use super::residuals::Evaluation;
 use crate::error::{check_finite, check_length, Error, Result};
 use crate::estimation::optimization::damped_step::Problem;
-use crate::estimation::optimization::levenberg_marquardt::{minimise, Settings, Status};
+use crate::estimation::optimization::levenberg_marquardt::{minimize, Settings, Status};
 use crate::parallel::Stop;
 
 /// Optimum of an output-error fit.
@@ -34,39 +34,39 @@ pub struct Fit {
 }
 
 /// Nonlinear least-squares problem of the output error of a model.
-struct OutputError<'a> {
+struct OutputErrorProblem<'a> {
     model: &'a FreeModel,
     experiments: &'a [Experiment],
     /// Initial coefficients, in the unit of time.
     start: Vec<f64>,
     /// Unit of time in which the coefficients are stepped.
-    clock: Clock,
+    time_unit: TimeUnit,
     /// True if a stable model must not become unstable.
-    steady: bool,
+    requires_stability: bool,
     /// True to allow extrapolation along valleys: all coefficients have plain coordinates, as near an optimum.
-    plain: bool,
+    allows_extrapolation: bool,
     /// Coefficients that are eliminated at every point.
     linear: Vec<usize>,
     /// Caches of the evaluations, by experiment.
-    shelves: RefCell<Vec<Shelf>>,
+    caches: RefCell<Vec<EvaluationCache>>,
     /// Cancellation flag.
     stop: &'a Stop,
 }
 
-impl Problem for OutputError<'_> {
+impl Problem for OutputErrorProblem<'_> {
     type Point = Point;
     type Evaluation = Evaluation;
 
     fn evaluate(&self, point: &Point) -> Result<Evaluation> {
         self.stop.check()?;
-        self.model.evaluate(self.experiments, &mut self.shelves.borrow_mut(), point, &self.linear)
+        self.model.evaluate(self.experiments, &mut self.caches.borrow_mut(), point, &self.linear)
     }
 
-    fn settled(&self, evaluation: &Evaluation, _point: Point) -> Point {
+    fn point_of_evaluation(&self, evaluation: &Evaluation, _point: Point) -> Point {
         evaluation.point.clone()
     }
 
-    fn projected(&self, parameter: usize) -> bool {
+    fn is_eliminated(&self, parameter: usize) -> bool {
         parameter.checked_sub(self.model.order_bounds.len()).is_some_and(|c| self.linear.contains(&c))
     }
 
@@ -76,41 +76,41 @@ impl Problem for OutputError<'_> {
 
     fn jacobian(&self, _point: &Point, evaluation: &Evaluation) -> Result<Vec<Vec<f64>>> {
         self.stop.check()?;
-        self.model.jacobian(self.experiments, &mut self.shelves.borrow_mut(), &self.linear, evaluation)
+        self.model.jacobian(self.experiments, &mut self.caches.borrow_mut(), &self.linear, evaluation)
     }
 
-    fn moved(&self, point: &Point, steps: &[f64]) -> (Point, f64) {
-        stepped(self.model, &self.clock, point, steps)
+    fn apply_step(&self, point: &Point, steps: &[f64]) -> (Point, f64) {
+        step_within_bounds(self.model, &self.time_unit, point, steps)
     }
 
-    fn stretch(&self, point: &Point, parameter: usize) -> f64 {
+    fn coordinate_derivative(&self, point: &Point, parameter: usize) -> f64 {
         parameter.checked_sub(point.orders.len()).filter(|j| *j < point.coefficients.len()).map_or(1.0, |j| {
-            let factor = self.clock.factor(j, &point.orders);
-            self.model.coordinates[j].stretch(factor * point.coefficients[j]) / factor
+            let factor = self.time_unit.factor(j, &point.orders);
+            self.model.coordinates[j].derivative(factor * point.coefficients[j]) / factor
         })
     }
 
     /// Derivatives of the coefficients with respect to an order, at constant values in the unit of time.
-    fn carried(&self, point: &Point, parameter: usize) -> Vec<(usize, f64)> {
+    fn coupled_derivatives(&self, point: &Point, parameter: usize) -> Vec<(usize, f64)> {
         if parameter >= point.orders.len() {
             return Vec::new();
         }
         (point.coefficients.iter().enumerate())
-            .map(|(j, c)| (point.orders.len() + j, -c * self.clock.fall(j, parameter)))
+            .map(|(j, c)| (point.orders.len() + j, -c * self.time_unit.relative_decrease(j, parameter)))
             .filter(|(_, slope)| *slope != 0.0)
             .collect()
     }
 
     /// Distance of a parameter from its bounds. Coefficients are bounded only if they keep their sign.
-    fn room(&self, point: &Point, parameter: usize) -> (f64, f64) {
+    fn distance_to_bounds(&self, point: &Point, parameter: usize) -> (f64, f64) {
         let behind = point.orders.len() + point.coefficients.len();
         let (value, (low, high)) = match (point.orders.get(parameter), parameter.checked_sub(behind)) {
             (Some(order), _) => (*order, self.model.order_bounds[parameter]),
             (None, Some(input)) => (point.inputs[input], self.model.inputs[input].bounds),
             (None, None) => {
                 let j = parameter - point.orders.len();
-                let value = self.clock.factor(j, &point.orders) * point.coefficients[j];
-                let down = self.model.coordinates[j].room(value, self.start[j]);
+                let value = self.time_unit.factor(j, &point.orders) * point.coefficients[j];
+                let down = self.model.coordinates[j].distance_to_bound(value, self.start[j]);
                 return (down, f64::INFINITY);
             }
         };
@@ -118,21 +118,21 @@ impl Problem for OutputError<'_> {
     }
 
     /// True for input parameters: the response is piecewise linear in delays and limits.
-    fn kinked(&self, point: &Point, parameter: usize) -> bool {
+    fn has_kinks(&self, point: &Point, parameter: usize) -> bool {
         parameter >= point.orders.len() + point.coefficients.len()
     }
 
-    fn size(&self, evaluation: &Evaluation) -> f64 {
+    fn signal_norm(&self, evaluation: &Evaluation) -> f64 {
         evaluation.size
     }
 
     /// True if the grids resolve the dynamics of each equation. Unresolved modes would fit noise.
-    fn trusted(&self, point: &Point) -> bool {
-        self.model.resolved(self.experiments, point) && !(self.steady && self.model.grows(point))
+    fn is_admissible(&self, point: &Point) -> bool {
+        self.model.is_resolved(self.experiments, point) && !(self.requires_stability && self.model.is_unstable(point))
     }
 
-    fn leaps(&self) -> bool {
-        self.plain
+    fn allows_extrapolation(&self) -> bool {
+        self.allows_extrapolation
     }
 }
 
@@ -140,7 +140,7 @@ impl Problem for OutputError<'_> {
 ///
 /// Changes of orders are absolute. Those of coefficients are relative in the unit of time, those of input parameters
 /// relative to their interval.
-fn stepped(model: &FreeModel, clock: &Clock, point: &Point, deltas: &[f64]) -> (Point, f64) {
+fn step_within_bounds(model: &FreeModel, clock: &TimeUnit, point: &Point, deltas: &[f64]) -> (Point, f64) {
     let mut next = point.clone();
     let mut moved: f64 = 0.0;
     let (orders, rest) = deltas.split_at(point.orders.len());
@@ -152,7 +152,7 @@ fn stepped(model: &FreeModel, clock: &Clock, point: &Point, deltas: &[f64]) -> (
     }
     for (j, (&coordinate, &delta)) in model.coordinates.iter().zip(coefficients).enumerate() {
         let before = clock.factor(j, &point.orders) * point.coefficients[j];
-        let value = coordinate.shifted(before, delta);
+        let value = coordinate.shift(before, delta);
         next.coefficients[j] = value / clock.factor(j, &next.orders);
         moved = moved.max((value - before).abs() / before.abs().max(f64::MIN_POSITIVE));
     }
@@ -218,7 +218,7 @@ pub fn fit(model: &FreeModel, experiments: &[Experiment], start: &Point, setting
 ///
 /// # Errors
 /// As [`fit`].
-pub fn fit_steady(model: &FreeModel, experiments: &[Experiment], start: &Point, settings: Settings) -> Result<Fit> {
+pub fn fit_stable(model: &FreeModel, experiments: &[Experiment], start: &Point, settings: Settings) -> Result<Fit> {
     fit_until(model, experiments, start, settings, true, &Stop::default())
 }
 
@@ -243,22 +243,32 @@ pub fn fit_until(
     point.orders.iter_mut().zip(&model.order_bounds).for_each(|(o, &(low, high))| *o = o.clamp(low, high));
     point.inputs.iter_mut().zip(&model.inputs).for_each(|(t, d)| *t = t.clamp(d.bounds.0, d.bounds.1));
     // With a single evaluation nothing is eliminated.
-    let linear = if settings.evaluations > 1 { model.linear() } else { Vec::new() };
+    let linear = if settings.evaluations > 1 { model.linear_coefficients() } else { Vec::new() };
     let plain = !model.coordinates.iter().any(|c| matches!(c, Coordinate::Logarithm | Coordinate::ExcessLogarithm));
     let mut model = model.clone();
     // Logarithmic coordinates are not needed for eliminated coefficients.
     linear.iter().for_each(|&j| model.coordinates[j] = Coordinate::Plain);
     // With free input parameters the inputs of the equations are not signals of the record.
     let passed: Option<Vec<Experiment>> = match settings.evaluations > 1 && model.inputs.is_empty() {
-        true => experiments.iter().map(Experiment::passed_first).collect::<Result<_>>()?,
+        true => experiments.iter().map(Experiment::prefilter_signals).collect::<Result<_>>()?,
         false => None,
     };
     let experiments = passed.as_deref().unwrap_or(experiments);
-    let shelves = RefCell::new(Shelf::of(experiments)?);
-    let clock = Clock::of(&model, experiments);
+    let shelves = RefCell::new(EvaluationCache::of(experiments)?);
+    let clock = TimeUnit::from_experiments(&model, experiments);
     let start = (point.coefficients.iter().enumerate()).map(|(j, c)| clock.factor(j, &point.orders) * c).collect();
-    let problem = OutputError { model: &model, experiments, start, clock, steady, plain, linear, shelves, stop };
-    let found = minimise(&problem, point, settings)?;
+    let problem = OutputErrorProblem {
+        model: &model,
+        experiments,
+        start,
+        time_unit: clock,
+        requires_stability: steady,
+        allows_extrapolation: plain,
+        linear,
+        caches: shelves,
+        stop,
+    };
+    let found = minimize(&problem, point, settings)?;
     Ok(Fit {
         point: found.point,
         cost: found.cost,
@@ -274,7 +284,7 @@ pub fn fit_until(
 /// Check that an initial guess is finite and in the range of its coordinates.
 fn check_start(model: &FreeModel, start: &Point) -> Result<()> {
     for (i, (&c, coordinate)) in start.coefficients.iter().zip(&model.coordinates).enumerate() {
-        if !coordinate.holds(c) {
+        if !coordinate.contains(c) {
             return Err(Error::OutOfRange {
                 name: format!("start of coefficient {i}"),
                 value: c,

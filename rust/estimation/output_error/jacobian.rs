@@ -3,10 +3,10 @@
 use std::borrow::Cow;
 use std::rc::Rc;
 
-use super::evaluation_cache::Shelf;
+use super::evaluation_cache::EvaluationCache;
 use super::experiment::Experiment;
 use super::parameterization::{FreeModel, Point};
-use super::residuals::{Evaluation, Part};
+use super::residuals::{Evaluation, Linearization};
 use crate::equation::AffineOrder;
 use crate::error::{Error, Result};
 use crate::linalg::orthogonal::project_out;
@@ -19,7 +19,7 @@ impl FreeModel {
     pub(crate) fn jacobian(
         &self,
         experiments: &[Experiment],
-        shelves: &mut [Shelf],
+        shelves: &mut [EvaluationCache],
         linear: &[usize],
         at: &Evaluation,
     ) -> Result<Vec<Vec<f64>>> {
@@ -40,8 +40,8 @@ impl FreeModel {
     fn sensitivities(
         &self,
         experiment: &Experiment,
-        shelf: &mut Shelf,
-        part: &Part,
+        shelf: &mut EvaluationCache,
+        part: &Linearization,
         point: &Point,
         initial: &[Vec<f64>],
         linear: &[usize],
@@ -52,11 +52,11 @@ impl FreeModel {
         let (m, n) = (record.m(), self.equations.len());
         let mut responses: Vec<Option<Rc<Kernel>>> = part.response.iter().map(|_| None).collect();
         let mut columns: Vec<Option<Vec<f64>>> = vec![None; jacobian.len()];
-        for (&coefficient, driven) in linear.iter().zip(&part.driven) {
+        for (&coefficient, driven) in linear.iter().zip(&part.linear_effects) {
             columns[orders.len() + coefficient] = Some(driven.samples.clone());
         }
         let open: Vec<usize> = (0..columns.len()).filter(|&parameter| columns[parameter].is_none()).collect();
-        part.solved.inverse()?.each(
+        part.system.inverse()?.solve_each(
             (n, m),
             open.len(),
             |place, rights| {
@@ -64,29 +64,32 @@ impl FreeModel {
                 for (i, equation) in self.equations.iter().enumerate() {
                     for (k, (signal, _, _)) in equation.terms.iter().enumerate() {
                         let turns = parameter < orders.len();
-                        let weight = self.pull((i, k), point, parameter);
+                        let weight = self.right_hand_side_weight((i, k), point, parameter);
                         if weight == 0.0 {
                             continue;
                         }
                         let operator = &part.operators[i][k];
                         if let Some(input) = parameter.checked_sub(orders.len() + coefficients.len()) {
-                            let slope = &part.acted[input].1;
+                            let slope = &part.input_means[input].1;
                             rights.add(i, weight, (operator, false), || Cow::Borrowed(slope), || shelf.spectrum(slope));
-                        } else if let Some(j) = self.unknown(i, *signal) {
+                        } else if let Some(j) = self.output_index(i, *signal) {
                             let (response, known) = (&part.response[j], &mut responses[j]);
                             let made = || known.get_or_insert_with(|| shelf.spectrum(response)).clone();
                             rights.add(i, weight, (operator, turns), || Cow::Borrowed(response), made);
                         } else {
-                            let series = || Cow::Borrowed(self.drives(record, (*signal, operator.eta()), &part.acted));
-                            let made = || shelf.driver(self, experiment, (*signal, operator.eta()), &part.acted);
+                            let series = || {
+                                Cow::Borrowed(self.input_means(record, (*signal, operator.eta()), &part.input_means))
+                            };
+                            let made =
+                                || shelf.input_spectrum(self, experiment, (*signal, operator.eta()), &part.input_means);
                             rights.add(i, weight, (operator, turns), series, made);
                         }
                     }
                     if parameter < orders.len() {
                         if let Some(moved) =
-                            initial_slope(self, (i, parameter), orders, &initial[i], (experiment, shelf))?
+                            initial_term_derivative(self, (i, parameter), orders, &initial[i], (experiment, shelf))?
                         {
-                            let series = || Cow::Owned(shelf.filtered(&moved));
+                            let series = || Cow::Owned(shelf.filter_series(&moved));
                             rights.add_series(i, series, || shelf.filtered_spectrum(&moved));
                         }
                     }
@@ -95,14 +98,15 @@ impl FreeModel {
             },
             |place, means| {
                 if let Some(means) = means {
-                    columns[open[place]] = Some(part.moved_by(open[place], means, (self, experiment, point))?.samples);
+                    columns[open[place]] =
+                        Some(part.parameter_effect(open[place], means, (self, experiment, point))?.samples);
                 }
                 Ok(())
             },
         )?;
         for (column, out) in columns.into_iter().zip(jacobian) {
             match column {
-                None => out.extend(std::iter::repeat_n(0.0, n * experiment.compared())),
+                None => out.extend(std::iter::repeat_n(0.0, n * experiment.compared_count())),
                 Some(mut column) => {
                     project_out(&part.basis, &mut column);
                     // Residuals are measured minus simulated samples.
@@ -117,7 +121,7 @@ impl FreeModel {
     ///
     /// It multiplies the operator for a coefficient, its derivative for an order, and the derivative of the input for
     /// an input parameter.
-    fn pull(&self, (i, k): (usize, usize), point: &Point, parameter: usize) -> f64 {
+    fn right_hand_side_weight(&self, (i, k): (usize, usize), point: &Point, parameter: usize) -> f64 {
         let (equation, (orders, coefficients)) = (&self.equations[i], (&point.orders, &point.coefficients));
         let (signal, order, monomial) = &equation.terms[k];
         if let Some(input) = parameter.checked_sub(orders.len() + coefficients.len()) {
@@ -137,12 +141,12 @@ impl FreeModel {
 /// Derivative of the weighted initial terms of equation i with respect to a free order, before the filter.
 ///
 /// None if they do not depend on the order.
-fn initial_slope(
+fn initial_term_derivative(
     model: &FreeModel,
     (i, parameter): (usize, usize),
     orders: &[f64],
     values: &[f64],
-    (experiment, shelf): (&Experiment, &Shelf),
+    (experiment, shelf): (&Experiment, &EvaluationCache),
 ) -> Result<Option<Vec<f64>>> {
     // Exponents are linear in the orders, so any shift gives their derivative.
     const SHIFT: f64 = 1e-4;
@@ -166,7 +170,7 @@ fn initial_slope(
             continue;
         }
         out.resize(experiment.record.m(), 0.0);
-        let power = shelf.power(exponent);
+        let power = shelf.initial_term(exponent);
         out.iter_mut().zip(power.slope()).for_each(|(v, slope)| *v += x * follows * slope);
     }
     Ok(Some(out).filter(|out| !out.is_empty()))

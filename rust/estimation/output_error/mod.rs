@@ -20,6 +20,6 @@ pub mod stability;
 mod system_inverse;
 
 pub use crate::estimation::optimization::levenberg_marquardt::{Settings, Status};
-pub use experiment::{Experiment, Instant, OwnTimes};
-pub use fit::{fit, fit_steady, fit_until, Fit};
+pub use experiment::{Experiment, NonuniformSamples, PointValues};
+pub use fit::{fit, fit_stable, fit_until, Fit};
 pub use parameterization::{Coordinate, FreeEquation, FreeInput, FreeModel, InputLaw, Monomial, Point};

@@ -7,11 +7,11 @@
 //! near 1, and orders and coefficients are least correlated.
 
 use super::experiment::Experiment;
-use super::stability::grows;
+use super::stability::is_unstable;
 use crate::equation::{AffineOrder, Initial, Structure, Term};
 use crate::error::{check_length, Error, Result};
 use crate::regressors::Record;
-use crate::signal::block_pulse::delayed;
+use crate::signal::block_pulse::delay_samples;
 use crate::simulate::nyquist_margin;
 
 /// Coordinate in which a coefficient is stepped; its scaling affects convergence.
@@ -24,51 +24,51 @@ pub enum Coordinate {
     /// ln(c − 1), for a ratio that exceeds 1.
     ExcessLogarithm,
     /// No coordinate: fixed at the initial value, like an order between equal bounds.
-    Held,
+    Fixed,
 }
 
 /// Largest logarithmic decrease of a coefficient from its initial value.
-const VANISHED: f64 = 20.0;
+const MAX_LOG_DECREASE: f64 = 20.0;
 
 impl Coordinate {
     /// True if a value is in the range of the coordinate.
-    pub(crate) fn holds(self, value: f64) -> bool {
+    pub(crate) fn contains(self, value: f64) -> bool {
         match self {
-            Self::Plain | Self::Held => value.is_finite(),
+            Self::Plain | Self::Fixed => value.is_finite(),
             Self::Logarithm => value != 0.0 && value.is_finite(),
             Self::ExcessLogarithm => value > 1.0 && value.is_finite(),
         }
     }
 
     /// Shift a coefficient by `delta` in its coordinate.
-    pub(crate) fn shifted(self, value: f64, delta: f64) -> f64 {
+    pub(crate) fn shift(self, value: f64, delta: f64) -> f64 {
         // The linearization is meaningless beyond a factor of e^5.
         let bounded = delta.clamp(-5.0, 5.0);
         match self {
             Self::Plain => value + delta,
             Self::Logarithm => value * libm::exp(bounded),
             Self::ExcessLogarithm => 1.0 + (value - 1.0) * libm::exp(bounded),
-            Self::Held => value,
+            Self::Fixed => value,
         }
     }
 
     /// Distance of a coefficient from its lower bound in its coordinate.
     ///
     /// Below the bound its terms have no effect, and an optimization would never terminate.
-    pub(crate) fn room(self, value: f64, start: f64) -> f64 {
+    pub(crate) fn distance_to_bound(self, value: f64, start: f64) -> f64 {
         match self {
-            Self::Logarithm => libm::log(value / start) + VANISHED,
-            Self::Plain | Self::ExcessLogarithm | Self::Held => f64::INFINITY,
+            Self::Logarithm => libm::log(value / start) + MAX_LOG_DECREASE,
+            Self::Plain | Self::ExcessLogarithm | Self::Fixed => f64::INFINITY,
         }
     }
 
     /// Derivative of a coefficient with respect to its coordinate.
-    pub(crate) fn stretch(self, value: f64) -> f64 {
+    pub(crate) fn derivative(self, value: f64) -> f64 {
         match self {
             Self::Plain => 1.0,
             Self::Logarithm => value,
             Self::ExcessLogarithm => value - 1.0,
-            Self::Held => 0.0,
+            Self::Fixed => 0.0,
         }
     }
 }
@@ -137,7 +137,7 @@ pub struct FreeModel {
 
 /// Smallest response of the divisor at the Nyquist frequency, relative to its leading coefficient, of an admissible
 /// point.
-const RESOLVED: f64 = 0.02;
+const MIN_NYQUIST_RESPONSE_RATIO: f64 = 0.02;
 
 impl FreeModel {
     /// Check that the model matches the experiments.
@@ -183,7 +183,7 @@ impl FreeModel {
         for experiment in experiments {
             experiment.check()?;
             check_length("outputs", self.equations.len(), experiment.samples.len())?;
-            if experiment.own.is_some() && !self.inputs.is_empty() {
+            if experiment.nonuniform.is_some() && !self.inputs.is_empty() {
                 let what = "a free delay or limit with samples at times of their own".to_owned();
                 return refuse(what, "give its value, or samples at regular times");
             }
@@ -197,10 +197,15 @@ impl FreeModel {
     }
 
     /// Pulse means of an input after its nonlinearity, and their derivative with respect to its parameter.
-    pub(crate) fn acted(&self, record: &Record, input: FreeInput, value: f64) -> Result<(Vec<f64>, Vec<f64>)> {
+    pub(crate) fn apply_input_law(
+        &self,
+        record: &Record,
+        input: FreeInput,
+        value: f64,
+    ) -> Result<(Vec<f64>, Vec<f64>)> {
         let means = record.signal(input.signal);
-        let before = if self.initial.at_rest() { 0.0 } else { means.first().copied().unwrap_or(0.0) };
-        input.law.acted(means, value, record.step(), before)
+        let before = if self.initial.is_at_rest() { 0.0 } else { means.first().copied().unwrap_or(0.0) };
+        input.law.apply(means, value, record.step(), before)
     }
 
     pub(crate) fn structures(&self, orders: &[f64]) -> Vec<Structure> {
@@ -208,8 +213,8 @@ impl FreeModel {
             .iter()
             .map(|e| Structure {
                 output: e.output,
-                order: raw(&e.order, orders),
-                terms: e.terms.iter().map(|(s, o, _)| Term { signal: *s, order: raw(o, orders) }).collect(),
+                order: unrounded_order(&e.order, orders),
+                terms: e.terms.iter().map(|(s, o, _)| Term { signal: *s, order: unrounded_order(o, orders) }).collect(),
             })
             .collect()
     }
@@ -218,11 +223,15 @@ impl FreeModel {
     ///
     /// Impulses are included only if the output passes a sensor filter, for the initial state of the filter.
     pub(crate) fn exponents(&self, experiment: &Experiment, i: usize, structure: &Structure) -> Vec<f64> {
-        structure.initial_exponents(if experiment.behind_filter(i) { &self.initial } else { self.initial.unfiltered() })
+        structure.initial_exponents(if experiment.is_filtered(i) {
+            &self.initial
+        } else {
+            self.initial.without_filter()
+        })
     }
 
     /// Index of the simulated output that a signal of equation i is; None for an input.
-    pub(crate) fn unknown(&self, i: usize, signal: usize) -> Option<usize> {
+    pub(crate) fn output_index(&self, i: usize, signal: usize) -> Option<usize> {
         if self.coupled {
             self.equations.iter().position(|e| e.output == signal)
         } else {
@@ -231,7 +240,7 @@ impl FreeModel {
     }
 
     /// Order of each equation, and coefficients and orders of its autoregressive terms.
-    fn own_terms(&self, point: &Point) -> Vec<(f64, Vec<(f64, f64)>)> {
+    fn autoregressive_terms(&self, point: &Point) -> Vec<(f64, Vec<(f64, f64)>)> {
         let own = |(structure, equation): (&Structure, &FreeEquation)| {
             let terms = structure.terms.iter().zip(&equation.terms);
             let own = terms.filter(|(term, _)| term.signal == structure.output);
@@ -241,9 +250,9 @@ impl FreeModel {
     }
 
     /// True if an equation is unstable; false for coupled equations, which are not checked.
-    pub(crate) fn grows(&self, point: &Point) -> bool {
+    pub(crate) fn is_unstable(&self, point: &Point) -> bool {
         let alone = !self.coupled || self.equations.len() == 1;
-        alone && self.own_terms(point).iter().any(|(order, own)| grows(*order, own))
+        alone && self.autoregressive_terms(point).iter().any(|(order, own)| is_unstable(*order, own))
     }
 
     /// True if every grid resolves the autoregressive terms of each equation; true for coupled equations.
@@ -251,24 +260,24 @@ impl FreeModel {
     /// The ratio of the divisor at the Nyquist frequency ([`nyquist_margin`]) to its leading coefficient is checked. If
     /// it is negative, the scheme has a mode that is unstable from pulse to pulse, near 0 one that hardly decays. A fit
     /// would use such a mode to follow noise.
-    pub(crate) fn resolved(&self, experiments: &[Experiment], point: &Point) -> bool {
+    pub(crate) fn is_resolved(&self, experiments: &[Experiment], point: &Point) -> bool {
         if self.coupled && self.equations.len() > 1 {
             return true;
         }
-        self.own_terms(point).iter().all(|(order, terms)| {
+        self.autoregressive_terms(point).iter().all(|(order, terms)| {
             let own: Vec<(f64, f64)> = terms.iter().map(|(c, nu)| (*c, order - nu)).collect();
             experiments.iter().all(|experiment| {
                 let h = experiment.record.step();
                 let first = |&(c, eta): &(f64, f64)| c * libm::pow(h, eta) / libm::tgamma(eta + 2.0);
                 let leading = 1.0 - own.iter().map(first).sum::<f64>();
-                nyquist_margin(&own, h) / leading >= RESOLVED
+                nyquist_margin(&own, h) / leading >= MIN_NYQUIST_RESPONSE_RATIO
             })
         })
     }
 }
 
 /// Value of an affine order without rounding, so that it is continuous.
-fn raw(law: &AffineOrder, free: &[f64]) -> f64 {
+fn unrounded_order(law: &AffineOrder, free: &[f64]) -> f64 {
     law.constant + law.weights.iter().zip(free).map(|(w, x)| w * x).sum::<f64>()
 }
 
@@ -314,7 +323,7 @@ impl InputLaw {
     /// # Ok(())
     /// # }
     /// ```
-    pub fn acted(self, means: &[f64], value: f64, step: f64, before: f64) -> Result<(Vec<f64>, Vec<f64>)> {
+    pub fn apply(self, means: &[f64], value: f64, step: f64, before: f64) -> Result<(Vec<f64>, Vec<f64>)> {
         if !(value >= 0.0 && value.is_finite()) {
             return Err(Error::OutOfRange {
                 name: "number of an input".into(),
@@ -328,9 +337,9 @@ impl InputLaw {
             Self::Delay => {
                 let steps = value / step;
                 let whole = steps.floor();
-                let (near, far) = (delayed(means, whole, before)?, delayed(means, whole + 1.0, before)?);
+                let (near, far) = (delay_samples(means, whole, before)?, delay_samples(means, whole + 1.0, before)?);
                 let slope = near.iter().zip(&far).map(|(near, far)| (far - near) / step).collect();
-                (delayed(means, steps, before)?, slope)
+                (delay_samples(means, steps, before)?, slope)
             }
             Self::Saturation => means.iter().map(|&v| (v.clamp(-value, value), beyond(v))).unzip(),
             Self::DeadZone => means
@@ -345,36 +354,36 @@ impl InputLaw {
 }
 
 /// Largest logarithm of a scaling factor; larger ones are clipped.
-const LARGEST: f64 = 300.0;
+const MAX_LOG_FACTOR: f64 = 300.0;
 /// Difference below which two exponents of time are equal.
-const SAME: f64 = 1e-9;
+const EXPONENT_TOLERANCE: f64 = 1e-9;
 
 /// Exponent of time: its constant, and the weights of the free orders.
-type Power = (f64, Vec<f64>);
+type TimePower = (f64, Vec<f64>);
 
 /// Unit of time (its logarithm), and the exponent of time of each coefficient; None for unscaled coefficients.
 #[derive(Debug, Clone)]
-pub(crate) struct Clock {
+pub(crate) struct TimeUnit {
     unit: f64,
-    powers: Vec<Option<Power>>,
+    powers: Vec<Option<TimePower>>,
 }
 
-impl Clock {
+impl TimeUnit {
     /// Unit of time of experiments.
-    pub(crate) fn of(model: &FreeModel, experiments: &[Experiment]) -> Self {
-        Self::of_spans(model, &experiments.iter().map(span).collect::<Vec<_>>())
+    pub(crate) fn from_experiments(model: &FreeModel, experiments: &[Experiment]) -> Self {
+        Self::from_log_spans(model, &experiments.iter().map(log_span).collect::<Vec<_>>())
     }
 
     /// Unit of time from the logarithm of sampling interval times duration of each run.
     #[allow(clippy::cast_precision_loss)]
-    pub(crate) fn of_spans(model: &FreeModel, spans: &[f64]) -> Self {
+    pub(crate) fn from_log_spans(model: &FreeModel, spans: &[f64]) -> Self {
         // Geometric mean of the lowest frequency of the record and the Nyquist frequency.
         let unit = spans.iter().sum::<f64>() / (2.0 * spans.len().max(1) as f64) - libm::log(std::f64::consts::PI);
-        Self { unit, powers: powers(model) }
+        Self { unit, powers: time_powers(model) }
     }
 
     /// Logarithm of the unit of time.
-    pub(crate) fn unit(&self) -> f64 {
+    pub(crate) fn log_unit(&self) -> f64 {
         self.unit
     }
 
@@ -383,77 +392,77 @@ impl Clock {
         self.powers[coefficient].as_ref().map_or(1.0, |(constant, weights)| {
             let power = constant + weights.iter().zip(orders).map(|(w, o)| w * o).sum::<f64>();
             // Clipping avoids overflow with extreme units.
-            libm::exp((power * self.unit).clamp(-LARGEST, LARGEST))
+            libm::exp((power * self.unit).clamp(-MAX_LOG_FACTOR, MAX_LOG_FACTOR))
         })
     }
 
     /// Relative decrease of a coefficient per unit of a free order, at a constant value in the unit.
-    pub(crate) fn fall(&self, coefficient: usize, order: usize) -> f64 {
-        let weight = |(_, weights): &Power| weights.get(order).copied().unwrap_or(0.0);
+    pub(crate) fn relative_decrease(&self, coefficient: usize, order: usize) -> f64 {
+        let weight = |(_, weights): &TimePower| weights.get(order).copied().unwrap_or(0.0);
         self.powers[coefficient].as_ref().map_or(0.0, weight) * self.unit
     }
 }
 
 /// Logarithm of sampling interval times duration.
-fn span(experiment: &Experiment) -> f64 {
+fn log_span(experiment: &Experiment) -> f64 {
     let (m, step) = (experiment.record.m() as f64, experiment.record.step());
-    let interval = step * experiment.every as f64;
+    let interval = step * experiment.pulses_per_sample as f64;
     libm::log(interval) + libm::log(m * step)
 }
 
 /// Exponent of time of each coefficient; None for unscaled ones.
-fn powers(model: &FreeModel) -> Vec<Option<Power>> {
-    agreed(model).unwrap_or_else(|| {
+fn time_powers(model: &FreeModel) -> Vec<Option<TimePower>> {
+    consistent_powers(model).unwrap_or_else(|| {
         // Exponents conflict if one coefficient occurs with several orders. Under a law no coefficient is scaled then.
         let lawful = model.equations.iter().flat_map(|e| &e.terms).any(|(_, _, c)| c.powers.len() > 1);
-        (0..model.coordinates.len()).map(|j| if lawful { None } else { power(model, j) }).collect()
+        (0..model.coordinates.len()).map(|j| if lawful { None } else { time_power(model, j) }).collect()
     })
 }
 
 /// True if a coefficient is scaled; fixed coefficients and ratios are not.
-fn moves(model: &FreeModel, coefficient: usize) -> bool {
+fn is_scaled(model: &FreeModel, coefficient: usize) -> bool {
     matches!(model.coordinates[coefficient], Coordinate::Plain | Coordinate::Logarithm)
 }
 
 /// Exponent α − ν of the first term whose coefficient is this one alone.
-fn power(model: &FreeModel, coefficient: usize) -> Option<Power> {
-    if !moves(model, coefficient) {
+fn time_power(model: &FreeModel, coefficient: usize) -> Option<TimePower> {
+    if !is_scaled(model, coefficient) {
         return None;
     }
     model.equations.iter().find_map(|equation| {
         let (_, order, _) = equation.terms.iter().find(|(_, _, c)| c.powers == [(coefficient, 1)])?;
-        let mut power = between(&equation.order, order);
+        let mut power = order_difference(&equation.order, order);
         let constant = power.remove(0);
         Some((constant, power))
     })
 }
 
 /// Difference α − ν: the constant, then the weights of the free orders.
-fn between(highest: &AffineOrder, order: &AffineOrder) -> Vec<f64> {
+fn order_difference(highest: &AffineOrder, order: &AffineOrder) -> Vec<f64> {
     let weights = highest.weights.iter().zip(&order.weights).map(|(a, b)| a - b);
     std::iter::once(highest.constant - order.constant).chain(weights).collect()
 }
 
 /// Exponents of time consistent with all products of coefficients, by elimination; None if they conflict.
-fn agreed(model: &FreeModel) -> Option<Vec<Option<Power>>> {
+fn consistent_powers(model: &FreeModel) -> Option<Vec<Option<TimePower>>> {
     let (count, orders) = (model.coordinates.len(), model.order_bounds.len());
     // One row per product: exponents of the coefficients, and the exponent of time of the product.
     let mut rows: Vec<(Vec<f64>, Vec<f64>)> = Vec::new();
     for equation in &model.equations {
         for (_, order, coefficient) in &equation.terms {
             let mut often = vec![0.0; count];
-            for &(j, n) in coefficient.powers.iter().filter(|(j, _)| moves(model, *j)) {
+            for &(j, n) in coefficient.powers.iter().filter(|(j, _)| is_scaled(model, *j)) {
                 often[j] += f64::from(n);
             }
             if often.iter().any(|&n| n != 0.0) {
-                rows.push((often, between(&equation.order, order)));
+                rows.push((often, order_difference(&equation.order, order)));
             }
         }
     }
     let mut pivots = Vec::new();
     for j in 0..count {
         let done = pivots.len();
-        let Some(at) = (done..rows.len()).find(|&i| rows[i].0[j].abs() > SAME) else { continue };
+        let Some(at) = (done..rows.len()).find(|&i| rows[i].0[j].abs() > EXPONENT_TOLERANCE) else { continue };
         rows.swap(done, at);
         let pivot = rows[done].clone();
         for (i, (often, power)) in rows.iter_mut().enumerate() {
@@ -464,11 +473,11 @@ fn agreed(model: &FreeModel) -> Option<Vec<Option<Power>>> {
         }
         pivots.push(j);
     }
-    if rows[pivots.len()..].iter().flat_map(|(_, power)| power).any(|v| v.abs() > SAME) {
+    if rows[pivots.len()..].iter().flat_map(|(_, power)| power).any(|v| v.abs() > EXPONENT_TOLERANCE) {
         return None;
     }
     // Coefficients not determined by the products have no unit.
-    let mut found: Vec<_> = (0..count).map(|j| moves(model, j).then(|| (0.0, vec![0.0; orders]))).collect();
+    let mut found: Vec<_> = (0..count).map(|j| is_scaled(model, j).then(|| (0.0, vec![0.0; orders]))).collect();
     for ((_, mut power), j) in rows.into_iter().zip(pivots) {
         let constant = power.remove(0);
         found[j] = Some((constant, power));

@@ -11,7 +11,7 @@ use crate::error::{Error, Result};
 use crate::fractional::kernels::{
     kernel, kernel_with_derivative, power_means, power_means_slope, power_pulses, power_pulses_slope,
 };
-use crate::series::{multiply, Buffers, Kernel, Recursion, Solver, Source, SumOfProducts, ABREAST, MAX_SUMS};
+use crate::series::{multiply, Buffers, Kernel, Recursion, Solver, Source, SumOfProducts, MAX_SUMS, RIGHT_SIDE_LANES};
 
 /// Representation of A⁻¹ at a point.
 pub(crate) enum Inverse {
@@ -22,14 +22,14 @@ pub(crate) enum Inverse {
 }
 
 /// Right-hand sides of the equations: sums of integrals of signals.
-pub(crate) enum Rights<'a> {
+pub(crate) enum RightHandSides<'a> {
     /// Sum of each equation, with a flag that is true if it is nonzero.
     Spectra(Vec<(bool, SumOfProducts)>),
     /// Equation, order, weight and signal of each summand.
     Sums(Vec<(usize, usize, f64, Cow<'a, [f64]>)>),
 }
 
-impl<'a> Rights<'a> {
+impl<'a> RightHandSides<'a> {
     /// Clear all sums.
     pub(crate) fn clear(&mut self) {
         match self {
@@ -44,7 +44,7 @@ impl<'a> Rights<'a> {
     }
 
     /// True if a summand was added.
-    pub(crate) fn moves(&self) -> bool {
+    pub(crate) fn is_nonzero(&self) -> bool {
         match self {
             Self::Spectra(rights) => rights.iter().any(|(used, _)| *used),
             Self::Sums(sources) => !sources.is_empty(),
@@ -52,7 +52,7 @@ impl<'a> Rights<'a> {
     }
 
     /// Multiply by the spectra of the inverse; None if zero.
-    fn through(
+    fn apply_inverse(
         &self,
         rows: &[Vec<Kernel>],
         m: usize,
@@ -67,7 +67,7 @@ impl<'a> Rights<'a> {
             target.take(&mut means, buffers);
             means
         };
-        self.moves().then(|| rows.iter().map(of_row).collect())
+        self.is_nonzero().then(|| rows.iter().map(of_row).collect())
     }
 
     /// Summands in the form of the running sums.
@@ -102,7 +102,9 @@ impl<'a> Rights<'a> {
             }
             Self::Sums(sources) => {
                 // Integer orders are fixed and have no derivative.
-                sources.extend(operator.whole().filter(|_| !slope).map(|order| (equation, order, weight, series())));
+                sources.extend(
+                    operator.integer_order().filter(|_| !slope).map(|order| (equation, order, weight, series())),
+                );
             }
         }
     }
@@ -126,37 +128,37 @@ impl<'a> Rights<'a> {
 }
 
 /// Pulse means of every output.
-pub(crate) type Means = Vec<Vec<f64>>;
+pub(crate) type PulseMeans = Vec<Vec<f64>>;
 
 /// Inverse of the equations A y = b at a point, for right-hand sides up to the length of the longest run.
-pub(crate) struct Solved {
+pub(crate) struct SystemInverse {
     /// Division by A; None with running sums.
     solver: Option<RefCell<Solver<'static>>>,
     inverse: OnceCell<Inverse>,
     /// Cache of the responses to initial terms, by equation and bits of the exponent, if shared by several runs.
-    natural: RefCell<HashMap<(usize, u64), Rc<Means>>>,
+    initial_responses: RefCell<HashMap<(usize, u64), Rc<PulseMeans>>>,
 }
 
-impl Solved {
+impl SystemInverse {
     /// Inverse of a matrix A of series.
     ///
     /// # Errors
     /// As [`Solver::new`].
-    pub(crate) fn by(matrix: Vec<Vec<Vec<f64>>>) -> Result<Self> {
-        let solver = Some(RefCell::new(Solver::keeping(matrix)?));
-        Ok(Self { solver, inverse: OnceCell::new(), natural: RefCell::default() })
+    pub(crate) fn from_matrix(matrix: Vec<Vec<Vec<f64>>>) -> Result<Self> {
+        let solver = Some(RefCell::new(Solver::from_matrix(matrix)?));
+        Ok(Self { solver, inverse: OnceCell::new(), initial_responses: RefCell::default() })
     }
 
     /// Inverse by running sums.
-    pub(crate) fn of(sums: Recursion) -> Self {
-        Self { solver: None, inverse: OnceCell::from(Inverse::Sums(sums)), natural: RefCell::default() }
+    pub(crate) fn from_running_sums(sums: Recursion) -> Self {
+        Self { solver: None, inverse: OnceCell::from(Inverse::Sums(sums)), initial_responses: RefCell::default() }
     }
 
     /// Solve by division, exact also if A⁻¹ is unstable; None with running sums.
     ///
     /// # Errors
     /// As [`Solver::solve`].
-    pub(crate) fn divided(&self, rhs: &[Vec<f64>]) -> Result<Option<Means>> {
+    pub(crate) fn solve_by_division(&self, rhs: &[Vec<f64>]) -> Result<Option<PulseMeans>> {
         self.solver.as_ref().map(|solver| solver.borrow_mut().solve(rhs)).transpose()
     }
 
@@ -167,7 +169,7 @@ impl Solved {
     pub(crate) fn inverse(&self) -> Result<&Inverse> {
         if let (None, Some(solver)) = (self.inverse.get(), &self.solver) {
             let mut solver = solver.borrow_mut();
-            let total = FACTORS * solver.terms();
+            let total = SPECTRUM_FACTORS * solver.terms();
             let rows = solver.inverse_spectra(total)?;
             return Ok(self.inverse.get_or_init(|| Inverse::Spectra { rows, total }));
         }
@@ -178,19 +180,19 @@ impl Solved {
     ///
     /// # Errors
     /// As [`Solver::solve`].
-    pub(crate) fn natural(
+    pub(crate) fn initial_term_responses(
         &self,
         (n, m): (usize, usize),
         terms: &[(usize, f64)],
         keep: bool,
-        power: impl Fn(f64) -> Rc<Power>,
-    ) -> Result<Vec<Rc<Means>>> {
+        power: impl Fn(f64) -> Rc<InitialTerm>,
+    ) -> Result<Vec<Rc<PulseMeans>>> {
         let key = |&(i, e): &(usize, f64)| (i, e.to_bits());
         let open: Vec<(usize, f64)> =
-            terms.iter().filter(|t| !self.natural.borrow().contains_key(&key(t))).copied().collect();
-        let powers: Vec<Rc<Power>> = open.iter().map(|&(_, e)| power(e)).collect();
+            terms.iter().filter(|t| !self.initial_responses.borrow().contains_key(&key(t))).copied().collect();
+        let powers: Vec<Rc<InitialTerm>> = open.iter().map(|&(_, e)| power(e)).collect();
         let mut made = HashMap::new();
-        self.inverse()?.each(
+        self.inverse()?.solve_each(
             (n, m),
             open.len(),
             |place, rights| {
@@ -203,7 +205,7 @@ impl Solved {
                 Ok(())
             },
         )?;
-        let mut kept = self.natural.borrow_mut();
+        let mut kept = self.initial_responses.borrow_mut();
         let answers = terms.iter().filter_map(|t| kept.get(&key(t)).or_else(|| made.get(&key(t))).cloned()).collect();
         if keep {
             kept.extend(made);
@@ -219,37 +221,37 @@ impl Inverse {
     ///
     /// # Errors
     /// Those of `given` and `taken`.
-    pub(crate) fn each<'a>(
+    pub(crate) fn solve_each<'a>(
         &self,
         (n, m): (usize, usize),
         count: usize,
-        mut given: impl FnMut(usize, &mut Rights<'a>) -> Result<()>,
+        mut given: impl FnMut(usize, &mut RightHandSides<'a>) -> Result<()>,
         mut taken: impl FnMut(usize, Option<Vec<Vec<f64>>>) -> Result<()>,
     ) -> Result<()> {
         match self {
             Self::Spectra { rows, total } => {
                 let sum = || (false, SumOfProducts::with_length(*total));
-                let mut rights = Rights::Spectra((0..n).map(|_| sum()).collect());
+                let mut rights = RightHandSides::Spectra((0..n).map(|_| sum()).collect());
                 let mut target = SumOfProducts::with_length(*total);
                 let mut buffers = Buffers::default();
                 for place in 0..count {
                     given(place, &mut rights)?;
-                    taken(place, rights.through(rows, m, &mut target, &mut buffers))?;
+                    taken(place, rights.apply_inverse(rows, m, &mut target, &mut buffers))?;
                     rights.clear();
                 }
             }
             Self::Sums(recursion) => {
-                for first in (0..count).step_by(ABREAST) {
-                    let mut lists = Vec::with_capacity(ABREAST);
-                    for place in first..(first + ABREAST).min(count) {
-                        let mut rights = Rights::Sums(Vec::new());
+                for first in (0..count).step_by(RIGHT_SIDE_LANES) {
+                    let mut lists = Vec::with_capacity(RIGHT_SIDE_LANES);
+                    for place in first..(first + RIGHT_SIDE_LANES).min(count) {
+                        let mut rights = RightHandSides::Sums(Vec::new());
                         given(place, &mut rights)?;
                         lists.push(rights);
                     }
-                    let sources: Vec<Vec<Source>> = lists.iter().map(Rights::sources).collect();
+                    let sources: Vec<Vec<Source>> = lists.iter().map(RightHandSides::sources).collect();
                     for (place, (means, rights)) in (first..).zip(recursion.solve(m, &sources)?.into_iter().zip(&lists))
                     {
-                        taken(place, rights.moves().then_some(means))?;
+                        taken(place, rights.is_nonzero().then_some(means))?;
                     }
                 }
             }
@@ -259,13 +261,13 @@ impl Inverse {
 }
 
 /// Number of series in a product: spectra of this multiple of m multiply without aliasing.
-pub(crate) const FACTORS: usize = 3;
+pub(crate) const SPECTRUM_FACTORS: usize = 3;
 
 /// Number of pulses above which spectra are not cached, because they need many times the memory of the record.
-pub(crate) const KEPT_PULSES: usize = 1 << 15;
+pub(crate) const MAX_CACHED_PULSES: usize = 1 << 15;
 
 /// Difference from an integer below which an integration order is an integer.
-const WHOLE: f64 = 1e-12;
+const INTEGER_TOLERANCE: f64 = 1e-12;
 
 /// Integral operator of a term: kernel, and its derivative with respect to the order if the order is free.
 pub(crate) struct Operator {
@@ -293,7 +295,7 @@ impl Operator {
 
     /// Spectrum of the derivative of the kernel; below order 0 a product of three series.
     fn slope(&self) -> Kernel {
-        let total = FACTORS * self.m;
+        let total = SPECTRUM_FACTORS * self.m;
         if self.eta >= 0.0 || !self.free {
             return Kernel::with_length(&self.series().1, total);
         }
@@ -312,7 +314,7 @@ impl Operator {
     }
 
     /// True if the operator has this order and this derivative flag.
-    pub(crate) fn serves(&self, eta: f64, free: bool) -> bool {
+    pub(crate) fn matches_order(&self, eta: f64, free: bool) -> bool {
         self.eta.to_bits() == eta.to_bits() && self.free == free
     }
 
@@ -323,16 +325,18 @@ impl Operator {
 
     /// Integration order if it is a fixed integer.
     #[allow(clippy::cast_possible_truncation, clippy::cast_sign_loss)]
-    pub(crate) fn whole(&self) -> Option<usize> {
+    pub(crate) fn integer_order(&self) -> Option<usize> {
         let near = self.eta.round();
-        let stays = !self.free && (self.eta - near).abs() <= WHOLE && near >= 0.0;
+        let stays = !self.free && (self.eta - near).abs() <= INTEGER_TOLERANCE && near >= 0.0;
         (stays && near <= MAX_SUMS as f64).then_some(near as usize)
     }
 
     /// Spectrum of the kernel, or of its derivative, for products of [`SPECTRUM_FACTORS`] series.
     pub(crate) fn spectrum(&self, slope: bool) -> Rc<Kernel> {
-        let made = || Rc::new(if slope { self.slope() } else { Kernel::with_length(self.kernel(), FACTORS * self.m) });
-        if self.m > KEPT_PULSES {
+        let made = || {
+            Rc::new(if slope { self.slope() } else { Kernel::with_length(self.kernel(), SPECTRUM_FACTORS * self.m) })
+        };
+        if self.m > MAX_CACHED_PULSES {
             return made();
         }
         self.spectra[usize::from(slope)].get_or_init(made).clone()
@@ -340,10 +344,10 @@ impl Operator {
 }
 
 /// Initial term t^e after the sensor filter of all signals, and its derivative with respect to the exponent.
-pub(crate) struct Power {
+pub(crate) struct InitialTerm {
     exponent: f64,
     step: f64,
-    filter: Option<Rc<Filter>>,
+    filter: Option<Rc<SeriesFilter>>,
     raw: Vec<f64>,
     series: OnceCell<Vec<f64>>,
     spectrum: OnceCell<Rc<Kernel>>,
@@ -351,26 +355,26 @@ pub(crate) struct Power {
 }
 
 /// Filter series with its spectrum for products of [`SPECTRUM_FACTORS`] series.
-pub(crate) struct Filter {
+pub(crate) struct SeriesFilter {
     series: Vec<f64>,
     spectrum: Kernel,
 }
 
-impl Filter {
+impl SeriesFilter {
     /// Filter from its series.
     pub(crate) fn new(series: &[f64]) -> Self {
-        Self { series: series.to_vec(), spectrum: Kernel::with_length(series, FACTORS * series.len()) }
+        Self { series: series.to_vec(), spectrum: Kernel::with_length(series, SPECTRUM_FACTORS * series.len()) }
     }
 
     /// Filter a series.
-    pub(crate) fn of(&self, series: &[f64]) -> Vec<f64> {
+    pub(crate) fn apply(&self, series: &[f64]) -> Vec<f64> {
         multiply(&self.series, series, series.len())
     }
 }
 
-impl Power {
+impl InitialTerm {
     /// Initial term on a grid of m pulses.
-    pub(crate) fn new(exponent: f64, m: usize, step: f64, filter: Option<Rc<Filter>>) -> Self {
+    pub(crate) fn new(exponent: f64, m: usize, step: f64, filter: Option<Rc<SeriesFilter>>) -> Self {
         let raw = if filter.is_some() { power_pulses(exponent, m, step) } else { power_means(exponent, m, step) };
         let (series, spectrum, slope) = Default::default();
         Self { exponent, step, filter, raw, series, spectrum, slope }
@@ -380,7 +384,7 @@ impl Power {
     pub(crate) fn series(&self) -> &[f64] {
         match &self.filter {
             None => &self.raw,
-            Some(filter) => self.series.get_or_init(|| filter.of(&self.raw)),
+            Some(filter) => self.series.get_or_init(|| filter.apply(&self.raw)),
         }
     }
 
@@ -392,8 +396,8 @@ impl Power {
 
     /// Spectrum of the pulse means, for a product with one more series.
     pub(crate) fn spectrum(&self) -> Rc<Kernel> {
-        let made = || Rc::new(filtered_spectrum(&self.raw, self.filter.as_deref(), FACTORS * self.raw.len()));
-        if self.raw.len() > KEPT_PULSES {
+        let made = || Rc::new(filtered_spectrum(&self.raw, self.filter.as_deref(), SPECTRUM_FACTORS * self.raw.len()));
+        if self.raw.len() > MAX_CACHED_PULSES {
             return made();
         }
         self.spectrum.get_or_init(made).clone()
@@ -401,7 +405,7 @@ impl Power {
 }
 
 /// Spectrum of a filtered series, of length `total`.
-pub(crate) fn filtered_spectrum(series: &[f64], filter: Option<&Filter>, total: usize) -> Kernel {
+pub(crate) fn filtered_spectrum(series: &[f64], filter: Option<&SeriesFilter>, total: usize) -> Kernel {
     let mut spectrum = Kernel::with_length(series, total);
     if let Some(filter) = filter {
         spectrum.multiply(&filter.spectrum);

@@ -15,16 +15,16 @@ use std::borrow::Cow;
 use std::sync::atomic::Ordering;
 
 use crate::error::Result;
-use crate::order_search::batches::batch::Hunt;
-use crate::order_search::batches::incumbent::Scouted;
-use crate::order_search::batches::vector_generation::Made;
-use crate::order_search::branch_and_bound::Boxes;
-use crate::order_search::candidate_index::Catalogue;
-use crate::order_search::control::{another, Checkpoint, Control, Place};
-use crate::order_search::grid::independent::Lattice;
-use crate::order_search::grid::traversal::visit;
+use crate::order_search::batches::batch::BatchEvaluation;
+use crate::order_search::batches::incumbent::InitialIncumbent;
+use crate::order_search::batches::vector_generation::GeneratedVectors;
+use crate::order_search::branch_and_bound::BranchAndBound;
+use crate::order_search::candidate_index::CandidateIndex;
+use crate::order_search::control::{mismatch_error, BatchPosition, Checkpoint, Control};
+use crate::order_search::grid::independent::OrderGrid;
+use crate::order_search::grid::traversal::low_discrepancy_order;
 use crate::order_search::options::{Criterion, Options};
-use crate::order_search::result::{Counts, Kept, Outcome, Part, Row};
+use crate::order_search::result::{Counts, Outcome, Part, Row, TopRows};
 use crate::parallel::pool;
 use crate::regressors::Record;
 
@@ -57,77 +57,79 @@ use crate::regressors::Record;
 /// ```
 pub fn search(
     records: &[Record],
-    lattice: &Lattice,
+    lattice: &OrderGrid,
     fixed: &[Option<f64>],
     options: &Options,
     control: &Control,
 ) -> Result<Outcome> {
     let pool = pool(options.threads)?;
-    let ready = Search::new(records, Cow::Borrowed(lattice), fixed, options, &pool, control)?;
+    let ready = BatchEvaluator::new(records, Cow::Borrowed(lattice), fixed, options, &pool, control)?;
     let mut all = Part::default();
     let mut first = 0;
-    for last in waves(rounds(lattice.count(), options)) {
+    for last in generation_ends(batch_count(lattice.count(), options)) {
         let seed = all.seed();
-        all.join(ready.rounds(first, last, &seed, None, &pool, control)?, options.keep);
+        all.join(ready.evaluate_batches(first, last, &seed, None, &pool, control)?, options.top);
         first = last;
     }
     Ok(all.outcome(options.norm, ready.catalogue.problem.samples()))
 }
 
 /// Evaluator of an order search, prepared for its batches.
-pub struct Search<'a> {
-    catalogue: Catalogue<'a>,
+pub struct BatchEvaluator<'a> {
+    catalogue: CandidateIndex<'a>,
     /// Branch and bound, if it excludes whole boxes of candidates.
-    boxes: Option<Boxes>,
+    boxes: Option<BranchAndBound>,
     /// Raw score above which no candidate can enter the table, from the initial sample.
     limit: f64,
 }
 
-impl<'a> Search<'a> {
+impl<'a> BatchEvaluator<'a> {
     /// Build the data shared by all batches: regressors, their products, test vectors and an initial limit.
     ///
     /// # Errors
     /// As [`search`].
     pub fn new(
         records: &[Record],
-        lattice: Cow<'a, Lattice>,
+        lattice: Cow<'a, OrderGrid>,
         fixed: &[Option<f64>],
         options: &Options,
         pool: &rayon::ThreadPool,
         control: &Control,
     ) -> Result<Self> {
         let count = lattice.count();
-        let mut catalogue = Catalogue::new(records, lattice, fixed, options, pool, &control.stop)?;
+        let mut catalogue = CandidateIndex::new(records, lattice, fixed, options, pool, &control.stop)?;
         control.total.store(count, Ordering::Relaxed);
         control.check_stop()?;
         let problem = &catalogue.problem;
         // An initial sample of few refined candidates would cost as much as the search.
-        let few = problem.refines() && count <= FEW;
-        if few || (problem.bound.is_none() && problem.squares.is_none()) {
+        let few = problem.refines() && count <= MAX_UNSAMPLED_CANDIDATES;
+        if few || (problem.bound.is_none() && problem.residual_sums.is_none()) {
             return Ok(Self { catalogue, boxes: None, limit: f64::INFINITY });
         }
-        let pay = count >= BOXED && Boxes::pay(&catalogue);
-        let closely = proved_closely(count, options);
-        let Scouted { mut kept, mut tried, hard, which } =
-            Hunt::new(&catalogue, None, pool, control).scout(pay, closely)?;
+        let pay = count >= MIN_BOX_CANDIDATES && BranchAndBound::is_worthwhile(&catalogue);
+        let closely = uses_close_bounds(count, options);
+        let InitialIncumbent { mut kept, mut tried, needs_close_bounds: hard, selected_vectors: which } =
+            BatchEvaluation::new(&catalogue, None, pool, control).find_incumbent(pay, closely)?;
         if let Some(which) = which {
             let problem = &mut catalogue.problem;
-            problem.bound = problem.bound.take().map(|bound| bound.chosen(&which));
+            problem.bound = problem.bound.take().map(|bound| bound.select_vectors(&which));
         }
         // The Gram matrix determines squared equation errors completely.
-        if pay && catalogue.problem.squares.is_none() && kept.limit < f64::INFINITY {
-            let (adapted, bytes) = catalogue.problem.no_adapted();
-            catalogue.problem.adapted = Some(adapted);
+        if pay && catalogue.problem.residual_sums.is_none() && kept.limit < f64::INFINITY {
+            let (adapted, bytes) = catalogue.problem.empty_tailored_vectors();
+            catalogue.problem.tailored_vectors = Some(adapted);
             for time in 0.. {
                 let best = kept.rows.first().map(|row| row.index);
-                let Made { vectors, left, again } =
-                    Hunt::new(&catalogue, None, pool, control).made(kept.limit, time, best)?;
-                catalogue.spare = catalogue.spare.saturating_sub(bytes.saturating_mul(vectors.len() as u64));
-                if let Some(adapted) = &mut catalogue.problem.adapted {
-                    adapted.each.extend(vectors);
+                let GeneratedVectors { vectors, open: left, is_worth_repeating: again } =
+                    BatchEvaluation::new(&catalogue, None, pool, control)
+                        .generate_tailored_vectors(kept.limit, time, best)?;
+                catalogue.spare_bytes =
+                    catalogue.spare_bytes.saturating_sub(bytes.saturating_mul(vectors.len() as u64));
+                if let Some(adapted) = &mut catalogue.problem.tailored_vectors {
+                    adapted.vectors.extend(vectors);
                 }
                 // Candidates that no vector excludes are likely to be good.
-                Hunt::new(&catalogue, None, pool, control).on_from(&left, &mut kept, &mut tried)?;
+                BatchEvaluation::new(&catalogue, None, pool, control).refine_from(&left, &mut kept, &mut tried)?;
                 if !again {
                     break;
                 }
@@ -135,20 +137,23 @@ impl<'a> Search<'a> {
         }
         let limit = kept.limit;
         if hard {
-            let spare = catalogue.spare;
-            catalogue.spare -= pool.install(|| catalogue.problem.with_roots(spare));
-            let along = Hunt::new(&catalogue, None, pool, control).along(limit)?;
+            let spare = catalogue.spare_bytes;
+            catalogue.spare_bytes -= pool.install(|| catalogue.problem.add_unstable_zeros(spare));
+            let along = BatchEvaluation::new(&catalogue, None, pool, control).generate_linearized_vectors(limit)?;
             if let Some(along) = along {
-                catalogue.spare = catalogue.spare.saturating_sub(along.held());
-                catalogue.problem.tangents = Some(along);
+                catalogue.spare_bytes = catalogue.spare_bytes.saturating_sub(along.memory_bytes());
+                catalogue.problem.linearized_vectors = Some(along);
             }
         }
-        let mut boxes = pool.install(|| if pay { Boxes::new(&catalogue) } else { None });
+        let mut boxes = pool.install(|| if pay { BranchAndBound::new(&catalogue) } else { None });
         control.check_stop()?;
         // Boxes, and tailored test vectors with them, may fail on the candidates that are open in the initial sample.
-        if hard && boxes.is_some() && !Hunt::new(&catalogue, boxes.as_ref(), pool, control).boxes_exclude(limit)? {
+        if hard
+            && boxes.is_some()
+            && !BatchEvaluation::new(&catalogue, boxes.as_ref(), pool, control).boxes_are_worthwhile(limit)?
+        {
             boxes = None;
-            catalogue.problem.adapted = None;
+            catalogue.problem.tailored_vectors = None;
         }
         Ok(Self { catalogue, boxes, limit })
     }
@@ -187,7 +192,7 @@ impl<'a> Search<'a> {
     /// assert_eq!(all.counts.candidates, 4);
     /// # Ok::<(), ftlm::error::Error>(())
     /// ```
-    pub fn rounds(
+    pub fn evaluate_batches(
         &self,
         first: u64,
         last: u64,
@@ -196,49 +201,54 @@ impl<'a> Search<'a> {
         pool: &rayon::ThreadPool,
         control: &Control,
     ) -> Result<Part> {
-        let Catalogue { lattice, options, .. } = &self.catalogue;
+        let CandidateIndex { lattice, options, .. } = &self.catalogue;
         let count = lattice.count();
-        let (all, length) = (rounds(count, options), round_length(count, options, algorithm(count, options)));
+        let (all, length) =
+            (batch_count(count, options), batch_size(count, options, algorithm_version(count, options)));
         let begun = from.is_none();
-        let from = from.unwrap_or_else(|| Checkpoint { place: Place::start(first), anew: true, part: Part::default() });
-        if !(first <= from.place.round && from.place.round <= last && last <= all) {
-            let what = format!("rounds {first} to {last} from {} on are not among {all}", from.place.round);
-            return Err(another(what));
+        let from = from.unwrap_or_else(|| Checkpoint {
+            place: BatchPosition::start(first),
+            replaces_previous: true,
+            part: Part::default(),
+        });
+        if !(first <= from.place.batch && from.place.batch <= last && last <= all) {
+            let what = format!("rounds {first} to {last} from {} on are not among {all}", from.place.batch);
+            return Err(mismatch_error(what));
         }
-        if !from.place.sound() {
-            let Place { followed, end, size, limit, .. } = from.place;
-            return Err(another(format!(
+        if !from.place.is_valid() {
+            let BatchPosition { evaluated_count: followed, end, size, limit, .. } = from.place;
+            return Err(mismatch_error(format!(
                 "a checkpoint stands at {followed} of {end} ({size} at a time, limit {limit})"
             )));
         }
-        if let Some((index, score)) = seed.iter().find(|(index, score)| *index >= count || strange(*score)) {
-            return Err(another(format!("a row of score {score} has index {index} among {count} candidates")));
+        if let Some((index, score)) = seed.iter().find(|(index, score)| *index >= count || is_invalid_score(*score)) {
+            return Err(mismatch_error(format!("a row of score {score} has index {index} among {count} candidates")));
         }
         self.check(&from.part)?;
         // Batches are distributed over the grid, so that early generations sample all of it and later ones start with a
         // good limit.
-        let order = visit(all);
-        let mut hunt = Hunt::new(&self.catalogue, self.boxes.as_ref(), pool, control);
+        let order = low_discrepancy_order(all);
+        let mut hunt = BatchEvaluation::new(&self.catalogue, self.boxes.as_ref(), pool, control);
         let Checkpoint { mut place, part, .. } = from;
         control.total.store(count, Ordering::Relaxed);
-        let known = part.counts.done();
+        let known = part.counts.processed_count();
         control.count(known, 0);
-        hunt.part = part;
-        hunt.anew = begun;
-        while place.round < last {
-            let start = order(place.round) * length;
+        hunt.result = part;
+        hunt.replaces_previous = begun;
+        while place.batch < last {
+            let start = order(place.batch) * length;
             let bounds = (start, count.min(start + length));
             let own = |row: &Row| bounds.0 <= row.index && row.index < bounds.1;
-            let mut kept = Kept::new(options.keep, self.limit);
+            let mut kept = TopRows::new(options.top, self.limit);
             let seeds = seed.iter().map(|&(index, score)| Row { index, score, coefficients: vec![], initial: vec![] });
-            kept.take(seeds);
-            kept.lower(options.early_stopping);
-            kept.take(hunt.part.rows.iter().filter(|row| own(row)).cloned());
-            hunt.part.rows.retain(|row| !own(row));
-            if !hunt.round(bounds, &mut kept, place)? {
+            kept.insert_rows(seeds);
+            kept.lower_limit(options.pruning);
+            kept.insert_rows(hunt.result.rows.iter().filter(|row| own(row)).cloned());
+            hunt.result.rows.retain(|row| !own(row));
+            if !hunt.evaluate_batch(bounds, &mut kept, place)? {
                 // Its candidates would be evaluated twice or never, so the foreign result is discarded.
                 control.done.fetch_sub(known, Ordering::Relaxed);
-                (hunt.part, hunt.anew, place) = (Part::default(), true, Place::start(first));
+                (hunt.result, hunt.replaces_previous, place) = (Part::default(), true, BatchPosition::start(first));
                 continue;
             }
             let part = Part {
@@ -246,56 +256,59 @@ impl<'a> Search<'a> {
                 counts: Counts { candidates: bounds.1 - bounds.0, ..Counts::default() },
                 failures: Vec::new(),
             };
-            hunt.part.join(part, options.keep);
-            place = Place::start(place.round + 1);
+            hunt.result.join(part, options.top);
+            place = BatchPosition::start(place.batch + 1);
         }
-        Ok(hunt.part)
+        Ok(hunt.result)
     }
 
     /// Raise an error for a partial result of another search.
     fn check(&self, part: &Part) -> Result<()> {
         let (count, width) = (self.catalogue.lattice.count(), self.catalogue.lattice.width());
-        let other = |row: &Row| row.coefficients.len() != width || row.index >= count || strange(row.score);
+        let other = |row: &Row| row.coefficients.len() != width || row.index >= count || is_invalid_score(row.score);
         if part.rows.iter().any(other) || part.failures.iter().any(|failure| failure.0 >= count) {
-            return Err(another("a checkpoint holds rows of another search".into()));
+            return Err(mismatch_error("a checkpoint holds rows of another search".into()));
         }
-        let done = part.counts.done();
-        if part.counts.boxed > part.counts.bounded {
-            let Counts { boxed, bounded, .. } = part.counts;
-            return Err(another(format!("a checkpoint has {boxed} candidates in boxes among {bounded} excluded ones")));
+        let done = part.counts.processed_count();
+        if part.counts.excluded_by_box > part.counts.excluded_by_bound {
+            let Counts { excluded_by_box: boxed, excluded_by_bound: bounded, .. } = part.counts;
+            return Err(mismatch_error(format!(
+                "a checkpoint has {boxed} candidates in boxes among {bounded} excluded ones"
+            )));
         }
         if done > count || part.counts.candidates > count {
-            return Err(another(format!("a checkpoint accounts for {done} candidates, but there are {count}")));
+            return Err(mismatch_error(format!("a checkpoint accounts for {done} candidates, but there are {count}")));
         }
         Ok(())
     }
 }
 
 /// Whether a value cannot be a raw sum of errors.
-fn strange(score: f64) -> bool {
+fn is_invalid_score(score: f64) -> bool {
     score.is_nan() || score < 0.0
 }
 
 /// Candidates per batch: ranked by the Gram matrix alone (16 ns each), screened by bounds (about 1 µs), all simulated.
 /// A batch is long enough to be sent to another machine, and short enough to be lost.
-const ROUND_PLAIN: u64 = 1 << 18;
-const ROUND_BOUNDED: u64 = 1 << 16;
-const ROUND_FOLLOWED: u64 = 1 << 12;
+const BATCH_SIZE_GRAM: u64 = 1 << 18;
+const BATCH_SIZE_BOUNDED: u64 = 1 << 16;
+const BATCH_SIZE_SIMULATED: u64 = 1 << 12;
 /// Minimum candidates for branch and bound, and maximum batch size. Batches grow with the grid because the tables of
 /// boxes shared by two batches are computed twice.
-pub(super) const BOXED: u64 = 1 << 25;
-const ROUND_LONGEST: u64 = 1 << 22;
+pub(super) const MIN_BOX_CANDIDATES: u64 = 1 << 25;
+const MAX_BATCH_SIZE: u64 = 1 << 22;
 /// Minimum candidates for close bounds if simulation ranks: unstable zeros and linearized test vectors. A smaller
 /// search ends before these are built.
-const PROVED: u64 = 1 << 18;
+const MIN_CLOSE_BOUND_CANDIDATES: u64 = 1 << 18;
 /// Maximum refined candidates that are evaluated without an initial sample, one batch.
-pub(super) const FEW: u64 = ROUND_FOLLOWED;
+pub(super) const MAX_UNSAMPLED_CANDIDATES: u64 = BATCH_SIZE_SIMULATED;
 
 /// Version of the algorithm that divides and evaluates a search over this many candidates.
 #[must_use]
-pub fn algorithm(candidates: u64, options: &Options) -> u64 {
-    let bounded = options.criterion == Criterion::OutputError || (candidates >= BOXED && !options.refines());
-    if options.early_stopping && bounded {
+pub fn algorithm_version(candidates: u64, options: &Options) -> u64 {
+    let bounded =
+        options.criterion == Criterion::OutputError || (candidates >= MIN_BOX_CANDIDATES && !options.refines());
+    if options.pruning && bounded {
         5
     } else {
         1
@@ -303,33 +316,35 @@ pub fn algorithm(candidates: u64, options: &Options) -> u64 {
 }
 
 /// Whether a search over this many candidates uses close bounds.
-pub(super) fn proved_closely(candidates: u64, options: &Options) -> bool {
-    candidates >= PROVED && options.scored_by_free_runs()
+pub(super) fn uses_close_bounds(candidates: u64, options: &Options) -> bool {
+    candidates >= MIN_CLOSE_BOUND_CANDIDATES && options.ranks_by_simulation()
 }
 
 /// Number of candidates per batch of a search, for this version of the algorithm.
-pub(super) fn round_length(candidates: u64, options: &Options, algorithm: u64) -> u64 {
-    if options.refines() || !options.early_stopping {
-        ROUND_FOLLOWED
-    } else if options.scored_by_products() && algorithm < 3 {
-        ROUND_PLAIN
-    } else if algorithm < 2 || candidates < BOXED {
-        ROUND_BOUNDED
+pub(super) fn batch_size(candidates: u64, options: &Options, algorithm: u64) -> u64 {
+    if options.refines() || !options.pruning {
+        BATCH_SIZE_SIMULATED
+    } else if options.ranks_by_gram_matrix() && algorithm < 3 {
+        BATCH_SIZE_GRAM
+    } else if algorithm < 2 || candidates < MIN_BOX_CANDIDATES {
+        BATCH_SIZE_BOUNDED
     } else {
-        (candidates / (BOXED / ROUND_BOUNDED)).next_power_of_two().clamp(ROUND_BOUNDED, ROUND_LONGEST)
+        (candidates / (MIN_BOX_CANDIDATES / BATCH_SIZE_BOUNDED))
+            .next_power_of_two()
+            .clamp(BATCH_SIZE_BOUNDED, MAX_BATCH_SIZE)
     }
 }
 
 /// Number of batches of a search over this many candidates.
 #[must_use]
-pub fn rounds(candidates: u64, options: &Options) -> u64 {
-    rounds_by(algorithm(candidates, options), candidates, options)
+pub fn batch_count(candidates: u64, options: &Options) -> u64 {
+    batch_count_by_version(algorithm_version(candidates, options), candidates, options)
 }
 
 /// Number of batches for an earlier version of the algorithm, whose completed batches must be read.
 #[must_use]
-pub fn rounds_by(algorithm: u64, candidates: u64, options: &Options) -> u64 {
-    candidates.div_ceil(round_length(candidates, options, algorithm))
+pub fn batch_count_by_version(algorithm: u64, candidates: u64, options: &Options) -> u64 {
+    candidates.div_ceil(batch_size(candidates, options, algorithm))
 }
 
 /// End of each generation for this number of batches: 1, 3, 7, …
@@ -341,7 +356,7 @@ pub fn rounds_by(algorithm: u64, candidates: u64, options: &Options) -> u64 {
 /// assert_eq!((batches, generation_ends(batches)), (7, vec![1, 3, 7]));
 /// ```
 #[must_use]
-pub fn waves(rounds: u64) -> Vec<u64> {
+pub fn generation_ends(rounds: u64) -> Vec<u64> {
     let mut ends = Vec::new();
     let mut end: u64 = 0;
     while end < rounds {

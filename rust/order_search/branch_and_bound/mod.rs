@@ -9,5 +9,5 @@ mod axis_table;
 mod bisection;
 mod box_bound;
 
-pub use bisection::{box_bounds, left_open, Boxed};
-pub(crate) use bisection::{screen_slab, Boxes, LEAST};
+pub use bisection::{box_bounds, open_candidates, BoxBound};
+pub(crate) use bisection::{screen_slice, BranchAndBound, MIN_SLICE_CANDIDATES};

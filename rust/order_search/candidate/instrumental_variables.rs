@@ -13,7 +13,7 @@ use crate::series::Kernel;
 const START_BAND: f64 = 2.0;
 
 /// Spectra of one record that the refinement of every candidate reads.
-struct Shelf {
+struct RecordSpectra {
     /// Spectrum of each column of the bank.
     columns: Vec<Kernel>,
     /// Spectrum of the kernel of each column of the output itself.
@@ -23,7 +23,7 @@ struct Shelf {
 
 /// Refinement of coefficients by instrumental variables.
 pub(crate) struct Refiner {
-    shelves: Vec<Shelf>,
+    spectra: Vec<RecordSpectra>,
     settings: Settings,
 }
 
@@ -31,13 +31,13 @@ impl Refiner {
     /// Compute the spectra of the columns of `banks`, which belong to the records' noise-free signals. Unusable after a
     /// stop request.
     pub(crate) fn new(records: &[Record], output: usize, banks: &[Bank], settings: Settings, stop: &Stop) -> Self {
-        let shelves = records
+        let spectra = records
             .iter()
             .zip(banks)
             .map(|(record, bank)| {
                 let all = || (0..bank.len()).collect();
                 let spectrum = |x: &[f64]| Kernel::new(if stop.is_set() { &[] } else { x });
-                Shelf {
+                RecordSpectra {
                     columns: parallel::map(all(), || (), |(), p| spectrum(bank.column(p))),
                     kernels: parallel::map(
                         all(),
@@ -48,7 +48,7 @@ impl Refiner {
                 }
             })
             .collect();
-        Self { shelves, settings }
+        Self { spectra, settings }
     }
 
     /// Refine coefficients in place: those of the terms, then those of the initial terms by record. The result is
@@ -63,7 +63,7 @@ impl Refiner {
         stop: &Stop,
     ) -> std::result::Result<(), Failure> {
         let sources: Vec<Source<'_>> = self
-            .shelves
+            .spectra
             .iter()
             .zip(banks)
             .zip(targets)
@@ -100,7 +100,7 @@ impl Refiner {
 /// As [`Bank::counted`].
 pub(crate) fn start_bank(record: &Record, output: usize, index: &Index, stop: &Stop) -> Result<(Bank, Vec<f64>)> {
     let band = START_BAND * power_frequency(record.signal(output), record.step());
-    let smooth = record.cleaned().through(&low_pass(band, record)?)?;
+    let smooth = record.clean_record().with_filter(&low_pass(band, record)?)?;
     let target = smooth.signal(output).to_vec();
-    Ok((Bank::counted(index, &smooth, output, stop)?, target))
+    Ok((Bank::new_interruptible(index, &smooth, output, stop)?, target))
 }

@@ -3,10 +3,10 @@
 //! The squared equation error follows from the Gram matrix alone.
 
 use crate::error::Result;
-use crate::estimation::multi_innovation::{Innovation, Rows};
+use crate::estimation::multi_innovation::{Innovation, RowBasis};
 use crate::fractional::operational_matrices;
 use crate::linalg::dense;
-use crate::linalg::small::{packed, solve_lanes, PIVOT_FLOOR};
+use crate::linalg::small::{packed_index, solve_lanes, PIVOT_FLOOR};
 use crate::order_search::candidate::columns::Columns;
 use crate::parallel::Stop;
 use crate::regressors::Bank;
@@ -86,7 +86,7 @@ impl<const L: usize> Solve<L> {
 pub(crate) struct NormalEquations {
     terms: Normal,
     /// Equations of each record for its initial terms. Empty for zero initial conditions.
-    parts: Vec<Normal>,
+    record_equations: Vec<Normal>,
     /// Coefficients by term, `None` for a free one, and the indices of the free terms.
     fixed: Vec<Option<f64>>,
     free: Vec<usize>,
@@ -94,18 +94,18 @@ pub(crate) struct NormalEquations {
 
 impl NormalEquations {
     /// Combine the equations of all records and, with initial terms, those of each record.
-    pub(super) fn new(terms: Normal, parts: Vec<Normal>, fixed: &[Option<f64>]) -> Self {
+    pub(super) fn new(terms: Normal, record_equations: Vec<Normal>, fixed: &[Option<f64>]) -> Self {
         let free = (0..fixed.len()).filter(|&k| fixed[k].is_none()).collect();
-        Self { terms, parts, fixed: fixed.to_vec(), free }
+        Self { terms, record_equations, fixed: fixed.to_vec(), free }
     }
 
     /// Equations over all records if no coefficient is fixed and there are no initial terms.
-    pub(crate) fn whole(&self) -> Option<&Normal> {
-        (self.parts.is_empty() && self.free.len() == self.fixed.len()).then_some(&self.terms)
+    pub(crate) fn unconstrained_equations(&self) -> Option<&Normal> {
+        (self.record_equations.is_empty() && self.free.len() == self.fixed.len()).then_some(&self.terms)
     }
 
     /// Coefficients by term, `None` for a free one.
-    pub(super) fn fixed(&self) -> &[Option<f64>] {
+    pub(super) fn fixed_coefficients(&self) -> &[Option<f64>] {
         &self.fixed
     }
 
@@ -121,17 +121,17 @@ impl NormalEquations {
     ) -> [bool; L] {
         let normal = &self.terms;
         let (free, width) = (self.free.len(), normal.width);
-        let k = free + initial.len() * self.parts.len();
+        let k = free + initial.len() * self.record_equations.len();
         let zero = [0.0; L];
         let Solve { gram, rhs, coefficients, initial: weights } = solve;
         gram.clear();
-        gram.resize(packed(k, 0), zero);
+        gram.resize(packed_index(k, 0), zero);
         rhs.clear();
         rhs.resize(k, zero);
         for (a, &ta) in self.free.iter().enumerate() {
             let rows = &positions[ta];
             for (b, &tb) in self.free[..=a].iter().enumerate() {
-                gram[packed(a, b)] = rows.with(&positions[tb], &normal.correlation, width);
+                gram[packed_index(a, b)] = rows.with(&positions[tb], &normal.correlation, width);
             }
             rhs[a] = rows.of(&normal.rhs);
             for (columns, fixed) in positions.iter().zip(&self.fixed) {
@@ -141,7 +141,7 @@ impl NormalEquations {
                 }
             }
         }
-        for (r, part) in self.parts.iter().enumerate() {
+        for (r, part) in self.record_equations.iter().enumerate() {
             for (i, &e) in initial.iter().enumerate() {
                 let a = free + r * initial.len() + i;
                 let row = &part.correlation[e * width..(e + 1) * width];
@@ -149,10 +149,10 @@ impl NormalEquations {
                     // Contribution of this record to a term's column, relative to the column's norm over all records.
                     let columns = &positions[tb];
                     let (c, size, all) = (columns.of(row), columns.of(&part.size), columns.of(&normal.inverse));
-                    gram[packed(a, b)] = std::array::from_fn(|n| c[n] * size[n] * all[n]);
+                    gram[packed_index(a, b)] = std::array::from_fn(|n| c[n] * size[n] * all[n]);
                 }
                 for (j, &f) in initial[..=i].iter().enumerate() {
-                    gram[packed(a, free + r * initial.len() + j)] = [row[f]; L];
+                    gram[packed_index(a, free + r * initial.len() + j)] = [row[f]; L];
                 }
                 rhs[a] = [part.rhs[e]; L];
                 for (columns, fixed) in positions.iter().zip(&self.fixed) {
@@ -182,7 +182,7 @@ impl NormalEquations {
             });
         }
         weights.clear();
-        for (r, part) in self.parts.iter().enumerate() {
+        for (r, part) in self.record_equations.iter().enumerate() {
             for (i, &e) in initial.iter().enumerate() {
                 let x = rhs[free + r * initial.len() + i];
                 weights.push(std::array::from_fn(|n| x[n] * part.inverse[e]));
@@ -199,7 +199,12 @@ pub(super) fn plain_gram(bank: &Bank, target: &[f64], stop: &Stop) -> Vec<f64> {
 
 /// Apply multi-innovation weights to a Gram matrix: p on all rows but the last p − 1.
 #[allow(clippy::cast_precision_loss)]
-pub(super) fn weigh(gram: &mut [f64], bank: &Bank, target: &[f64], innovation: Innovation) -> Result<()> {
+pub(super) fn apply_innovation_weights(
+    gram: &mut [f64],
+    bank: &Bank,
+    target: &[f64],
+    innovation: Innovation,
+) -> Result<()> {
     let width = bank.len() + 1;
     // Φ is orthogonal: the unweighted Gram matrix is the same in Haar coordinates.
     let m = target.len();
@@ -208,8 +213,8 @@ pub(super) fn weigh(gram: &mut [f64], bank: &Bank, target: &[f64], innovation: I
     let mut rows = vec![vec![0.0; width]; tail];
     for j in 0..width {
         let mut values = if j < bank.len() { bank.column(j) } else { target }.to_vec();
-        if innovation.rows == Rows::Haar {
-            operational_matrices::transform(&mut values)?;
+        if innovation.row_basis == RowBasis::Haar {
+            operational_matrices::haar_transform(&mut values)?;
         }
         for (t, row) in rows.iter_mut().enumerate() {
             row[j] = values[m - 1 - t];
@@ -228,7 +233,7 @@ pub(super) fn weigh(gram: &mut [f64], bank: &Bank, target: &[f64], innovation: I
 }
 
 /// Gram matrix of columns and target summed over records, with the norms of the columns.
-pub(crate) struct Squares {
+pub(crate) struct ResidualSumOfSquares {
     stride: usize,
     gram: Vec<f64>,
     /// Its diagonal, and the roots of that.
@@ -239,10 +244,10 @@ pub(crate) struct Squares {
     /// Same bound for the minimum over all coefficients, and the smallest eigenvalue for which it holds. The eigenvalue
     /// is that of the terms' correlation matrix (docs/mathematics.md).
     slack: f64,
-    flat: f64,
+    min_eigenvalue: f64,
 }
 
-impl Squares {
+impl ResidualSumOfSquares {
     /// Build from a Gram matrix over `width` columns and the target, row-major. `samples` is the length of its sums,
     /// `terms` the number of terms of a candidate. `weights` is the largest weight of a row in the normal equations.
     #[allow(clippy::cast_precision_loss)]
@@ -256,7 +261,7 @@ impl Squares {
             unit: 4.0 * f64::EPSILON * samples as f64,
             slack,
             // Candidates with this minimum eigenvalue are regular in the weighted equations, too.
-            flat: (2.0 * terms as f64 * slack).max(16.0 * weights as f64 * PIVOT_FLOOR),
+            min_eigenvalue: (2.0 * terms as f64 * slack).max(16.0 * weights as f64 * PIVOT_FLOOR),
         }
     }
 
@@ -298,8 +303,8 @@ impl Squares {
 
     /// Smallest eigenvalue of a correlation matrix for which the bound holds.
     #[inline(always)]
-    pub(super) fn flat(&self) -> f64 {
-        self.flat
+    pub(super) fn min_eigenvalue(&self) -> f64 {
+        self.min_eigenvalue
     }
 
     /// Lower bounds of the squared equation error of L candidates, including rounding, and its computed values.

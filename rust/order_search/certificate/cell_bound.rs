@@ -11,26 +11,28 @@
 
 use crate::error::{check_length, Error, Result};
 use crate::linalg::dense::inner_products;
-use crate::order_search::certificate::regressor_expansion::{series, unit, Curve, ALL, MOST};
-use crate::order_search::certificate::subspace_bound::Span;
+use crate::order_search::certificate::regressor_expansion::{
+    rounding_unit, taylor_sum, RegressorExpansion, EXPANSION_COLUMNS, MAX_TERMS,
+};
+use crate::order_search::certificate::subspace_bound::DerivativeSubspace;
 use crate::parallel::Stop;
 use crate::regressors::Record;
 
-type Row = [f64; MOST];
+type Row = [f64; MAX_TERMS];
 
 /// Relative margin of B, and of the inverse matrices. It is far above their rounding error.
-const HAIR: f64 = 1e-6;
-const SIXTEENTH: f64 = 1.0 / 16.0;
+const BOUND_MARGIN: f64 = 1e-6;
+const INVERSE_TOLERANCE: f64 = 1.0 / 16.0;
 
 /// Inner products of the columns at the midpoint of a cell, for all k terms. The columns and the target have unit norm.
 #[derive(Debug, Clone, Copy)]
-pub(super) struct Local {
+pub(super) struct CellProducts {
     pub(super) k: usize,
     /// x_i·x_j⁽ᵐ⁾, by m, then i, then j.
-    pub(super) products: [[Row; MOST]; ALL],
+    pub(super) products: [[Row; MAX_TERMS]; EXPANSION_COLUMNS],
     /// x_j⁽ᵐ⁾·y and ‖x_j⁽ᵐ⁾‖.
-    pub(super) target: [Row; ALL],
-    pub(super) sizes: [Row; ALL],
+    pub(super) target: [Row; EXPANSION_COLUMNS],
+    pub(super) sizes: [Row; EXPANSION_COLUMNS],
     /// Remainders of the expansions, and half widths of the cell.
     pub(super) rests: Row,
     pub(super) halves: Row,
@@ -38,47 +40,49 @@ pub(super) struct Local {
     pub(super) rounding: f64,
 }
 
-impl Local {
+impl CellProducts {
     pub(super) fn new(k: usize, samples: usize) -> Self {
         Self {
             k,
-            products: [[[0.0; MOST]; MOST]; ALL],
-            target: [[0.0; MOST]; ALL],
-            sizes: [[0.0; MOST]; ALL],
-            rests: [0.0; MOST],
-            halves: [0.0; MOST],
+            products: [[[0.0; MAX_TERMS]; MAX_TERMS]; EXPANSION_COLUMNS],
+            target: [[0.0; MAX_TERMS]; EXPANSION_COLUMNS],
+            sizes: [[0.0; MAX_TERMS]; EXPANSION_COLUMNS],
+            rests: [0.0; MAX_TERMS],
+            halves: [0.0; MAX_TERMS],
             // Products of stored columns have an eighth of the rounding error of a chain of transforms.
-            rounding: unit(samples) / 8.0,
+            rounding: rounding_unit(samples) / 8.0,
         }
     }
 }
 
 /// Bound of a cell, relative to the squared norm of the target.
 #[derive(Debug, Clone, Copy)]
-pub(super) struct Bounded {
+pub(super) struct CellBound {
     /// Lower bound of the relative squared residual of all orders in the cell, 0 if nothing is proved.
-    pub(super) least: f64,
+    pub(super) lower_bound: f64,
     /// Relative squared residual at the midpoint, infinite if it cannot be computed.
-    pub(super) middle: f64,
+    pub(super) midpoint_residual: f64,
     /// Loss of the bound caused by the width of each order.
     pub(super) costs: Row,
 }
 
-impl Local {
+impl CellProducts {
     #[allow(clippy::cast_precision_loss)]
-    pub(super) fn bound(&self) -> Bounded {
+    pub(super) fn bound(&self) -> CellBound {
         let k = self.k;
-        let mut found = Bounded { least: 0.0, middle: f64::INFINITY, costs: self.halves };
+        let mut found = CellBound { lower_bound: 0.0, midpoint_residual: f64::INFINITY, costs: self.halves };
         let Some(inverse) = inverse(self.products[0], k) else { return found };
         let trace: f64 = (0..k).map(|i| inverse[i][i]).sum();
         let terms = (k * k) as f64;
         let lost = self.rounding * terms;
         let elimination = 64.0 * f64::EPSILON * terms * terms * trace * trace;
         // This form of the condition also rejects NaN.
-        if !(trace * lost < SIXTEENTH * SIXTEENTH && elimination < SIXTEENTH * SIXTEENTH) {
+        if !(trace * lost < INVERSE_TOLERANCE * INVERSE_TOLERANCE
+            && elimination < INVERSE_TOLERANCE * INVERSE_TOLERANCE)
+        {
             return found;
         }
-        let mut c = [0.0; MOST];
+        let mut c = [0.0; MAX_TERMS];
         for i in 0..k {
             c[i] = (0..k).map(|j| inverse[i][j] * self.target[0][j]).sum();
         }
@@ -93,31 +97,31 @@ impl Local {
         if !(square.is_finite() && square > error) {
             return found;
         }
-        found.middle = square;
+        found.midpoint_residual = square;
         let size = (square + error).sqrt();
-        let (mut tau, mut gamma, mut a) = ([0.0; MOST], [0.0; MOST], [[0.0; MOST]; MOST]);
+        let (mut tau, mut gamma, mut a) = ([0.0; MAX_TERMS], [0.0; MAX_TERMS], [[0.0; MAX_TERMS]; MAX_TERMS]);
         for j in 0..k {
             let half = self.halves[j];
             tau[j] = along(0, j).abs() + self.rounding * all;
             gamma[j] =
-                series(half, |m| along(m, j).abs() + self.rounding * all * self.sizes[m][j]) + size * self.rests[j];
+                taylor_sum(half, |m| along(m, j).abs() + self.rounding * all * self.sizes[m][j]) + size * self.rests[j];
             for i in 0..k {
                 let part = |m: usize| -> (f64, f64) {
                     let terms = (0..k).map(|l| inverse[i][l] * self.products[m][l][j]);
                     terms.fold((0.0, 0.0), |(sum, all), x| (sum + x, all + x.abs()))
                 };
                 let rounded = lost * trace;
-                let within = series(half, |m| {
+                let within = taylor_sum(half, |m| {
                     let (sum, all) = part(m);
                     sum.abs() + rounded * (all + (1.0 + trace) * self.sizes[m][j])
                 });
-                let beyond = (inverse[i][i].max(0.0) * (1.0 + SIXTEENTH)).sqrt() * self.rests[j];
+                let beyond = (inverse[i][i].max(0.0) * (1.0 + INVERSE_TOLERANCE)).sqrt() * self.rests[j];
                 a[i][j] = within + beyond;
             }
         }
         let costs = |j: usize| (0..k).map(|i| a[i][j]).sum::<f64>();
         (0..k).for_each(|j| found.costs[j] = costs(j));
-        let Some(b) = dominating(&a, &gamma, &tau, k) else { return found };
+        let Some(b) = dominating_vector(&a, &gamma, &tau, k) else { return found };
         let (mut first, mut second) = (0.0, 0.0);
         for i in 0..k {
             let cost = 2.0 * c[i].abs() * b[i];
@@ -127,18 +131,18 @@ impl Local {
                 second += (b[i] + tau[i]) * inverse[i][j].abs() * (b[j] + tau[j]);
             }
         }
-        let least = (square - error - first - second * (1.0 + SIXTEENTH)) * (1.0 - HAIR * HAIR);
+        let least = (square - error - first - second * (1.0 + INVERSE_TOLERANCE)) * (1.0 - BOUND_MARGIN * BOUND_MARGIN);
         // Neither NaN nor an overflow proves anything.
         if least > 0.0 && least.is_finite() {
-            found.least = least;
+            found.lower_bound = least;
         }
         found
     }
 }
 
 /// Inverse of a positive definite matrix.
-fn inverse(mut matrix: [Row; MOST], k: usize) -> Option<[Row; MOST]> {
-    let mut out = [[0.0; MOST]; MOST];
+fn inverse(mut matrix: [Row; MAX_TERMS], k: usize) -> Option<[Row; MAX_TERMS]> {
+    let mut out = [[0.0; MAX_TERMS]; MAX_TERMS];
     (0..k).for_each(|i| out[i][i] = 1.0);
     for i in 0..k {
         let pivot = matrix[i][i];
@@ -161,8 +165,8 @@ fn inverse(mut matrix: [Row; MOST], k: usize) -> Option<[Row; MOST]> {
 }
 
 /// A vector B with B > γ + Aᵀ(τ + B), which proves that I + A is regular. `None` if none is found.
-fn dominating(a: &[Row; MOST], gamma: &Row, tau: &Row, k: usize) -> Option<Row> {
-    let (mut matrix, mut right) = ([[0.0; MOST]; MOST], [0.0; MOST]);
+fn dominating_vector(a: &[Row; MAX_TERMS], gamma: &Row, tau: &Row, k: usize) -> Option<Row> {
+    let (mut matrix, mut right) = ([[0.0; MAX_TERMS]; MAX_TERMS], [0.0; MAX_TERMS]);
     for i in 0..k {
         right[i] = gamma[i] + (0..k).map(|j| a[j][i] * tau[j]).sum::<f64>() + f64::MIN_POSITIVE.sqrt();
         for j in 0..k {
@@ -181,14 +185,15 @@ fn dominating(a: &[Row; MOST], gamma: &Row, tau: &Row, k: usize) -> Option<Row> 
             right[l] -= factor * right[i];
         }
     }
-    let mut b = [0.0; MOST];
+    let mut b = [0.0; MAX_TERMS];
     for i in (0..k).rev() {
         let sum: f64 = (i + 1..k).map(|j| matrix[i][j] * b[j]).sum();
         b[i] = (right[i] - sum) / matrix[i][i];
     }
-    b[..k].iter_mut().for_each(|b| *b *= 1.0 + HAIR);
+    b[..k].iter_mut().for_each(|b| *b *= 1.0 + BOUND_MARGIN);
     // Accept the vector only if it satisfies the inequality.
-    let proved = |i: usize| (wanted[i] + (0..k).map(|j| a[j][i] * b[j]).sum::<f64>()) * (1.0 + 1e-3 * HAIR) <= b[i];
+    let proved =
+        |i: usize| (wanted[i] + (0..k).map(|j| a[j][i] * b[j]).sum::<f64>()) * (1.0 + 1e-3 * BOUND_MARGIN) <= b[i];
     (0..k).all(proved).then_some(b)
 }
 
@@ -218,7 +223,7 @@ pub fn cell_bounds(
     terms: &[(usize, f64, f64)],
     (largest, goal): (f64, f64),
 ) -> Result<(f64, f64)> {
-    check(records, output, terms.iter().map(|t| t.0))?;
+    check_records(records, output, terms.iter().map(|t| t.0))?;
     for &(_, middle, half) in terms {
         if !(half >= 0.0 && half <= middle && middle < 20.0) {
             return Err(Error::OutOfRange {
@@ -229,47 +234,49 @@ pub fn cell_bounds(
             });
         }
     }
-    let (local, span, square) = about(records, output, terms, &Stop::default())?;
-    Ok((local.bound().least * square, span.bound(largest, goal / square) * square))
+    let (local, span, square) = expand_cell(records, output, terms, &Stop::default())?;
+    Ok((local.bound().lower_bound * square, span.bound(largest, goal / square) * square))
 }
 
 /// Inner products and subspace of a cell with these midpoints and half widths, and the squared norm of the output.
-pub(super) fn about(
+pub(super) fn expand_cell(
     records: &[Record],
     output: usize,
     terms: &[(usize, f64, f64)],
     stop: &Stop,
-) -> Result<(Local, Span, f64)> {
+) -> Result<(CellProducts, DerivativeSubspace, f64)> {
     let target: Vec<f64> = records.iter().flat_map(|r| r.signal(output)).copied().collect();
     let square = target.iter().map(|v| v * v).sum::<f64>();
     let curves = terms
         .iter()
-        .map(|&(s, middle, half)| Curve::new(records, s, middle, half, stop))
+        .map(|&(s, middle, half)| RegressorExpansion::new(records, s, middle, half, stop))
         .collect::<Result<Vec<_>>>()?;
     let all: Vec<&[f64]> = curves.iter().flat_map(|c| c.columns.iter().map(Vec::as_slice)).collect();
     let (products, along) = (inner_products(&all, &all, stop), inner_products(&[&target], &all, stop));
     stop.check()?;
-    let product = |(i, n): (usize, usize), (j, m): (usize, usize)| products[(i * ALL + n) * all.len() + j * ALL + m];
-    let target_product = |(j, m): (usize, usize)| along[j * ALL + m] / square.sqrt();
-    let (mut local, mut span) = (Local::new(terms.len(), target.len()), Span::new(target.len()));
+    let product = |(i, n): (usize, usize), (j, m): (usize, usize)| {
+        products[(i * EXPANSION_COLUMNS + n) * all.len() + j * EXPANSION_COLUMNS + m]
+    };
+    let target_product = |(j, m): (usize, usize)| along[j * EXPANSION_COLUMNS + m] / square.sqrt();
+    let (mut local, mut span) = (CellProducts::new(terms.len(), target.len()), DerivativeSubspace::new(target.len()));
     for (j, (curve, &(_, _, half))) in curves.iter().zip(terms).enumerate() {
-        for m in 0..ALL {
+        for m in 0..EXPANSION_COLUMNS {
             for i in 0..terms.len() {
                 local.products[m][i][j] = product((i, 0), (j, m));
             }
             local.target[m][j] = target_product((j, m));
             local.sizes[m][j] = curve.sizes[m];
         }
-        local.rests[j] = curve.rest;
+        local.rests[j] = curve.remainder;
         local.halves[j] = half;
-        span.add(half, curve.sizes, curve.rest);
+        span.add(half, curve.sizes, curve.remainder);
     }
     span.fill(product, target_product);
     Ok((local, span, square))
 }
 
 /// Raise an error for records and signals that cannot be certified.
-pub(super) fn check(records: &[Record], output: usize, signals: impl Iterator<Item = usize>) -> Result<()> {
+pub(super) fn check_records(records: &[Record], output: usize, signals: impl Iterator<Item = usize>) -> Result<()> {
     let Some(first) = records.first() else {
         return Err(Error::Structure { what: "no record is given".into(), remedy: "give at least one run".into() });
     };
@@ -290,10 +297,10 @@ pub(super) fn check(records: &[Record], output: usize, signals: impl Iterator<It
             remedy: "scale it so that its squares are positive numbers".into(),
         });
     }
-    if !(1..=MOST).contains(&signals.len()) {
+    if !(1..=MAX_TERMS).contains(&signals.len()) {
         return Err(Error::Structure {
             what: format!("an equation of {} terms", signals.len()),
-            remedy: format!("certificates are of 1 to {MOST} terms"),
+            remedy: format!("certificates are of 1 to {MAX_TERMS} terms"),
         });
     }
     Ok(())

@@ -11,6 +11,6 @@ mod gram_tables;
 mod regressor_expansion;
 mod subspace_bound;
 
-pub use bisection::{certify, Asked, Certificate};
+pub use bisection::{certify, Certificate, CertificateOptions};
 pub use cell_bound::cell_bounds;
 pub use gram_tables::{Range, Region};

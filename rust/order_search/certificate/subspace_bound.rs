@@ -4,59 +4,59 @@
 //! nothing. The distance of the output from this subspace still bounds the equation error for coefficients of limited
 //! size, since the subspace omits only terms of third order from the columns.
 
-use crate::order_search::certificate::regressor_expansion::{unit, ALL, MOST};
+use crate::order_search::certificate::regressor_expansion::{rounding_unit, EXPANSION_COLUMNS, MAX_TERMS};
 
 /// Number of spanning columns of a term: the value and its derivatives.
-const SPANNED: usize = 3;
-const ROWS: usize = SPANNED * MOST;
+const SPANNED_DERIVATIVES: usize = 3;
+const MAX_BASIS_ROWS: usize = SPANNED_DERIVATIVES * MAX_TERMS;
 /// Ridge on the squared coefficients, relative to the goal for all of them together, and its minimum. The ridge keeps
 /// nearly dependent columns harmless.
-const SHARE: f64 = 0.05;
-const RIDGE: f64 = 1e-11;
+const RIDGE_GOAL_SHARE: f64 = 0.05;
+const MIN_RIDGE: f64 = 1e-11;
 /// Relative margin for the rounding of the bound.
-const HAIR: f64 = 1e-9;
+const ROUNDING_MARGIN: f64 = 1e-9;
 
 /// Subspace spanned by the scaled columns x, ωx′, ω²x″/2. In this scaling no derivative has larger coefficients than
 /// the value.
-pub(super) struct Span {
+pub(super) struct DerivativeSubspace {
     /// Term, derivative and scale of each row.
-    rows: [((usize, usize), f64); ROWS],
+    rows: [((usize, usize), f64); MAX_BASIS_ROWS],
     count: usize,
     terms: usize,
-    matrix: [[f64; ROWS]; ROWS],
-    target: [f64; ROWS],
+    matrix: [[f64; MAX_BASIS_ROWS]; MAX_BASIS_ROWS],
+    target: [f64; MAX_BASIS_ROWS],
     /// Largest norm omitted from a unit column, and smallest norm of a unit column within the cell.
-    beyond: f64,
-    least: f64,
+    max_omitted_norm: f64,
+    min_column_norm: f64,
     /// Rounding-error bound of a product of two unit columns.
     rounding: f64,
 }
 
-impl Span {
+impl DerivativeSubspace {
     pub(super) fn new(samples: usize) -> Self {
         Self {
-            rows: [((0, 0), 0.0); ROWS],
+            rows: [((0, 0), 0.0); MAX_BASIS_ROWS],
             count: 0,
             terms: 0,
-            matrix: [[0.0; ROWS]; ROWS],
-            target: [0.0; ROWS],
-            beyond: 0.0,
-            least: 1.0,
-            rounding: unit(samples) / 8.0,
+            matrix: [[0.0; MAX_BASIS_ROWS]; MAX_BASIS_ROWS],
+            target: [0.0; MAX_BASIS_ROWS],
+            max_omitted_norm: 0.0,
+            min_column_norm: 1.0,
+            rounding: rounding_unit(samples) / 8.0,
         }
     }
 
     /// Add a term: half its width, the norms of its columns and the remainder of its expansion.
-    pub(super) fn add(&mut self, half: f64, sizes: [f64; ALL], rest: f64) {
+    pub(super) fn add(&mut self, half: f64, sizes: [f64; EXPANSION_COLUMNS], rest: f64) {
         let units = [1.0, half, half * half / 2.0, half * half * half / 6.0];
-        for (derivative, unit) in units.into_iter().enumerate().take(if half > 0.0 { SPANNED } else { 1 }) {
+        for (derivative, unit) in units.into_iter().enumerate().take(if half > 0.0 { SPANNED_DERIVATIVES } else { 1 }) {
             self.rows[self.count] = ((self.terms, derivative), unit);
             self.count += 1;
         }
         self.terms += 1;
-        let off = |from: usize| (from..ALL).map(|m| units[m] * sizes[m]).sum::<f64>() + rest;
-        self.beyond = self.beyond.max(off(SPANNED));
-        self.least = self.least.min(1.0 - off(1));
+        let off = |from: usize| (from..EXPANSION_COLUMNS).map(|m| units[m] * sizes[m]).sum::<f64>() + rest;
+        self.max_omitted_norm = self.max_omitted_norm.max(off(SPANNED_DERIVATIVES));
+        self.min_column_norm = self.min_column_norm.min(1.0 - off(1));
     }
 
     /// Fill in the products of the columns of terms and derivatives, and those with the target.
@@ -79,13 +79,13 @@ impl Span {
     /// Lower bound of the relative squared residual over the cell, 0 if nothing is proved. It holds for coefficients
     /// whose terms sum up to at most `largest` times the norm of the output. The ridge is tuned for `goal`.
     pub(super) fn bound(&self, largest: f64, goal: f64) -> f64 {
-        if self.least.is_nan() || self.least <= 0.5 || goal.is_nan() {
+        if self.min_column_norm.is_nan() || self.min_column_norm <= 0.5 || goal.is_nan() {
             return 0.0;
         }
-        let (n, all) = (self.count, largest / self.least);
-        let powers = f64::from(u8::try_from(SPANNED).unwrap_or(u8::MAX));
-        let added = (SHARE * goal / (powers * all * all)).clamp(RIDGE, 1.0);
-        let coefficients = self.minimum(added);
+        let (n, all) = (self.count, largest / self.min_column_norm);
+        let powers = f64::from(u8::try_from(SPANNED_DERIVATIVES).unwrap_or(u8::MAX));
+        let added = (RIDGE_GOAL_SHARE * goal / (powers * all * all)).clamp(MIN_RIDGE, 1.0);
+        let coefficients = self.ridge_solution(added);
         // The minimum of the form with the ridge is at least its value anywhere minus |gradient|²/(4·ridge). The bound
         // uses the exact form of the columns, which is positive semidefinite, not the rounded one.
         let (mut value, mut gradient, mut sum) = (1.0, 0.0, 1.0);
@@ -102,8 +102,8 @@ impl Span {
         let ridge = value - rounded * sum * sum - slope * slope / (4.0 * added);
         // The coefficients of the values, and those of each derivative, sum up to at most `all`.
         let square = ridge - added * powers * all * all;
-        let root = square.max(0.0).sqrt() - all * self.beyond;
-        let least = root * root * (1.0 - HAIR);
+        let root = square.max(0.0).sqrt() - all * self.max_omitted_norm;
+        let least = root * root * (1.0 - ROUNDING_MARGIN);
         if root > 0.0 && least.is_finite() {
             least
         } else {
@@ -112,7 +112,7 @@ impl Span {
     }
 
     /// Approximate minimizer of the form with the ridge.
-    fn minimum(&self, added: f64) -> [f64; ROWS] {
+    fn ridge_solution(&self, added: f64) -> [f64; MAX_BASIS_ROWS] {
         let n = self.count;
         let mut factor = self.matrix;
         let mut x = self.target;

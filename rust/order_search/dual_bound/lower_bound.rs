@@ -10,13 +10,13 @@
 
 use crate::equation::{Equation, Structure};
 use crate::error::{check_length, Result};
-use crate::order_search::dual_bound::infeasibility::Reach;
-use crate::order_search::dual_bound::tailored_vectors::{Adapted, Memory};
-use crate::order_search::dual_bound::test_vectors::{Probes, POOL};
+use crate::order_search::dual_bound::infeasibility::InfeasibilityProof;
+use crate::order_search::dual_bound::tailored_vectors::{NormCache, TailoredVectors};
+use crate::order_search::dual_bound::test_vectors::{TestVectors, MAX_TEST_VECTORS};
 use crate::order_search::options::Norm;
 use crate::parallel::Stop;
 use crate::regressors::{Bank, Index, Key, Record};
-use crate::simd::WIDTH;
+use crate::simd::LANE_COUNT;
 
 /// Lower bound of an equation's output error from each fixed test vector, with zero initial conditions. The error is
 /// Σ|y − ŷ| or Σ(y − ŷ)².
@@ -43,10 +43,10 @@ use crate::simd::WIDTH;
 /// # Ok::<(), ftlm::error::Error>(())
 /// ```
 pub fn lower_bounds(record: &Record, equation: &Equation, norm: Norm) -> Result<Vec<f64>> {
-    let (bound, positions) = pooled(record, &equation.structure, norm)?;
+    let (bound, positions) = build_pool_bound(record, &equation.structure, norm)?;
     check_length("coefficients", positions.len(), equation.coefficients.len())?;
     let mut each = vec![0.0; bound.len()];
-    bound.each(|_| (&positions[..], &equation.coefficients[..], &[][..], &[][..]), &mut each);
+    bound.bound_per_vector(|_| (&positions[..], &equation.coefficients[..], &[][..], &[][..]), &mut each);
     Ok(each)
 }
 
@@ -70,7 +70,7 @@ pub fn lower_bounds(record: &Record, equation: &Equation, norm: Norm) -> Result<
 /// assert!(is_infeasible(&record, &structure, &[Some(2.0)], &[2.0], Norm::L1, 1e-3)?);
 /// # Ok::<(), ftlm::error::Error>(())
 /// ```
-pub fn out_of_reach(
+pub fn is_infeasible(
     record: &Record,
     structure: &Structure,
     fixed: &[Option<f64>],
@@ -78,10 +78,10 @@ pub fn out_of_reach(
     norm: Norm,
     limit: f64,
 ) -> Result<bool> {
-    let (bound, positions) = pooled(record, structure, norm)?;
+    let (bound, positions) = build_pool_bound(record, structure, norm)?;
     check_length("fixed coefficients", structure.terms.len(), fixed.len())?;
     check_length("coefficients", structure.terms.len(), start.len())?;
-    Ok(bound.excludes(limit, &positions, fixed, &[], start, &mut Reach::default()))
+    Ok(bound.proves_infeasible(limit, &positions, fixed, &[], start, &mut InfeasibilityProof::default()))
 }
 
 /// Whether the test vector tailored to one equation proves that another equation's output error exceeds `limit`. The
@@ -133,15 +133,15 @@ pub fn excluded_in_turn(
     }
     let bank = Bank::new(&index, record, made_for.structure.output)?;
     let (banks, targets) = ([bank], [record.signal(made_for.structure.output).to_vec()]);
-    let mut adapted = Adapted::new(&banks, &targets, norm);
-    adapted.each.extend(adapted.fit(&banks, &targets, &positions[0], &made_for.coefficients));
-    let mut memory = Memory::of_neighbours();
+    let mut adapted = TailoredVectors::new(&banks, &targets, norm);
+    adapted.vectors.extend(adapted.fit(&banks, &targets, &positions[0], &made_for.coefficients));
+    let mut memory = NormCache::for_adjacent_candidates();
     let asked = positions[1..].iter().zip(equations);
-    Ok(asked.map(|(terms, asked)| adapted.exclude(terms, &asked.coefficients, limit, &mut memory)).collect())
+    Ok(asked.map(|(terms, asked)| adapted.excludes_candidate(terms, &asked.coefficients, limit, &mut memory)).collect())
 }
 
 /// Return the bound with all fixed test vectors on one record, and the columns of a structure's terms.
-fn pooled(record: &Record, structure: &Structure, norm: Norm) -> Result<(Bound, Vec<usize>)> {
+fn build_pool_bound(record: &Record, structure: &Structure, norm: Norm) -> Result<(Bound, Vec<usize>)> {
     structure.check(record.len(), |_| true)?;
     let mut index = Index::default();
     let positions: Vec<usize> = (0..structure.terms.len())
@@ -149,18 +149,18 @@ fn pooled(record: &Record, structure: &Structure, norm: Norm) -> Result<(Bound, 
         .collect();
     let bank = Bank::new(&index, record, structure.output)?;
     let target = record.signal(structure.output).to_vec();
-    Ok((Bound::new((&[bank], &[target]), norm, true, POOL, &Stop::default()), positions))
+    Ok((Bound::new((&[bank], &[target]), norm, true, MAX_TEST_VECTORS, &Stop::default()), positions))
 }
 
 /// Dual bound from the fixed test vectors of a search, on every record.
 pub(crate) struct Bound {
     norm: Norm,
-    probes: Vec<Probes>,
+    test_vectors: Vec<TestVectors>,
 }
 
 impl Bound {
     /// Maximum number of test vectors.
-    pub(crate) const POOL: usize = POOL;
+    pub(crate) const MAX_TEST_VECTORS: usize = MAX_TEST_VECTORS;
 
     /// Build `count` test vectors for these records, a multiple of [`WIDTH`] and at most [`MAX_TEST_VECTORS`].
     ///
@@ -173,24 +173,24 @@ impl Bound {
         count: usize,
         stop: &Stop,
     ) -> Self {
-        let probes =
-            banks.iter().zip(targets).map(|(b, y)| Probes::new(b, y, norm, (output_error, count), stop)).collect();
-        Self { norm, probes }
+        let test_vectors =
+            banks.iter().zip(targets).map(|(b, y)| TestVectors::new(b, y, norm, (output_error, count), stop)).collect();
+        Self { norm, test_vectors }
     }
 
     /// Test vectors on every record.
-    pub(crate) fn probes(&self) -> &[Probes] {
-        &self.probes
+    pub(crate) fn test_vectors(&self) -> &[TestVectors] {
+        &self.test_vectors
     }
 
     /// Number of test vectors.
     pub(crate) fn len(&self) -> usize {
-        self.probes.first().map_or(0, |p| p.groups * WIDTH)
+        self.test_vectors.first().map_or(0, |p| p.groups * LANE_COUNT)
     }
 
     /// Return the bound with these test vectors only, in this order. Their number is a multiple of [`WIDTH`].
-    pub(crate) fn chosen(&self, which: &[usize]) -> Self {
-        Self { norm: self.norm, probes: self.probes.iter().map(|p| p.chosen(which)).collect() }
+    pub(crate) fn select_vectors(&self, which: &[usize]) -> Self {
+        Self { norm: self.norm, test_vectors: self.test_vectors.iter().map(|p| p.select_vectors(which)).collect() }
     }
 
     /// Lower bound of a candidate's raw score (Σ|e| or Σe²), and an estimate of it that orders the evaluation.
@@ -203,13 +203,13 @@ impl Bound {
         columns: impl Fn(usize) -> (&'a [usize], &'a [f64], &'a [usize], &'a [f64]),
     ) -> (f64, f64) {
         let (mut bound, mut guess) = (0.0, 0.0);
-        for (r, probes) in self.probes.iter().enumerate() {
+        for (r, probes) in self.test_vectors.iter().enumerate() {
             let (terms, coefficients, initial, weights) = columns(r);
-            let rounding = probes.allowance(terms, coefficients, initial, weights);
+            let rounding = probes.rounding_bound(terms, coefficients, initial, weights);
             let (mut largest, mut farthest) = (0.0, 0.0);
             for group in 0..probes.groups {
-                let (bounds, guesses) = probes.group(group, terms, coefficients, initial, weights, rounding);
-                for n in 0..WIDTH {
+                let (bounds, guesses) = probes.group_bounds(group, terms, coefficients, initial, weights, rounding);
+                for n in 0..LANE_COUNT {
                     // Neither NaN nor an overflow proves anything.
                     if bounds[n] > largest && bounds[n] < f64::MAX {
                         largest = bounds[n];
@@ -233,35 +233,35 @@ impl Bound {
     /// The slice `fixed` holds the fixed coefficients of the terms. All others, and those of the initial terms, are
     /// free. `start` is the initial guess: coefficients of the terms, then of the initial terms by record.
     #[inline(always)]
-    pub(crate) fn excludes(
+    pub(crate) fn proves_infeasible(
         &self,
         limit: f64,
         terms: &[usize],
         fixed: &[Option<f64>],
         initial: &[usize],
         start: &[f64],
-        scratch: &mut Reach,
+        scratch: &mut InfeasibilityProof,
     ) -> bool {
         let largest = match self.norm {
             Norm::L1 => limit,
             Norm::L2 => limit.sqrt(),
         };
-        scratch.lay_out(&self.probes, largest, terms, fixed, initial, start);
-        scratch.search()
+        scratch.set_conditions(&self.test_vectors, largest, terms, fixed, initial, start);
+        scratch.find_multipliers()
     }
 
     /// Bound of each test vector separately, summed over records.
-    pub(crate) fn each<'a>(
+    pub(crate) fn bound_per_vector<'a>(
         &self,
         columns: impl Fn(usize) -> (&'a [usize], &'a [f64], &'a [usize], &'a [f64]),
         out: &mut [f64],
     ) {
         out.fill(0.0);
-        for (r, probes) in self.probes.iter().enumerate() {
+        for (r, probes) in self.test_vectors.iter().enumerate() {
             let (terms, coefficients, initial, weights) = columns(r);
-            let rounding = probes.allowance(terms, coefficients, initial, weights);
-            for (group, out) in out.chunks_exact_mut(WIDTH).enumerate().take(probes.groups) {
-                let (bounds, _) = probes.group(group, terms, coefficients, initial, weights, rounding);
+            let rounding = probes.rounding_bound(terms, coefficients, initial, weights);
+            for (group, out) in out.chunks_exact_mut(LANE_COUNT).enumerate().take(probes.groups) {
+                let (bounds, _) = probes.group_bounds(group, terms, coefficients, initial, weights, rounding);
                 for (sum, bound) in out.iter_mut().zip(bounds) {
                     if bound > 0.0 && bound < f64::MAX {
                         *sum += self.raw(bound);

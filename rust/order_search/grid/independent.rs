@@ -30,7 +30,7 @@ pub struct TermAxis {
 /// distinct. Interchangeable ones are unordered, with the larger first. Indices ascend in α. Within an α the last
 /// signal's tuple varies fastest, within a tuple its last order, both from the largest down.
 #[derive(Debug, Clone)]
-pub struct Lattice {
+pub struct OrderGrid {
     output: usize,
     width: usize,
     pub(super) groups: Vec<Group>,
@@ -43,10 +43,10 @@ pub struct Lattice {
 pub(crate) struct Block {
     pub(crate) alpha: f64,
     pub(crate) start: u64,
-    pub(crate) slices: Vec<Slice>,
+    pub(crate) tuples: Vec<GroupTuples>,
 }
 
-impl Lattice {
+impl OrderGrid {
     /// Build the grid from its axes. `is_input` selects the signals that may have a negative order.
     ///
     /// # Errors
@@ -132,21 +132,22 @@ impl Lattice {
         let mut count: u128 = 0;
         let mut why = "no value of alpha".to_owned();
         for (&alpha, firsts) in alphas.iter().zip(firsts) {
-            let slices: Vec<Slice> = groups.iter().zip(firsts).map(|(group, first)| group.slice(first)).collect();
+            let slices: Vec<GroupTuples> =
+                groups.iter().zip(firsts).map(|(group, first)| group.tuples_below(first)).collect();
             if let Some(empty) = slices.iter().position(|slice| slice.count == 0) {
                 why = format!("no orders of signal {} fit below alpha = {alpha}", groups[empty].signal);
                 continue;
             }
             let size = slices.iter().fold(1u128, |size, slice| size.saturating_mul(u128::from(slice.count)));
             #[allow(clippy::cast_possible_truncation)]
-            blocks.push(Block { alpha, start: count as u64, slices });
+            blocks.push(Block { alpha, start: count as u64, tuples: slices });
             count = count.saturating_add(size);
             if count > MAX_CANDIDATES {
-                return Err(Error::LatticeTooLarge { count, limit: MAX_CANDIDATES });
+                return Err(Error::OrderGridTooLarge { count, limit: MAX_CANDIDATES });
             }
         }
         if count == 0 {
-            return Err(Error::EmptyLattice { why });
+            return Err(Error::EmptyOrderGrid { why });
         }
         #[allow(clippy::cast_possible_truncation)]
         Ok(Self { output, width: terms.len(), groups, blocks, count: count as u64 })
@@ -194,7 +195,7 @@ fn check_size(axes: &[Vec<Vec<f64>>], firsts: &[Vec<Vec<usize>>]) -> Result<()> 
     // The number of unordered tuples is smaller than the product of the axes by at most this factor.
     let folds = axes.iter().fold(1u128, |p, group| p.saturating_mul((1..=group.len() as u128).product()));
     if all / folds / 2 > MAX_CANDIDATES || prefixes > MAX_PREFIXES {
-        return Err(Error::LatticeTooLarge { count: all, limit: MAX_CANDIDATES });
+        return Err(Error::OrderGridTooLarge { count: all, limit: MAX_CANDIDATES });
     }
     Ok(())
 }
@@ -208,7 +209,7 @@ fn values(term: &TermAxis, lowest: f64) -> Vec<f64> {
 }
 
 /// Number of prefixes per stored count. Counts between are recomputed on look-up.
-pub(super) const STRIDE: usize = 64;
+pub(super) const PREFIX_STRIDE: usize = 64;
 
 /// Terms of one signal, their axes, and the pairs of values that exclude each other.
 #[derive(Debug, Clone)]
@@ -224,7 +225,7 @@ pub(crate) struct Group {
 
 /// Tuples of a group that are admissible for one α.
 #[derive(Debug, Clone)]
-pub(crate) struct Slice {
+pub(crate) struct GroupTuples {
     /// First value of each axis within the range.
     pub(crate) first: Vec<usize>,
     /// Number of prefixes (all orders except the last), and of tuples.
@@ -363,18 +364,18 @@ impl Group {
     }
 
     /// Tuples of this group below an α. Completions are counted, not stored.
-    pub(super) fn slice(&self, first: Vec<usize>) -> Slice {
+    pub(super) fn tuples_below(&self, first: Vec<usize>) -> GroupTuples {
         let prefixes: usize = (0..self.last()).map(|a| self.axes[a].len() - first[a]).product();
         let mut digits = vec![0; self.terms.len()];
-        let mut before = Vec::with_capacity(prefixes / STRIDE + 1);
+        let mut before = Vec::with_capacity(prefixes / PREFIX_STRIDE + 1);
         let mut count = 0;
         for prefix in 0..prefixes {
-            if prefix % STRIDE == 0 {
+            if prefix % PREFIX_STRIDE == 0 {
                 before.push(count);
             }
             self.decode(&first, prefix, &mut digits);
             count += self.count_completions(&first, &digits);
         }
-        Slice { first, prefixes, count, before }
+        GroupTuples { first, prefixes, count, before }
     }
 }

@@ -7,5 +7,5 @@ pub mod independent;
 pub mod order_law;
 pub(crate) mod traversal;
 
-pub use independent::{Lattice, TermAxis, MAX_CANDIDATES};
-pub use order_law::{LawEquation, LawLattice, MAX_TUPLES};
+pub use independent::{OrderGrid, TermAxis, MAX_CANDIDATES};
+pub use order_law::{LawEquation, OrderLawGrid, MAX_TUPLES};

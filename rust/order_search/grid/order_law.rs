@@ -20,7 +20,7 @@ pub struct LawEquation {
 
 /// Grid of free orders under an order law. Tuples that form no equation are excluded.
 #[derive(Debug, Clone)]
-pub struct LawLattice {
+pub struct OrderLawGrid {
     axes: Vec<Vec<f64>>,
     equations: Vec<LawEquation>,
     inputs: Vec<bool>,
@@ -29,7 +29,7 @@ pub struct LawLattice {
     known: Vec<(usize, usize)>,
 }
 
-impl LawLattice {
+impl OrderLawGrid {
     /// Build the grid from the values of each free order and the equations. `inputs[s]` marks signal s as an input.
     ///
     /// # Errors
@@ -69,7 +69,7 @@ impl LawLattice {
             })
             .collect();
         if let Some(empty) = axes.iter().position(Vec::is_empty) {
-            return Err(Error::EmptyLattice { why: format!("free order {empty} has no value") });
+            return Err(Error::EmptyOrderGrid { why: format!("free order {empty} has no value") });
         }
         let product = axes.iter().fold(1u128, |p, a| p.saturating_mul(a.len() as u128));
         match u64::try_from(product) {
@@ -80,7 +80,7 @@ impl LawLattice {
                 product: count,
                 known: Vec::new(),
             }),
-            _ => Err(Error::LatticeTooLarge { count: product, limit: MAX_TUPLES }),
+            _ => Err(Error::OrderGridTooLarge { count: product, limit: MAX_TUPLES }),
         }
     }
 
@@ -89,7 +89,7 @@ impl LawLattice {
     ///
     /// A term above α with a free coefficient is excluded because it nearly equates an output with itself.
     #[must_use]
-    pub fn with_known(mut self, fixed: &[Vec<Option<f64>>]) -> Self {
+    pub fn with_fixed_coefficients(mut self, fixed: &[Vec<Option<f64>>]) -> Self {
         let terms = self.equations.iter().zip(fixed).flat_map(|(equation, fixed)| {
             let known = fixed.iter().enumerate().filter(|(_, value)| value.is_some());
             known.map(|(k, _)| (equation.output, k))

@@ -4,9 +4,9 @@
 //! low-discrepancy order spreads every initial part of the candidates evenly over the whole grid.
 
 use crate::equation::{Structure, Term};
-use crate::order_search::grid::independent::{Bits, Lattice, STRIDE};
+use crate::order_search::grid::independent::{Bits, OrderGrid, PREFIX_STRIDE};
 
-impl Lattice {
+impl OrderGrid {
     /// Structure of a candidate. An index beyond the end yields the last candidate.
     ///
     /// ```
@@ -26,7 +26,7 @@ impl Lattice {
 /// Position of a traversal of an order grid.
 #[derive(Debug, Clone)]
 pub(crate) struct Cursor<'a> {
-    lattice: &'a Lattice,
+    lattice: &'a OrderGrid,
     block: usize,
     /// Prefix of each group, and the values that complete it.
     prefixes: Vec<usize>,
@@ -37,7 +37,7 @@ pub(crate) struct Cursor<'a> {
 
 impl<'a> Cursor<'a> {
     /// Return a cursor at a candidate. An index beyond the end yields the last candidate.
-    pub(crate) fn at(lattice: &'a Lattice, index: u64) -> Self {
+    pub(crate) fn at(lattice: &'a OrderGrid, index: u64) -> Self {
         let index = index.min(lattice.count - 1);
         let block = lattice.blocks.partition_point(|b| b.start <= index).saturating_sub(1);
         let groups = lattice.groups.len();
@@ -50,7 +50,7 @@ impl<'a> Cursor<'a> {
         };
         let mut rest = index - lattice.blocks[block].start;
         for g in (0..groups).rev() {
-            let count = lattice.blocks[block].slices[g].count;
+            let count = lattice.blocks[block].tuples[g].count;
             cursor.seek(g, rest % count);
             rest /= count;
         }
@@ -59,11 +59,11 @@ impl<'a> Cursor<'a> {
 
     /// Index of the candidate of a block with these positions in the axes, one per term. `None` if there is no such
     /// candidate.
-    pub(crate) fn find(lattice: &'a Lattice, block: usize, digits: &[usize]) -> Option<u64> {
+    pub(crate) fn find(lattice: &'a OrderGrid, block: usize, digits: &[usize]) -> Option<u64> {
         let mut cursor = Self::at(lattice, lattice.blocks.get(block)?.start);
         let mut index = 0;
         for (g, group) in lattice.groups.iter().enumerate() {
-            let count = lattice.blocks[block].slices[g].count;
+            let count = lattice.blocks[block].tuples[g].count;
             let wanted = || group.terms.iter().map(|&term| digits[term]);
             let (mut lo, mut hi) = (0, count);
             while lo < hi {
@@ -89,10 +89,10 @@ impl<'a> Cursor<'a> {
 
     /// Move a group to the tuple with this rank.
     fn seek(&mut self, g: usize, rank: u64) {
-        let (group, slice) = (&self.lattice.groups[g], &self.lattice.blocks[self.block].slices[g]);
+        let (group, slice) = (&self.lattice.groups[g], &self.lattice.blocks[self.block].tuples[g]);
         let stretch = slice.before.partition_point(|&b| b <= rank).saturating_sub(1);
         let mut rest = rank - slice.before[stretch];
-        for prefix in stretch * STRIDE..slice.prefixes {
+        for prefix in stretch * PREFIX_STRIDE..slice.prefixes {
             group.decode(&slice.first, prefix, &mut self.digits[g]);
             let here = group.count_completions(&slice.first, &self.digits[g]);
             if rest < here {
@@ -107,7 +107,7 @@ impl<'a> Cursor<'a> {
     /// Move a group to a prefix. Return whether any value completes it.
     fn enter(&mut self, g: usize, prefix: usize) -> bool {
         let group = &self.lattice.groups[g];
-        let first = &self.lattice.blocks[self.block].slices[g].first;
+        let first = &self.lattice.blocks[self.block].tuples[g].first;
         group.decode(first, prefix, &mut self.digits[g]);
         let words = &mut self.completions[g].0;
         words.clear();
@@ -126,7 +126,7 @@ impl<'a> Cursor<'a> {
     pub(crate) fn advance(&mut self) -> usize {
         let groups = self.lattice.groups.len();
         for g in (0..groups).rev() {
-            if self.lattice.blocks[self.block].slices[g].count == 1 {
+            if self.lattice.blocks[self.block].tuples[g].count == 1 {
                 continue;
             }
             if self.step(g) {
@@ -144,8 +144,8 @@ impl<'a> Cursor<'a> {
     /// Term and axis position that alone change over this and the next `len` − 1 candidates, by one position each.
     /// `None` if something else changes, too.
     #[inline]
-    pub(crate) fn stretch(&self, len: usize) -> Option<(usize, usize)> {
-        let slices = &self.lattice.blocks[self.block].slices;
+    pub(crate) fn adjacent_block(&self, len: usize) -> Option<(usize, usize)> {
+        let slices = &self.lattice.blocks[self.block].tuples;
         let g = (0..slices.len()).rev().find(|&g| slices[g].count > 1)?;
         let group = &self.lattice.groups[g];
         let digit = self.digits[g][group.last()];
@@ -156,8 +156,8 @@ impl<'a> Cursor<'a> {
     /// Term, axis position and number of the next candidates over which this term alone changes, by one position each.
     /// `None` if no order varies.
     #[inline]
-    pub(crate) fn run(&self) -> Option<(usize, usize, usize)> {
-        let slices = &self.lattice.blocks[self.block].slices;
+    pub(crate) fn adjacent_run(&self) -> Option<(usize, usize, usize)> {
+        let slices = &self.lattice.blocks[self.block].tuples;
         let g = (0..slices.len()).rev().find(|&g| slices[g].count > 1)?;
         let group = &self.lattice.groups[g];
         let digit = self.digits[g][group.last()];
@@ -167,7 +167,7 @@ impl<'a> Cursor<'a> {
     /// Advance by this many candidates of a contiguous block.
     #[inline]
     pub(crate) fn skip(&mut self, count: usize) {
-        let slices = &self.lattice.blocks[self.block].slices;
+        let slices = &self.lattice.blocks[self.block].tuples;
         if let Some(g) = (0..slices.len()).rev().find(|&g| slices[g].count > 1) {
             self.digits[g][self.lattice.groups[g].last()] += count;
         }
@@ -180,7 +180,7 @@ impl<'a> Cursor<'a> {
             self.digits[g][last] = next;
             return true;
         }
-        let prefixes = self.lattice.blocks[self.block].slices[g].prefixes;
+        let prefixes = self.lattice.blocks[self.block].tuples[g].prefixes;
         if !(self.prefixes[g] + 1..prefixes).any(|prefix| self.enter(g, prefix)) {
             return false;
         }
@@ -221,7 +221,7 @@ impl<'a> Cursor<'a> {
 
 /// Candidates `lo … hi − 1`: one row for each order of one term, with a run of orders of another term.
 #[derive(Debug, Clone)]
-pub(crate) struct Slab {
+pub(crate) struct GridSlice {
     pub(crate) lo: u64,
     pub(crate) hi: u64,
     /// Number of the block, and axis position of every term's order at `lo`.
@@ -236,33 +236,34 @@ pub(crate) struct Slab {
     pub(crate) len: usize,
 }
 
-impl Lattice {
+impl OrderGrid {
     /// First value of a term's axis within the range of a block.
-    pub(crate) fn first(&self, block: usize, term: usize) -> usize {
-        let place = self.groups.iter().zip(&self.blocks[block].slices);
+    pub(crate) fn first_in_range(&self, block: usize, term: usize) -> usize {
+        let place = self.groups.iter().zip(&self.blocks[block].tuples);
         let mut all = place.flat_map(|(group, slice)| group.terms.iter().zip(&slice.first));
         all.find(|(t, _)| **t == term).map_or(0, |(_, first)| *first)
     }
 
     /// Maximum number of candidates of a slice of the same block.
-    pub(crate) fn largest(&self, slab: &Slab) -> u64 {
+    pub(crate) fn max_slice_candidates(&self, slab: &GridSlice) -> u64 {
         let whole = self.groups.iter().find(|group| group.terms.contains(&slab.outer));
-        let axis = whole.map_or(0, |group| group.axes[group.last()].len() - self.first(slab.block, slab.outer));
+        let axis =
+            whole.map_or(0, |group| group.axes[group.last()].len() - self.first_in_range(slab.block, slab.outer));
         (axis * slab.len) as u64
     }
 
     /// Slice that contains a candidate. `None` if the fastest signal has several terms, or no other signal has a
     /// varying order.
-    pub(crate) fn slab(&self, index: u64) -> Option<Slab> {
+    pub(crate) fn slice_at(&self, index: u64) -> Option<GridSlice> {
         let cursor = Cursor::at(self, index);
         let block = &self.blocks[cursor.block()];
-        let mut varying = (0..self.groups.len()).rev().filter(|&g| block.slices[g].count > 1);
+        let mut varying = (0..self.groups.len()).rev().filter(|&g| block.tuples[g].count > 1);
         let (inner, outer) = (varying.next()?, varying.next()?);
         let (fast, slow) = (&self.groups[inner], &self.groups[outer]);
         if fast.terms.len() != 1 {
             return None;
         }
-        let first = block.slices[inner].first[0];
+        let first = block.tuples[inner].first[0];
         let len = fast.axes[0].len() - first;
         let rows = cursor.completions(outer);
         let mut digits = vec![0; self.width()];
@@ -273,24 +274,24 @@ impl Lattice {
         digits[u] = rows[0];
         digits[v] = first;
         let hi = lo + (rows.len() * len) as u64;
-        Some(Slab { lo, hi, block: cursor.block(), digits, outer: u, rows, inner: v, first, len })
+        Some(GridSlice { lo, hi, block: cursor.block(), digits, outer: u, rows, inner: v, first, len })
     }
 }
 /// Fractional part of the golden ratio. Its multiples are evenly distributed.
-const GOLDEN: f64 = 0.618_033_988_75;
+const GOLDEN_FRACTION: f64 = 0.618_033_988_75;
 
 /// Position of an index in [0, 1). Consecutive indices are far apart.
 #[allow(clippy::cast_precision_loss)]
-pub(crate) fn spread(index: u64) -> f64 {
-    (index as f64 * GOLDEN).fract()
+pub(crate) fn low_discrepancy_position(index: u64) -> f64 {
+    (index as f64 * GOLDEN_FRACTION).fract()
 }
 
 /// Permutation of 0 … count − 1 whose initial parts are evenly distributed.
-pub(crate) fn visit(count: u64) -> impl Fn(u64) -> u64 {
+pub(crate) fn low_discrepancy_order(count: u64) -> impl Fn(u64) -> u64 {
     // Multiples of the golden ratio are evenly distributed. The next stride that is coprime with the count visits all
     // indices.
     #[allow(clippy::cast_possible_truncation, clippy::cast_sign_loss, clippy::cast_precision_loss)]
-    let mut stride = ((count as f64 * GOLDEN) as u64).max(1);
+    let mut stride = ((count as f64 * GOLDEN_FRACTION) as u64).max(1);
     while gcd(stride, count) != 1 {
         stride += 1;
     }

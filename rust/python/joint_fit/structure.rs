@@ -3,7 +3,9 @@
 use pyo3::prelude::*;
 
 use crate::error::Error;
-use crate::estimation::joint_fit::structure::{Coefficient, Equation, Hints, Input, Law, Order, Rubs, Structure, Term};
+use crate::estimation::joint_fit::structure::{
+    Coefficient, Equation, FrictionParameters, Hints, Input, Law, Order, Structure, Term,
+};
 use crate::python::convert::{initial, InitialArg, List};
 use crate::python::estimation::free_inputs;
 
@@ -63,13 +65,13 @@ fn order((constant, weights): OrderArg) -> Order {
     Order { constant, weights: weights.into() }
 }
 
-fn rubs([coulomb, stribeck, speed]: [NumberArg; 3]) -> Rubs {
+fn rubs([coulomb, stribeck, speed]: [NumberArg; 3]) -> FrictionParameters {
     let number = |(factor, coefficient): NumberArg| (factor, coefficient.into());
-    Rubs { coulomb: number(coulomb), stribeck: number(stribeck), speed: number(speed) }
+    FrictionParameters { coulomb: number(coulomb), stribeck: number(stribeck), speed: number(speed) }
 }
 
 /// Structure whose signals and coefficients exist.
-pub fn named(argument: StructureArg) -> PyResult<Structure> {
+pub fn parse_structure(argument: StructureArg) -> PyResult<Structure> {
     let term = |(signal, at, coefficient, factor): TermArg| Term {
         signal,
         order: order(at),
@@ -102,7 +104,7 @@ pub fn named(argument: StructureArg) -> PyResult<Structure> {
         hints: Hints {
             highest: hints.highest,
             natural: hints.natural.into_iter().map(|(name, values)| (name, values.into())).collect(),
-            exceeds: hints.exceeds.into_iter().collect(),
+            ratio_lower_bounds: hints.exceeds.into_iter().collect(),
             positive: hints.positive.into_iter().collect(),
             known: hints.known.into_iter().collect(),
         },

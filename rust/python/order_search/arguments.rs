@@ -6,18 +6,18 @@ use pyo3::types::PyDict;
 use crate::equation::{AffineOrder, Initial};
 use crate::error::Error;
 use crate::estimation::instrumental_variables::{with_projections, Settings};
-use crate::estimation::multi_innovation::{Innovation, Rows};
-use crate::order_search::control::{another, Checkpoint, Control, Place};
-use crate::order_search::grid::independent::{Lattice, TermAxis};
-use crate::order_search::grid::order_law::{LawEquation, LawLattice};
+use crate::estimation::multi_innovation::{Innovation, RowBasis};
+use crate::order_search::control::{mismatch_error, BatchPosition, Checkpoint, Control};
+use crate::order_search::grid::independent::{OrderGrid, TermAxis};
+use crate::order_search::grid::order_law::{LawEquation, OrderLawGrid};
 use crate::order_search::options::{Criterion, Estimator, Norm, Options};
 use crate::order_search::result::{Counts, Failure, Part, Row, Verdict};
 use crate::order_search::stage_join::Span;
-use crate::python::convert::{initial, lists, nested, records, InitialArg, List, RecordArg};
+use crate::python::convert::{initial, records, to_lists, to_vectors, InitialArg, List, RecordArg};
 use crate::regressors::Record;
 
 /// Convergence tolerance of a candidate's instrumental variables, far below a change of the ranking.
-const REFINED: f64 = 1e-4;
+const IV_CONVERGENCE_TOLERANCE: f64 = 1e-4;
 
 /// Settings: (criterion, norm, p or 0 for least squares, K₀, Haar rows, rows kept, threads, pruning, iterations of
 /// instrumental variables or 0, bytes of memory).
@@ -57,12 +57,12 @@ impl<'py> FromPyObject<'_, 'py> for SettingsArg {
                 other => return Err(unknown(format!("norm '{other}' is not known"), "use l1 or l2").into()),
             },
             estimator: if iterations > 0 {
-                Estimator::InstrumentalVariables(Settings { iterations, tolerance: REFINED })
+                Estimator::InstrumentalVariables(Settings { iterations, tolerance: IV_CONVERGENCE_TOLERANCE })
             } else if length == 0 {
                 Estimator::LeastSquares
             } else {
-                let rows = if haar { Rows::Haar } else { Rows::Time };
-                Estimator::MultiInnovation(Innovation { length, prior_covariance, rows })
+                let rows = if haar { RowBasis::Haar } else { RowBasis::Time };
+                Estimator::MultiInnovation(Innovation { length, prior_covariance, row_basis: rows })
             },
             keep,
             threads,
@@ -76,19 +76,28 @@ impl SettingsArg {
     /// Options with the initial terms of the records.
     pub fn options(self, terms: InitialArg) -> PyResult<Options> {
         let Self { criterion, norm, estimator, keep, threads, early_stopping, memory } = self;
-        Ok(Options { criterion, norm, estimator, initial: initial(terms)?, keep, threads, early_stopping, memory })
+        Ok(Options {
+            criterion,
+            norm,
+            estimator,
+            initial: initial(terms)?,
+            top: keep,
+            threads,
+            pruning: early_stopping,
+            memory,
+        })
     }
 }
 
 /// Data and options of a search without its order grid. `F` holds the fixed coefficients of one or several equations.
-pub struct Given<F> {
+pub struct SearchInputs<F> {
     records: Vec<Record>,
     pub inputs: Vec<bool>,
     pub fixed: F,
     pub options: Options,
 }
 
-impl<F> Given<F> {
+impl<F> SearchInputs<F> {
     pub fn new(
         runs: &[RecordArg<'_>],
         inputs: List<bool>,
@@ -131,8 +140,8 @@ impl<'py> FromPyObject<'_, 'py> for OrdersArg {
 }
 
 impl OrdersArg {
-    pub fn lattice(&self, inputs: &[bool]) -> Result<Lattice, Error> {
-        Lattice::new(self.output, &self.alphas, &self.axes, |s| inputs.get(s).copied().unwrap_or(false))
+    pub fn lattice(&self, inputs: &[bool]) -> Result<OrderGrid, Error> {
+        OrderGrid::new(self.output, &self.alphas, &self.axes, |s| inputs.get(s).copied().unwrap_or(false))
     }
 }
 
@@ -161,18 +170,18 @@ pub fn law_lattice(
     laws: List<LawArg>,
     inputs: &[bool],
     fixed: &[Vec<Option<f64>>],
-) -> Result<LawLattice, Error> {
+) -> Result<OrderLawGrid, Error> {
     let equations: Vec<LawEquation> = laws.into_iter().map(|law| law.0).collect();
-    Ok(LawLattice::new(axes, &equations, inputs)?.with_known(fixed))
+    Ok(OrderLawGrid::new(axes, &equations, inputs)?.with_fixed_coefficients(fixed))
 }
 
 /// Counts under their public names.
-pub fn counted<'py>(py: Python<'py>, counts: &Counts) -> PyResult<Bound<'py, PyDict>> {
+pub fn counts_to_dict<'py>(py: Python<'py>, counts: &Counts) -> PyResult<Bound<'py, PyDict>> {
     let dict = PyDict::new(py);
     dict.set_item("candidates", counts.candidates)?;
     dict.set_item("kept", counts.kept)?;
     dict.set_item("beaten", counts.beaten)?;
-    dict.set_item("bound", counts.bounded)?;
+    dict.set_item("bound", counts.excluded_by_bound)?;
     dict.set_item("stopped early", counts.stopped)?;
     dict.set_item("singular", counts.singular)?;
     dict.set_item("diverged", counts.diverged)?;
@@ -180,7 +189,7 @@ pub fn counted<'py>(py: Python<'py>, counts: &Counts) -> PyResult<Bound<'py, PyD
 }
 
 /// Name of a failure.
-pub fn named(failure: Failure) -> &'static str {
+pub fn failure_name(failure: Failure) -> &'static str {
     match failure {
         Failure::Singular => "singular",
         Failure::Diverged => "diverged",
@@ -204,10 +213,27 @@ pub type CheckpointArg = ((u64, u64, u64, u64, f64, u64), bool, PartArg);
 pub fn part_of(part: Part) -> PartArg {
     let c = part.counts;
     (
-        part.rows.into_iter().map(|r| (r.index, r.score, r.coefficients.into(), lists(r.initial))).collect(),
-        match c.boxed {
-            0 => CountsArg::Plain((c.candidates, c.kept, c.beaten, c.bounded, c.stopped, c.singular, c.diverged)),
-            n => CountsArg::Boxed((c.candidates, c.kept, c.beaten, c.bounded, c.stopped, c.singular, c.diverged, n)),
+        part.rows.into_iter().map(|r| (r.index, r.score, r.coefficients.into(), to_lists(r.initial))).collect(),
+        match c.excluded_by_box {
+            0 => CountsArg::Plain((
+                c.candidates,
+                c.kept,
+                c.beaten,
+                c.excluded_by_bound,
+                c.stopped,
+                c.singular,
+                c.diverged,
+            )),
+            n => CountsArg::Boxed((
+                c.candidates,
+                c.kept,
+                c.beaten,
+                c.excluded_by_bound,
+                c.stopped,
+                c.singular,
+                c.diverged,
+                n,
+            )),
         },
         part.failures.into_iter().map(|(index, f)| (index, f == Failure::Diverged)).collect(),
     )
@@ -226,10 +252,19 @@ pub fn part((rows, counts, failures): PartArg) -> Part {
                 index,
                 score,
                 coefficients: coefficients.into(),
-                initial: nested(initial),
+                initial: to_vectors(initial),
             })
             .collect(),
-        counts: Counts { candidates, kept, beaten, bounded, boxed, stopped, singular, diverged },
+        counts: Counts {
+            candidates,
+            kept,
+            beaten,
+            excluded_by_bound: bounded,
+            excluded_by_box: boxed,
+            stopped,
+            singular,
+            diverged,
+        },
         failures: failures
             .into_iter()
             .map(|(index, diverged)| (index, if diverged { Failure::Diverged } else { Failure::Singular }))
@@ -239,13 +274,21 @@ pub fn part((rows, counts, failures): PartArg) -> Part {
 
 /// Checkpoint from Python tuples.
 pub fn checkpoint(((round, followed, end, size, limit, order), anew, found): CheckpointArg) -> Checkpoint {
-    Checkpoint { place: Place { round, followed, end, size, limit, order }, anew, part: part(found) }
+    Checkpoint {
+        place: BatchPosition { batch: round, evaluated_count: followed, end, size, limit, order },
+        replaces_previous: anew,
+        part: part(found),
+    }
 }
 
 /// Checkpoint as Python tuples.
 pub fn checkpoint_of(checkpoint: Checkpoint) -> CheckpointArg {
     let p = checkpoint.place;
-    ((p.round, p.followed, p.end, p.size, p.limit, p.order), checkpoint.anew, part_of(checkpoint.part))
+    (
+        (p.batch, p.evaluated_count, p.end, p.size, p.limit, p.order),
+        checkpoint.replaces_previous,
+        part_of(checkpoint.part),
+    )
 }
 
 /// Block of candidates: (equation, first, one past the last, limit).
@@ -283,6 +326,6 @@ pub fn verdicts(values: &[u8], kinds: &[u8]) -> Result<Vec<Verdict>, Error> {
         }
     });
     known.collect::<Option<Vec<_>>>().filter(|_| values.len() == 8 * kinds.len()).ok_or_else(|| {
-        another(format!("{} bytes of values and {} of kinds are no verdicts", values.len(), kinds.len()))
+        mismatch_error(format!("{} bytes of values and {} of kinds are no verdicts", values.len(), kinds.len()))
     })
 }

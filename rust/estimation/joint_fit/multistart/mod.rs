@@ -10,6 +10,9 @@ mod halving;
 mod nested_models;
 mod search;
 
-pub use halving::{distinct, finalists, in_reach, same_optimum, same_place};
-pub use nested_models::{held, lower_order, simpler, unlike, whole, Held, LowerOrder, Simpler, Whole};
-pub use search::{on_coarse_grids, race, Course, Starts};
+pub use halving::{competitive_candidates, is_same_iterate, is_same_optimum, merge_duplicates, select_survivors};
+pub use nested_models::{
+    distinct_problems, fixed_order_problems, integer_order_problems, lower_order_problem, reduced_problems,
+    FixedOrderProblem, IntegerOrderProblem, LowerOrderProblem, ReducedProblem,
+};
+pub use search::{optimize_on_coarse_grids, run_multistart, InitialGuessSource, MultistartContext};

@@ -3,29 +3,29 @@
 use std::collections::{BTreeMap, BTreeSet};
 
 use crate::equation::Initial;
-use crate::estimation::joint_fit::format::short;
-use crate::estimation::joint_fit::parameter_set::{Clock, Free};
-use crate::estimation::joint_fit::problem::{Attempt, Place, Runner};
+use crate::estimation::joint_fit::format::format_general;
+use crate::estimation::joint_fit::parameter_set::{ParameterSet, TimeScaling};
+use crate::estimation::joint_fit::problem::{Candidate, Iterate, OptimizationResult};
 use crate::estimation::joint_fit::structure::{Coefficient, Equation, Order, Structure};
 use crate::estimation::output_error::Point;
 
 /// Submodel with one term removed or its coefficient fixed.
 #[derive(Debug, Clone, PartialEq)]
-pub struct Simpler {
+pub struct ReducedProblem {
     /// Remaining free parameters.
-    pub free: Free,
+    pub free: ParameterSet,
     coefficient: String,
     order: Order,
     value: f64,
     /// True if the coefficient is fixed and all signals remain in the equation.
-    pub driven: bool,
+    pub keeps_signals: bool,
 }
 
-impl Simpler {
+impl ReducedProblem {
     /// Restrict a candidate of the full problem to this one.
     #[must_use]
-    pub fn without(&self, runner: &Runner, whole: &Free) -> Runner {
-        let Point { orders, coefficients, inputs } = &runner.attempt.place.point;
+    pub fn restrict(&self, runner: &Candidate, whole: &ParameterSet) -> Candidate {
+        let Point { orders, coefficients, inputs } = &runner.result.iterate.point;
         let order = |name: &String| whole.orders.iter().position(|o| o == name).map(|at| orders[at]);
         let value = |name: &String| whole.coefficients.iter().position(|c| c == name).map(|at| coefficients[at]);
         let point = Point {
@@ -33,13 +33,13 @@ impl Simpler {
             coefficients: self.free.coefficients.iter().filter_map(value).collect(),
             inputs: inputs.clone(),
         };
-        Runner::at(Place { point, states: Vec::new() }, runner.origin.clone())
+        Candidate::at(Iterate { point, states: Vec::new() }, runner.origin.clone())
     }
 
     /// Embed a candidate in the full problem. The free order of a term with coefficient 0 is set to half the highest.
     #[must_use]
-    pub fn embedded(&self, runner: &Runner, whole: &Free) -> Runner {
-        let Point { orders, coefficients, inputs } = &runner.attempt.place.point;
+    pub fn embed(&self, runner: &Candidate, whole: &ParameterSet) -> Candidate {
+        let Point { orders, coefficients, inputs } = &runner.result.iterate.point;
         let known: BTreeMap<&String, f64> = self.free.orders.iter().zip(orders.iter().copied()).collect();
         let highest = self.order.at(|name| known.get(&name.to_owned()).copied().unwrap_or(0.0));
         let values: BTreeMap<&String, f64> = self.free.coefficients.iter().zip(coefficients.iter().copied()).collect();
@@ -48,9 +48,13 @@ impl Simpler {
             coefficients: whole.coefficients.iter().map(|n| values.get(n).copied().unwrap_or(self.value)).collect(),
             inputs: inputs.clone(),
         };
-        let origin = format!("{}, from {} = {}", runner.origin, self.coefficient, short(self.value, 6));
-        let place = Place { point, states: runner.attempt.place.states.clone() };
-        Runner { attempt: Attempt { place, ..runner.attempt.clone() }, origin, alike: runner.alike.clone() }
+        let origin = format!("{}, from {} = {}", runner.origin, self.coefficient, format_general(self.value, 6));
+        let place = Iterate { point, states: runner.result.iterate.states.clone() };
+        Candidate {
+            result: OptimizationResult { iterate: place, ..runner.result.clone() },
+            origin,
+            duplicates: runner.duplicates.clone(),
+        }
     }
 }
 
@@ -60,7 +64,7 @@ impl Simpler {
 /// there can be optima in which one signal replaces the others. For the same reason a coefficient with a known physical
 /// value is first fixed at that value.
 #[must_use]
-pub fn simpler(free: &Free) -> Vec<Simpler> {
+pub fn reduced_problems(free: &ParameterSet) -> Vec<ReducedProblem> {
     let structure = &free.structure;
     if structure.has_order_law() || !free.products.is_empty() {
         return Vec::new();
@@ -68,12 +72,18 @@ pub fn simpler(free: &Free) -> Vec<Simpler> {
     let mut out = Vec::new();
     let mut add = |reduced, name: &String, order: &Order, value, driven| {
         // Some give no valid equation.
-        if let Ok(free) = Free::of(reduced) {
-            out.push(Simpler { free, coefficient: name.clone(), order: order.clone(), value, driven });
+        if let Ok(free) = ParameterSet::from_structure(reduced) {
+            out.push(ReducedProblem {
+                free,
+                coefficient: name.clone(),
+                order: order.clone(),
+                value,
+                keeps_signals: driven,
+            });
         }
     };
     for (place, item) in structure.equations.iter().enumerate() {
-        let several = item.own().count() > 1;
+        let several = item.autoregressive_terms().count() > 1;
         for (k, term) in item.terms.iter().enumerate().filter(|(_, term)| several && term.signal == item.output) {
             if let Coefficient::Free(name) = &term.coefficient {
                 let mut terms = item.terms.clone();
@@ -82,7 +92,7 @@ pub fn simpler(free: &Free) -> Vec<Simpler> {
                 add(structure.with_equation(place, rest), name, &item.order, 0.0, false);
             }
         }
-        let driving: Vec<_> = item.driving().filter(|term| term.coefficient.name().is_some()).collect();
+        let driving: Vec<_> = item.input_terms().filter(|term| term.coefficient.name().is_some()).collect();
         for term in driving.iter().filter(|term| !structure.coupled && driving.len() > 1 && !term.order.is_free()) {
             if let Some(name) = term.coefficient.name() {
                 // The signal stays with coefficient 0, because the records contain it.
@@ -102,18 +112,18 @@ pub fn simpler(free: &Free) -> Vec<Simpler> {
 
 /// Remove problems that differ only in the names of their free parameters.
 #[must_use]
-pub fn unlike(problems: Vec<Simpler>) -> Vec<Simpler> {
+pub fn distinct_problems(problems: Vec<ReducedProblem>) -> Vec<ReducedProblem> {
     let mut seen = BTreeSet::new();
-    problems.into_iter().filter(|less| nameless(less).is_none_or(|key| seen.insert(key))).collect()
+    problems.into_iter().filter(|less| canonical_equation(less).is_none_or(|key| seen.insert(key))).collect()
 }
 
 /// Canonical text of an equation, with sorted terms and bounds in place of order names.
 ///
 /// None if problems with equal text can still differ.
-fn nameless(less: &Simpler) -> Option<String> {
+fn canonical_equation(less: &ReducedProblem) -> Option<String> {
     let structure = &less.free.structure;
     let [item] = structure.equations.as_slice() else { return None };
-    if less.driven || structure.delayed {
+    if less.keeps_signals || structure.delayed {
         return None;
     }
     let bound = |name: &String| less.free.orders.iter().position(|o| o == name).map(|at| less.free.bounds()[at]);
@@ -122,7 +132,7 @@ fn nameless(less: &Simpler) -> Option<String> {
         format!("{:?} {weights:?}", order.constant)
     };
     let term = |t: &crate::estimation::joint_fit::structure::Term| {
-        format!("{} {} {:?} {:?}", t.signal, of(&t.order), t.fixed(), t.factor)
+        format!("{} {} {:?} {:?}", t.signal, of(&t.order), t.fixed_coefficient(), t.factor)
     };
     let mut terms: Vec<String> = item.terms.iter().map(term).collect();
     terms.sort();
@@ -130,29 +140,29 @@ fn nameless(less: &Simpler) -> Option<String> {
 }
 
 /// Frequency at which a pole is too fast to be identified from the samples.
-const FAST_POLE: f64 = 0.2;
+const FAST_POLE_RADIANS_PER_SAMPLE: f64 = 0.2;
 /// Difference below which two exponents of t are equal.
-const SAME_POWER: f64 = 1e-9;
+const EXPONENT_TOLERANCE: f64 = 1e-9;
 
 /// Submodel of lower order: the highest autoregressive term takes the place of the highest derivative.
 ///
 /// The coefficient of that term, without its fixed factor, is 1 in the submodel and `fast` in the full one.
 /// `others` are the coefficients of the remaining terms of the equation.
 #[derive(Debug, Clone, PartialEq)]
-pub struct LowerOrder {
+pub struct LowerOrderProblem {
     /// Free parameters.
-    pub free: Free,
+    pub free: ParameterSet,
     coefficient: String,
     factor: f64,
     others: BTreeSet<String>,
     fast: f64,
 }
 
-impl LowerOrder {
+impl LowerOrderProblem {
     /// Embed a candidate in the full problem: same dynamics with an additional fast pole.
     #[must_use]
-    pub fn embedded(&self, runner: &Runner, whole: &Free) -> Runner {
-        let point = &runner.attempt.place.point;
+    pub fn embed(&self, runner: &Candidate, whole: &ParameterSet) -> Candidate {
+        let point = &runner.result.iterate.point;
         let value = |name: &String| {
             if *name == self.coefficient {
                 return -self.fast / self.factor;
@@ -167,8 +177,8 @@ impl LowerOrder {
         };
         let order = |name: &String| self.free.orders.iter().position(|o| o == name).map_or(0.0, |at| point.orders[at]);
         let mut found = runner.clone();
-        found.attempt.place.point.orders = whole.orders.iter().map(order).collect();
-        found.attempt.place.point.coefficients = whole.coefficients.iter().map(value).collect();
+        found.result.iterate.point.orders = whole.orders.iter().map(order).collect();
+        found.result.iterate.point.coefficients = whole.coefficients.iter().map(value).collect();
         found.origin = format!("{}, from the equation of lower order", runner.origin);
         found
     }
@@ -177,13 +187,13 @@ impl LowerOrder {
 /// Submodel of lower order of a single equation with fixed autoregressive orders; `step` is the sampling interval
 /// \[s\]. Free orders reach the lower order without it.
 #[must_use]
-pub fn lower_order(free: &Free, step: f64) -> Option<LowerOrder> {
+pub fn lower_order_problem(free: &ParameterSet, step: f64) -> Option<LowerOrderProblem> {
     let structure = &free.structure;
     let [item] = structure.equations.as_slice() else { return None };
     if structure.has_order_law() || !free.products.is_empty() || item.order.is_free() {
         return None;
     }
-    if item.own().any(|term| term.order.is_free()) {
+    if item.autoregressive_terms().any(|term| term.order.is_free()) {
         return None;
     }
     let own = item.terms.iter().enumerate().filter(|(_, term)| term.signal == item.output);
@@ -193,7 +203,9 @@ pub fn lower_order(free: &Free, step: f64) -> Option<LowerOrder> {
     let mut rest = item.terms.clone();
     rest.remove(place);
     let order = highest.order.constant;
-    if order <= 0.0 || rest.iter().any(|term| term.fixed().is_some() || term.coefficient == highest.coefficient) {
+    if order <= 0.0
+        || rest.iter().any(|term| term.fixed_coefficient().is_some() || term.coefficient == highest.coefficient)
+    {
         return None;
     }
     let mut driving = rest.iter().filter(|term| term.signal != item.output && !term.order.is_free());
@@ -202,20 +214,21 @@ pub fn lower_order(free: &Free, step: f64) -> Option<LowerOrder> {
         return None;
     }
     let others = rest.iter().filter_map(|term| term.coefficient.name().cloned()).collect();
-    let initial = if structure.history { structure.initial.clone() } else { below(&structure.initial, order)? };
+    let initial =
+        if structure.history { structure.initial.clone() } else { initial_terms_below(&structure.initial, order)? };
     let lower = Equation { order: highest.order.clone(), terms: rest, ..item.clone() };
     // The construction fails if a term of another signal exceeds the lower order.
-    let reduced = Free::of(Structure { initial, ..structure.with_equation(0, lower) }).ok()?;
-    let fast = libm::pow(FAST_POLE / step, item.order.constant - order);
-    Some(LowerOrder { free: reduced, coefficient: name.clone(), factor: highest.factor, others, fast })
+    let reduced = ParameterSet::from_structure(Structure { initial, ..structure.with_equation(0, lower) }).ok()?;
+    let fast = libm::pow(FAST_POLE_RADIANS_PER_SAMPLE / step, item.order.constant - order);
+    Some(LowerOrderProblem { free: reduced, coefficient: name.clone(), factor: highest.factor, others, fast })
 }
 
 /// Initial terms with exponents below an order; None if one of them coincides with an exponent of the offset.
-fn below(initial: &Initial, order: f64) -> Option<Initial> {
+fn initial_terms_below(initial: &Initial, order: f64) -> Option<Initial> {
     let Initial::Powers(powers) = initial.under() else { return Some(initial.clone()) };
     let powers: Vec<f64> = powers.iter().copied().filter(|power| *power < order).collect();
     let offsets = initial.offset_exponents(order);
-    if powers.iter().any(|power| offsets.iter().any(|offset| (power - offset).abs() < SAME_POWER)) {
+    if powers.iter().any(|power| offsets.iter().any(|offset| (power - offset).abs() < EXPONENT_TOLERANCE)) {
         return None;
     }
     let under = if powers.is_empty() { Initial::Rest } else { Initial::Powers(powers) };
@@ -223,24 +236,24 @@ fn below(initial: &Initial, order: f64) -> Option<Initial> {
 }
 
 /// Integer values of a free order; at most [`MAX_INTEGER_ORDER_PROBLEMS`] combinations are tried.
-const WHOLE: [f64; 4] = [0.0, 1.0, 2.0, 3.0];
-const MOST_WHOLE: usize = 12;
+const DEFAULT_INTEGER_ORDERS: [f64; 4] = [0.0, 1.0, 2.0, 3.0];
+const MAX_INTEGER_ORDER_PROBLEMS: usize = 12;
 
 /// Submodel with every free order fixed at an integer value.
 #[derive(Debug, Clone, PartialEq)]
-pub struct Whole {
+pub struct IntegerOrderProblem {
     /// Remaining free parameters.
-    pub free: Free,
+    pub free: ParameterSet,
     /// The orders.
     pub orders: Vec<f64>,
 }
 
-impl Whole {
+impl IntegerOrderProblem {
     /// Embed a candidate of this problem in the full problem.
     #[must_use]
-    pub fn embedded(&self, runner: &Runner) -> Runner {
+    pub fn embed(&self, runner: &Candidate) -> Candidate {
         let mut found = runner.clone();
-        found.attempt.place.point.orders.clone_from(&self.orders);
+        found.result.iterate.point.orders.clone_from(&self.orders);
         found.origin = format!("{}, from whole orders", runner.origin);
         found
     }
@@ -252,13 +265,13 @@ impl Whole {
 /// integer orders need not be the best. Combinations without a valid equation are omitted.
 #[must_use]
 #[allow(clippy::float_cmp)]
-pub fn whole(free: &Free, near: &[f64]) -> Vec<Whole> {
+pub fn integer_order_problems(free: &ParameterSet, near: &[f64]) -> Vec<IntegerOrderProblem> {
     let natural = &free.structure.hints.natural;
     let values: Vec<Vec<f64>> = (free.orders.iter().zip(free.bounds()))
         .map(|(name, &(low, high))| {
             let known: Vec<f64> =
                 natural.get(name).into_iter().flatten().copied().filter(|v| *v == v.round()).collect();
-            let known = if known.is_empty() { WHOLE.to_vec() } else { known };
+            let known = if known.is_empty() { DEFAULT_INTEGER_ORDERS.to_vec() } else { known };
             known.into_iter().filter(|v| (low..=high).contains(v)).collect()
         })
         .collect();
@@ -271,8 +284,8 @@ pub fn whole(free: &Free, near: &[f64]) -> Vec<Whole> {
             points.push(point);
         }
     };
-    for point in [free.whole_orders().as_slice(), near] {
-        let first: Vec<f64> = values.iter().zip(point).map(|(v, at)| nearest(v, *at)).collect();
+    for point in [free.integer_orders().as_slice(), near] {
+        let first: Vec<f64> = values.iter().zip(point).map(|(v, at)| nearest_value(v, *at)).collect();
         add(first.clone());
         for (k, choices) in values.iter().enumerate() {
             for &other in choices.iter().filter(|v| **v != first[k]) {
@@ -282,52 +295,57 @@ pub fn whole(free: &Free, near: &[f64]) -> Vec<Whole> {
             }
         }
     }
-    points.into_iter().filter_map(|orders| at(free, orders)).take(MOST_WHOLE).collect()
+    points
+        .into_iter()
+        .filter_map(|orders| integer_order_problem(free, orders))
+        .take(MAX_INTEGER_ORDER_PROBLEMS)
+        .collect()
 }
 
-fn nearest(values: &[f64], at: f64) -> f64 {
+fn nearest_value(values: &[f64], at: f64) -> f64 {
     values.iter().copied().reduce(|best, v| if (v - at).abs() < (best - at).abs() { v } else { best }).unwrap_or(at)
 }
 
 /// Submodel at given integer orders; None if they give no valid equation.
-fn at(free: &Free, orders: Vec<f64>) -> Option<Whole> {
+fn integer_order_problem(free: &ParameterSet, orders: Vec<f64>) -> Option<IntegerOrderProblem> {
     let known: BTreeMap<String, f64> = free.orders.iter().cloned().zip(orders.iter().copied()).collect();
-    let reduced = free.structure.with_orders(&known).and_then(Free::of).ok()?;
+    let reduced = free.structure.with_orders(&known).and_then(ParameterSet::from_structure).ok()?;
     // The sequence of the terms is unchanged, so the coefficients keep their indices.
-    (reduced.coefficients == free.coefficients).then_some(Whole { free: reduced, orders })
+    (reduced.coefficients == free.coefficients).then_some(IntegerOrderProblem { free: reduced, orders })
 }
 
 /// Submodel with one free order fixed at its integer value.
 #[derive(Debug, Clone, PartialEq)]
-pub struct Held {
+pub struct FixedOrderProblem {
     /// Remaining free parameters.
-    pub free: Free,
+    pub free: ParameterSet,
     /// Index of the order in the full problem.
     pub order: usize,
     /// Value of the order.
     pub value: f64,
 }
 
-impl Held {
+impl FixedOrderProblem {
     /// Restrict a candidate of the full problem to this one, with the coefficients kept in scaled time.
     #[must_use]
-    pub fn without(&self, runner: &Runner, clock: &Clock) -> Runner {
-        let mut told = clock.told(&runner.attempt.values());
+    pub fn restrict(&self, runner: &Candidate, clock: &TimeScaling) -> Candidate {
+        let mut told = clock.to_scaled(&runner.result.values());
         told[self.order] = self.value;
-        let mut values = clock.untold(&told);
+        let mut values = clock.from_scaled(&told);
         values.remove(self.order);
         let (orders, rest) = values.split_at(self.free.orders.len());
         let (coefficients, inputs) = rest.split_at(self.free.coefficients.len());
         let point = Point { orders: orders.into(), coefficients: coefficients.into(), inputs: inputs.into() };
-        Runner::at(Place { point, states: Vec::new() }, runner.origin.clone())
+        Candidate::at(Iterate { point, states: Vec::new() }, runner.origin.clone())
     }
 
     /// Embed a candidate of this problem in the full problem.
     #[must_use]
-    pub fn embedded(&self, runner: &Runner, whole: &Free) -> Runner {
+    pub fn embed(&self, runner: &Candidate, whole: &ParameterSet) -> Candidate {
         let mut found = runner.clone();
-        found.attempt.place.point.orders.insert(self.order, self.value);
-        found.origin = format!("{}, from {} = {}", runner.origin, whole.orders[self.order], short(self.value, 6));
+        found.result.iterate.point.orders.insert(self.order, self.value);
+        found.origin =
+            format!("{}, from {} = {}", runner.origin, whole.orders[self.order], format_general(self.value, 6));
         found
     }
 }
@@ -335,18 +353,18 @@ impl Held {
 /// Submodels with one order fixed, if there are several orders. None may fit better than the full problem.
 #[must_use]
 #[allow(clippy::float_cmp)]
-pub fn held(free: &Free) -> Vec<Held> {
+pub fn fixed_order_problems(free: &ParameterSet) -> Vec<FixedOrderProblem> {
     let mut out = Vec::new();
-    for (order, value) in free.whole_orders().into_iter().enumerate() {
+    for (order, value) in free.integer_orders().into_iter().enumerate() {
         if free.orders.len() < 2 || value != value.round() {
             continue;
         }
         let known = BTreeMap::from([(free.orders[order].clone(), value)]);
         // Some give no valid equation.
-        let Ok(reduced) = free.structure.with_orders(&known).and_then(Free::of) else { continue };
+        let Ok(reduced) = free.structure.with_orders(&known).and_then(ParameterSet::from_structure) else { continue };
         let rest = free.orders.iter().enumerate().filter(|(k, _)| *k != order).map(|(_, name)| name);
         if reduced.coefficients == free.coefficients && reduced.orders.iter().eq(rest) {
-            out.push(Held { free: reduced, order, value });
+            out.push(FixedOrderProblem { free: reduced, order, value });
         }
     }
     out
