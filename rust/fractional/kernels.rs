@@ -277,7 +277,7 @@ pub fn power_means(exponent: f64, m: usize, step: f64) -> Vec<f64> {
 /// Derivative of [`power_means`] with respect to an exponent above −1.
 ///
 /// ```
-/// Means of t^0 are always 1. Those of t^e change with e like ln t: ∫ ln t over [0, 1] is −1.
+/// // Means of t^0 are always 1. Those of t^e change with e like ln t: ∫ ln t over [0, 1] is −1.
 /// let slope = ftlm::fractional::kernels::power_means_slope(0.0, 1, 1.0);
 /// assert!((slope[0] + 1.0).abs() < 1e-15);
 /// ```

@@ -88,7 +88,7 @@ pub struct Options {
     /// Whether to stop evaluating a candidate once its bound or partial sum excludes it. `false` evaluates all
     /// candidates completely and serves as oracle.
     pub pruning: bool,
-    /// Memory of regressors, their products, test vectors and the layout of an order law [bytes].
+    /// Memory of regressors, their products, test vectors and the layout of an order law \[bytes\].
     pub memory: u64,
 }
 

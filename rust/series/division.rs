@@ -355,7 +355,7 @@ pub fn divide(numerator: &[f64], divisor: &[f64]) -> Result<Vec<f64>> {
 /// Reciprocal of a series mod z^m. Not finite if the series starts with zero. O(m log² m).
 ///
 /// ```
-/// assert_eq!(ftlm::series::division::reciprocal(&[1.0, -1.0, 0.0]), [1.0, 1.0, 1.0]);
+/// assert_eq!(ftlm::series::reciprocal(&[1.0, -1.0, 0.0]), [1.0, 1.0, 1.0]);
 /// ```
 #[must_use]
 pub fn reciprocal(series: &[f64]) -> Vec<f64> {

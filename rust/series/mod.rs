@@ -2,8 +2,8 @@
 //!
 //! A causal operator on pulse means is a polynomial in the delay z truncated at z^m. The fractional integral F^η is one
 //! of them. All such operators commute. Products ([`product`]) are convolutions by FFT. Quotients ([`division`]) use
-//! forward substitution in blocks that are joined by FFT products. [`system`] solves for several unknown series. If all
-//! orders are integers, [`recursion`] uses running sums.
+//! forward substitution in blocks that are joined by FFT products. [`solve`] solves for several unknown series. If all
+//! orders are integers, [`mod@running_sums`] does the same by running sums.
 //!
 //! ```
 //! # fn main() -> ftlm::error::Result<()> {

@@ -9,7 +9,7 @@ pub fn multiply_naive(a: &[f64], b: &[f64], m: usize) -> Vec<f64> {
     direct(a, b, m)
 }
 
-/// Quotient `numerator / divisor` mod z^m by forward substitution, the oracle of [`super::system::divide`]. O(m²).
+/// Quotient `numerator / divisor` mod z^m by forward substitution, the oracle of [`super::division::divide`]. O(m²).
 ///
 /// # Errors
 /// [`Error::LeadingZero`] where the divisor starts with zero, [`Error::Length`] where it is shorter than the numerator.

@@ -24,7 +24,7 @@ const CHUNK_TERMS: usize = 256;
 ///
 /// ```
 /// // I^1 of a pulse: half of it within the pulse, all of it in every later one.
-/// assert_eq!(ftlm::series::running_sums::running_sums(1, 0.1), [-0.05, 0.1]);
+/// assert_eq!(ftlm::series::running_sums(1, 0.1), [-0.05, 0.1]);
 /// ```
 #[must_use]
 #[allow(clippy::cast_precision_loss)]

@@ -33,7 +33,7 @@ impl Settings {
     /// [`Error::OutOfRange`] for more than 1000 iterations, and for a tolerance that is negative or not finite.
     ///
     /// ```
-    /// # use ftlm::estimation::instrumental_variables::solution::Settings;
+    /// # use ftlm::estimation::instrumental_variables::Settings;
     /// assert!(Settings::default().check().is_ok());
     /// assert!(Settings { iterations: 1 << 20, ..Settings::default() }.check().is_err());
     /// ```

@@ -184,9 +184,9 @@ impl<'a> FitProblem<'a> {
 /// use ftlm::estimation::joint_fit::parameter_set::Free;
 /// use ftlm::estimation::joint_fit::initial_guesses::OrderGrids;
 /// use ftlm::estimation::joint_fit::fit;
-/// use ftlm::estimation::joint_fit::reweighting::Loss;
+/// use ftlm::estimation::joint_fit::Loss;
 /// use ftlm::estimation::joint_fit::fit::{Outset, Settings, Size, Sought};
-/// use ftlm::estimation::joint_fit::source::{Sampled, Signal};
+/// use ftlm::estimation::joint_fit::{Sampled, Signal};
 /// use ftlm::signal::block_pulse::Intersample;
 /// use ftlm::parallel::Stop;
 /// // Data of D y = −2 y + 3 u in exact steps, fitted by D^alpha y = a y + b u.

@@ -89,7 +89,7 @@ pub struct Signal {
 ///
 /// ```
 /// # fn main() -> ftlm::error::Result<()> {
-/// use ftlm::estimation::joint_fit::source::{SampledRuns, Sampling, Signal, Source};
+/// use ftlm::estimation::joint_fit::{SampledRuns, Sampling, Signal, Source};
 /// use ftlm::signal::block_pulse::Intersample;
 /// let y = Signal { samples: vec![0.0, 1.0, 4.0, 9.0], intersample: Intersample::Linear };
 /// let u = Signal { samples: vec![1.0, 2.0, 2.0, 2.0], intersample: Intersample::Hold };

@@ -314,7 +314,7 @@ impl InputLaw {
     /// [`Error::OutOfRange`] for a parameter that is negative or not finite.
     ///
     /// ```
-    /// use ftlm::estimation::output_error::parameterization::InputLaw;
+    /// use ftlm::estimation::output_error::InputLaw;
     /// # fn main() -> ftlm::error::Result<()> {
     /// let (means, slope) = InputLaw::Saturation.apply(&[0.5, 2.0, -3.0], 1.5, 0.1, 0.0)?;
     /// assert_eq!((means, slope), (vec![0.5, 1.5, -1.5], vec![0.0, 1.0, -1.0]));

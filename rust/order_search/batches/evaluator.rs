@@ -42,7 +42,7 @@ use crate::regressors::Record;
 /// # use ftlm::order_search::control::Control;
 /// # use ftlm::order_search::grid::{Lattice, TermAxis};
 /// # use ftlm::order_search::options::Options;
-/// # use ftlm::order_search::batches::evaluator::search;
+/// # use ftlm::order_search::batches::search;
 /// # use ftlm::regressors::Record;
 /// # let input: Vec<f64> = (0..64).map(|k| if k % 16 < 8 { 1.0 } else { -1.0 }).collect();
 /// # let output = Record::new(0.1, vec![input.clone()], None)?.integral(0, 0.8);
@@ -173,7 +173,7 @@ impl<'a> BatchEvaluator<'a> {
     /// # use ftlm::order_search::grid::{Lattice, TermAxis};
     /// # use ftlm::order_search::options::Options;
     /// # use ftlm::order_search::result::Part;
-    /// # use ftlm::order_search::batches::evaluator::{batch_count, generation_ends, BatchEvaluator};
+    /// # use ftlm::order_search::batches::{batch_count, generation_ends, BatchEvaluator};
     /// # use ftlm::parallel::pool;
     /// # use ftlm::regressors::Record;
     /// # let input: Vec<f64> = (0..64).map(|k| if k % 16 < 8 { 1.0 } else { -1.0 }).collect();
@@ -351,7 +351,7 @@ pub fn batch_count_by_version(algorithm: u64, candidates: u64, options: &Options
 ///
 /// ```
 /// # use ftlm::order_search::options::Options;
-/// # use ftlm::order_search::batches::evaluator::{rounds, waves};
+/// # use ftlm::order_search::batches::{rounds, waves};
 /// let batches = batch_count(400_000, &Options::default());
 /// assert_eq!((batches, generation_ends(batches)), (7, vec![1, 3, 7]));
 /// ```

@@ -269,7 +269,7 @@ pub struct BoxBound {
 /// As [`crate::order_search::batches::search`].
 ///
 /// ```
-/// # use ftlm::order_search::branch_and_bound::bisection::box_bounds;
+/// # use ftlm::order_search::branch_and_bound::box_bounds;
 /// # use ftlm::order_search::grid::{Lattice, TermAxis};
 /// # use ftlm::order_search::options::{Criterion, Norm};
 /// # use ftlm::regressors::Record;

@@ -32,7 +32,7 @@ pub struct CertificateOptions {
     pub max_coefficient: f64,
     /// Maximum number of cells. The bisection ends there with the bound proved so far.
     pub max_cells: u64,
-    /// Number of threads, and memory [bytes].
+    /// Number of threads, and memory \[bytes\].
     pub threads: usize,
     /// See `threads`.
     pub memory: u64,
@@ -66,8 +66,8 @@ pub struct Certificate {
 /// memory, [`Error::Interrupted`].
 ///
 /// ```
-/// # use ftlm::order_search::certificate::bisection::{certify, Asked};
-/// # use ftlm::order_search::certificate::gram_tables::{Range, Region};
+/// # use ftlm::order_search::certificate::{certify, Asked};
+/// # use ftlm::order_search::certificate::{Range, Region};
 /// # use ftlm::order_search::control::Control;
 /// # use ftlm::regressors::Record;
 /// # let input: Vec<f64> = (0..64).map(|k| if k % 16 < 8 { 1.0 } else { -1.0 }).collect();

@@ -207,7 +207,7 @@ fn dominating_vector(a: &[Row; MAX_TERMS], gamma: &Row, tau: &Row, k: usize) -> 
 /// No records or terms, too many terms, a signal that is missing or zero, a midpoint below its half width.
 ///
 /// ```
-/// # use ftlm::order_search::certificate::cell_bound::cell_bounds;
+/// # use ftlm::order_search::certificate::cell_bounds;
 /// # use ftlm::regressors::Record;
 /// # let input: Vec<f64> = (0..64).map(|k| if k % 16 < 8 { 1.0 } else { -1.0 }).collect();
 /// # let output = Record::new(0.1, vec![input.clone()], None)?.integral(0, 0.8);

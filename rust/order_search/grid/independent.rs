@@ -50,12 +50,12 @@ impl OrderGrid {
     /// Build the grid from its axes. `is_input` selects the signals that may have a negative order.
     ///
     /// # Errors
-    /// [`Error::EmptyLattice`], [`Error::LatticeTooLarge`] before anything of that size is enumerated, an α outside (0,
+    /// [`Error::EmptyOrderGrid`], [`Error::OrderGridTooLarge`] before anything of that size is enumerated, an α outside (0,
     /// 10], [`Error::NotFinite`] for an order that is not finite, [`Error::Structure`] for more than 34 terms of one
     /// signal.
     ///
     /// ```
-    /// # use ftlm::order_search::grid::independent::{OrderGrid, TermAxis};
+    /// # use ftlm::order_search::grid::{OrderGrid, TermAxis};
     /// // Two own terms that may be swapped, and the input at order 0.
     /// let own = TermAxis { signal: 0, values: vec![0.0, 0.5, 1.0], interchangeable: true };
     /// let input = TermAxis { signal: 1, values: vec![0.0], interchangeable: false };

@@ -33,13 +33,13 @@ impl OrderLawGrid {
     /// Build the grid from the values of each free order and the equations. `inputs[s]` marks signal s as an input.
     ///
     /// # Errors
-    /// [`Error::EmptyLattice`] for an empty axis, [`Error::LatticeTooLarge`] for the product of the axes,
+    /// [`Error::EmptyOrderGrid`] for an empty axis, [`Error::OrderGridTooLarge`] for the product of the axes,
     /// [`Error::NotFinite`] for an order or a law that is not finite, [`Error::Structure`] without an equation, or for
     /// a signal or free order that does not exist.
     ///
     /// ```
     /// # use ftlm::equation::AffineOrder;
-    /// # use ftlm::order_search::grid::order_law::{LawEquation, OrderLawGrid};
+    /// # use ftlm::order_search::grid::{LawEquation, OrderLawGrid};
     /// // D^α y = c D^{α−1} u for a free α.
     /// let law = |constant: f64| AffineOrder { constant, weights: vec![1.0] };
     /// let equation = LawEquation { output: 0, order: law(0.0), terms: vec![(1, law(-1.0))] };

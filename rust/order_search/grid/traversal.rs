@@ -10,7 +10,7 @@ impl OrderGrid {
     /// Structure of a candidate. An index beyond the end yields the last candidate.
     ///
     /// ```
-    /// # use ftlm::order_search::grid::independent::{OrderGrid, TermAxis};
+    /// # use ftlm::order_search::grid::{OrderGrid, TermAxis};
     /// let own = TermAxis { signal: 0, values: vec![0.0, 0.5], interchangeable: false };
     /// let lattice = OrderGrid::new(0, &[0.8], &[own], |_| false)?;
     /// let orders: Vec<f64> = (0..lattice.count()).map(|index| lattice.structure(index).terms[0].order).collect();

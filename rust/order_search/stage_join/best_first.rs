@@ -108,7 +108,7 @@ impl<'a> Stage<'a> {
     /// for norm L1 is σ(y)·M. Joint angles and link deflections then have equal weight.
     ///
     /// # Errors
-    /// As [`crate::order_search::batches::search`]; [`Error::EmptyLattice`] where no tuple obeys the law,
+    /// As [`crate::order_search::batches::search`]; [`Error::EmptyOrderGrid`] where no tuple obeys the law,
     /// [`Error::OutOfRange`] for a scale that is not positive.
     pub fn new(
         records: &[Record],
@@ -370,7 +370,7 @@ impl SearchState {
 /// ```
 /// # use ftlm::order_search::control::Control;
 /// # use ftlm::order_search::options::Options;
-/// # use ftlm::order_search::stage_join::best_first::search;
+/// # use ftlm::order_search::stage_join::search;
 /// # use ftlm::equation::AffineOrder;
 /// # use ftlm::order_search::grid::{LawEquation, OrderLawGrid};
 /// let law = |constant: f64| AffineOrder { constant, weights: vec![1.0] };

@@ -53,7 +53,7 @@ impl<'a> OrderGrids<'a> {
     ///
     /// # Errors
     /// [`Error::Structure`] for a zero-order-hold input with an order above that of its equation, for friction, and for
-    /// duplicate terms; [`Error::EmptyLattice`], [`Error::Interrupted`]; errors of the source and of a search.
+    /// duplicate terms; [`Error::EmptyOrderGrid`], [`Error::Interrupted`]; errors of the source and of a search.
     pub fn candidates(&self, free: &ParameterSet) -> Result<Vec<Candidate>> {
         let frequencies = self.frequencies(free)?;
         if free.structure.inputs.is_empty() {

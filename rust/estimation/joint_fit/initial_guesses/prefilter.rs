@@ -64,7 +64,7 @@ const POWER_SHARE: f64 = 0.9;
 /// Bandwidth \[rad/s\] that contains 90 % of the power of samples, `step` \[s\] apart; NaN without samples. O(N log N).
 ///
 /// ```
-/// use ftlm::estimation::joint_fit::initial_guesses::prefilter::power_frequency;
+/// use ftlm::estimation::joint_fit::initial_guesses::power_frequency;
 /// let wave: Vec<f64> = (0..500).map(|k| (0.1 * f64::from(k)).sin()).collect();
 /// // One bin of the transform is 2π/5 rad/s.
 /// assert!((power_frequency(&wave, 0.01) - 10.0).abs() < 2.6);
