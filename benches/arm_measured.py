@@ -200,7 +200,7 @@ def numbers(found: ftlm.Identification, asked: Sequence[str] = ()) -> str:
 
 def fitted(runs: Sequence[ftlm.Run], made: ftlm.Structure) -> ftlm.Identification:
     """A joint fit on one thread."""
-    return ftlm.identify(list(runs), made, method="output-error", threads=1, intervals="quadratic")
+    return ftlm.identify(list(runs), made, method=ftlm.OutputError(intervals="quadratic"), threads=1)
 
 
 def judged(
@@ -340,7 +340,7 @@ def hubs() -> Iterator[str]:
         for used in ("psf", "lqr"):
             start = NEAR | ({"w2": 0.0, "w4": 0.0} if more[0] else {})
             found = ftlm.identify(
-                runs[used], made, method="output-error", threads=1, intervals="quadratic", start=start
+                runs[used], made, method=ftlm.OutputError(intervals="quadratic", start=start), threads=1
             )
             fits = {n: found.model.compare(r).fit_percent for n, r in runs.items()}
             told = " | ".join(

@@ -121,7 +121,9 @@ def fitted(job: tuple[str, int]) -> dict[str, Any]:
         inputs={"u": u}, outputs={"y": y + case.noise * np.std(y) * e}, step=step, intersample={"u": between}
     )
     begin = time.perf_counter()
-    found = ftlm.identify(run, ftlm.equation(case.words, initial="rest"), threads=1, intervals="quadratic")
+    found = ftlm.identify(
+        run, ftlm.equation(case.words, initial="rest"), threads=1, method=ftlm.OutputError(intervals="quadratic")
+    )
     fit = time.perf_counter()
     bent = nonlinear_parameters(likelihood_of(found), 0.95)
     test = time.perf_counter()
@@ -129,7 +131,9 @@ def fitted(job: tuple[str, int]) -> dict[str, Any]:
         profiles = found.profile(threads=1)
     except ftlm.ConvergenceError:
         # What `identify` does by itself where the profile finds a lower optimum.
-        found = ftlm.identify(run, ftlm.equation(case.words, initial="rest"), threads=1, intervals="profile")
+        found = ftlm.identify(
+            run, ftlm.equation(case.words, initial="rest"), threads=1, method=ftlm.OutputError(intervals="profile")
+        )
         profiles = found.profiles
     end = time.perf_counter()
     values, errors = found.parameter_values, found.standard_errors

@@ -41,10 +41,8 @@ def covered(found: ftlm.Identification, truth: dict[str, float]) -> list[bool]:
 def one_loop(task: tuple[str, int, str]) -> tuple[list[bool], bool, bool, float]:
     """Coverage, whether the result says that there is a loop, whether it warns of one or of its instrument, alpha."""
     kind, seed, how = task
-    options: dict[str, object] = {"threads": 1}
-    if how == "reference":
-        options["reference"] = "r"
-    found = ftlm.identify(loops.loop(kind, seed), STRUCTURE, **options)
+    method = ftlm.OutputError(reference="r" if how == "reference" else None)
+    found = ftlm.identify(loops.loop(kind, seed), STRUCTURE, method=method, threads=1)
     said = bool(found.residuals and found.residuals.outputs["y"].feedback)
     warned = any("closed loop" in w or "weak instrument" in w for w in found.warnings)
     return covered(found, loops.TRUTH), said, warned, found.orders["alpha"]
@@ -130,7 +128,7 @@ def cell(seeds: int) -> Iterator[str]:
             ended.append((z, time.process_time() - start, found))
         z = np.array([e[0] for e in ended])
         last = ended[-1][2]
-        words = ", ".join(f"{n} {last.joint_values[n]:.5g} ± {last.standard_errors[n]:.2g}" for n in truth)
+        words = ", ".join(f"{n} {last.parameter_values[n]:.5g} ± {last.standard_errors[n]:.2g}" for n in truth)
         yield (
             f"cell, {hold}, 50 000 rows, 1 % noise, {seeds} seeds: mean z "
             f"{', '.join(f'{v:.2f}' for v in z.mean(axis=0))}, covered {100 * np.mean(np.abs(z) < 1.96):.0f} %; the "

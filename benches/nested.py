@@ -100,7 +100,7 @@ def chain(run: ftlm.Run, name: str) -> Iterator[str]:
         begun = time.process_time()
         made = ftlm.equation(text.format(y="y", u="u"), orders=orders)
         try:
-            found = ftlm.identify(run, made, threads=1, intervals="quadratic")
+            found = ftlm.identify(run, made, threads=1, method=ftlm.OutputError(intervals="quadratic"))
         except ftlm.FtlmError as error:
             yield f"| {run.name} | {name} | {kind} | {error} | | |"
             continue

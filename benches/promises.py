@@ -412,7 +412,7 @@ start = time.perf_counter()
 found = ftlm.search_orders(run, equation, lattice, coefficients="least-squares", m=2048)
 wall = time.perf_counter() - start
 after = status("VmHWM")
-pruned = 1 - (len(found.table) + found.pruned["beaten"]) / found.candidates
+pruned = 1 - (len(found.table) + found.exclusion_counts["beaten"]) / found.candidates
 print(found.candidates, wall, (after - before) / 1024, pruned)
 """
 

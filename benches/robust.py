@@ -12,7 +12,7 @@ import os
 import time
 from collections.abc import Callable
 from concurrent.futures import ProcessPoolExecutor
-from dataclasses import dataclass, field
+from dataclasses import dataclass
 from typing import Any
 
 import numpy as np
@@ -186,17 +186,17 @@ class Case:
 
     make: Callable[[Plant, np.random.Generator], ftlm.Run]
     named: tuple[str, ...] = ()
-    options: dict[str, Any] = field(default_factory=dict)
+    method: str | ftlm.OutputError = "output-error"
 
 
 CASES = {
     "white": Case(nothing),
-    "white, huber": Case(nothing, options={"loss": "huber"}),
+    "white, huber": Case(nothing, method=ftlm.OutputError(loss="huber")),
     "coloured": Case(coloured, ("not white",)),
     "disturbed": Case(disturbed, ("not white",)),
     "quantised": Case(quantised, ("quantised",)),
     "outliers": Case(with_outliers, ("huber",)),
-    "outliers, huber": Case(with_outliers, options={"loss": "huber"}),
+    "outliers, huber": Case(with_outliers, method=ftlm.OutputError(loss="huber")),
     "unread": Case(unread),
     "lost": Case(lost, ("held",)),
     "jitter": Case(jittered),
@@ -209,7 +209,7 @@ def fitted(task: tuple[str, str, int]) -> tuple[list[float], list[float], bool, 
     case, plant = CASES[name], PLANTS[plant_name]
     run = case.make(plant, np.random.default_rng([seed, 13]))
     start = time.process_time()
-    found = ftlm.identify(run, ftlm.equation(plant.words), threads=1, **case.options)
+    found = ftlm.identify(run, ftlm.equation(plant.words), method=case.method, threads=1)
     taken = time.process_time() - start
     values, errors = found.orders | found.coefficients, found.standard_errors
     z = [(values[n] - true) / errors[n] for n, true in plant.truth.items()]

@@ -24,6 +24,7 @@ import numpy as np
 import ftlm
 import moves
 from ftlm import control, rig
+from ftlm.control import stability_margins
 
 RATE, ANGLE = moves.RATE, moves.ANGLE
 #: 20 degrees in half a second; rest before it for a reference that begins sooner, and a second behind it to be judged.
@@ -66,7 +67,7 @@ def identified(run, structure):
     """A model of a structure, on every fourth sample."""
     thin = run.resample(0.008)
     thin = thin.select([s for s in structure.signals if s in thin.signals])
-    return ftlm.identify(thin, structure, intervals="quadratic").model
+    return ftlm.identify(thin, structure, method=ftlm.OutputError(intervals="quadratic")).model
 
 
 def both(first):
@@ -161,14 +162,14 @@ def stable(seed=0):
     found = {name: [] for name in acting}
     for times in FINE_STIFFNESS:
         law = replace(arm, stage1=replace(arm.stage1, a=arm.stage1.a * float(times))).model()
-        plants = {o: control.margins.Plant(law, o, "I1", RATE, "simulated") for o in ("theta11", "theta12")}
+        plants = {o: stability_margins.Plant(law, o, "I1", RATE, "simulated") for o in ("theta11", "theta12")}
         seen = {o: plant.response(w) for o, plant in plants.items()}
-        grows = plants["theta11"].grows()
+        grows = plants["theta11"].count_unstable_poles()
         for delay in FINE_DELAYS:
             late = np.exp(-1j * w * float(delay))
             for name, ((read, answers), integral) in acting.items():
                 loop = sum(a * seen[o] for o, a in zip(read, answers, strict=True)) * late
-                margins = control.margins.margins_of(loop, w, plants["theta11"].integrates() + integral, grows)
+                margins = stability_margins.margins_of(loop, w, plants["theta11"].integral_order() + integral, grows)
                 found[name].append([float(times), float(delay), margins.stable])
     return {"stable": found}
 

@@ -234,7 +234,7 @@ def orders_by_lattice(task: tuple[str, int]) -> tuple[dict[str, float], float]:
     best = ftlm.identify(run, true, method="instrumental-variables", threads=1)
     try:
         found = ftlm.identify(
-            run, structure, method="instrumental-variables", order_grid=ftlm.order_grid(**LATTICES[name]), threads=1
+            run, structure, method=ftlm.InstrumentalVariables(order_grid=ftlm.order_grid(**LATTICES[name])), threads=1
         )
         return found.orders, shortfall(found.model, best.model, clean)
     except ftlm.ConvergenceError:

@@ -85,7 +85,7 @@ def for_links(run: ftlm.Run) -> ftlm.Run:
 def fitted(words: str, runs: list[ftlm.Run], judged: list[ftlm.Run]) -> ftlm.Identification:
     """Fit, and say numbers with standard errors and the fit on every run."""
     begun = time.process_time()
-    found = ftlm.identify(runs, ftlm.equation(words), threads=1, intervals="quadratic")
+    found = ftlm.identify(runs, ftlm.equation(words), threads=1, method=ftlm.OutputError(intervals="quadratic"))
     output = found.model.outputs[0]
     fits = ", ".join(f"{r.name} {found.model.compare(r).fit_percent[output]:.1f}" for r in judged)
     numbers = ", ".join(f"{n} {v:.5g} ± {found.standard_errors[n]:.2g}" for n, v in found.coefficients.items())

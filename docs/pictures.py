@@ -255,7 +255,7 @@ def unseen() -> Figure:
     square, sine = (demo_run(kind, duration=6.0).select(["I1", "theta11", "theta12"]) for kind in ("square", "sine"))
     link = ftlm.flexible_link(stage=1, form="published", coupling="measured", laws=())
     published = ftlm.identify(
-        square, link, method="multi-innovation", order_grid=ftlm.order_grid(increment=0.2, alpha=(1.4, 2.0))
+        square, link, method=ftlm.MultiInnovation(order_grid=ftlm.order_grid(increment=0.2, alpha=(1.4, 2.0)))
     ).validate(sine)
     ours = ftlm.identify(square, ftlm.flexible_link(stage=1, coupling="simulated")).validate(sine)
     thin = slice(None, None, 4)

@@ -7,194 +7,148 @@ import importlib as _importlib
 import typing as _typing
 
 if _typing.TYPE_CHECKING:
-    from ftlm import rig
-    from ftlm._core import __version__
-    from ftlm.arm.energy_balance import energies
-    from ftlm.arm.flexible_link import PARAMETER_SETS, LinkParameters, flexible_link, link_model, order_law
-    from ftlm.data.frequency_data import FrequencyData
-    from ftlm.data.run import Run
-    from ftlm.errors import ConvergenceError, DataError, FtlmError, InternalError, ModelError, RigFault
-    from ftlm.estimation.consistency import Consistency, ParameterDifference, consistency
-    from ftlm.estimation.frequency_domain import identify_frequency
-    from ftlm.estimation.frequency_result import FrequencyIdentification, FrequencyValidation
-    from ftlm.estimation.genetic import Genetic
-    from ftlm.estimation.identify import BatchResult, identify, identify_many
-    from ftlm.estimation.linear import MultiInnovationTrace, multi_innovation_trace
-    from ftlm.estimation.output_error import ProfileInterval
-    from ftlm.estimation.physical_parameters import PhysicalParameter, physical_parameters
-    from ftlm.estimation.result import Identification
-    from ftlm.estimation.verdict import Validation, Verdict
-    from ftlm.experiment_design.design_input import design_input
-    from ftlm.experiment_design.result import DesignedInput
-    from ftlm.fractional_calculus import (
-        block_pulse_matrix,
-        fractional_derivative,
-        fractional_integral,
-        haar_inverse,
-        haar_matrix,
-        haar_transform,
-        operational_matrix,
-    )
-    from ftlm.io.dialect import Assumption, Layout
-    from ftlm.io.load import load
-    from ftlm.io.load_frequency import load_frequency
-    from ftlm.io.preview import FileColumn, OpenedFile, open_file
-    from ftlm.model.model import Estimate, Model, load_model
-    from ftlm.order_search.certificate import certify_orders
-    from ftlm.order_search.result import OrderCertificate, SearchResult, SearchRow, StoreStatus
-    from ftlm.order_search.search import resume_search, search_orders, search_status
-    from ftlm.reproduction.reproduction import Reproduction, reproduce
-    from ftlm.simulation.simulate import explicit_euler, simulate
-    from ftlm.structure.equation import Equation, Friction, Stribeck, Term
-    from ftlm.structure.order import Order
-    from ftlm.structure.order_grid import OrderGrid, order_grid
-    from ftlm.structure.parser import equation
-    from ftlm.structure.sensor_filter import SensorFilter
-    from ftlm.structure.structure import Structure
-    from ftlm.structure_selection.cross_validation import Trial
-    from ftlm.structure_selection.result import Selection
-    from ftlm.structure_selection.select import select
-    from ftlm.validation.comparison import Comparison, Metrics, compare, metrics
-    from ftlm.validation.information_criteria import InformationCriteria, information_criteria
-    from ftlm.validation.residual_tests import CorrelationTest, FeedbackTest, OutputResiduals, Residuals, resid
-
-__all__ = [
-    "PARAMETER_SETS",
-    "Assumption",
-    "BatchResult",
-    "Comparison",
-    "Consistency",
-    "ConvergenceError",
-    "CorrelationTest",
-    "DataError",
-    "DesignedInput",
-    "Equation",
-    "Estimate",
-    "FeedbackTest",
-    "FileColumn",
-    "FrequencyData",
-    "FrequencyIdentification",
-    "FrequencyValidation",
-    "Friction",
-    "FtlmError",
-    "Genetic",
-    "Identification",
-    "InformationCriteria",
-    "InternalError",
-    "Layout",
-    "LinkParameters",
-    "Metrics",
-    "Model",
-    "ModelError",
-    "MultiInnovationTrace",
-    "OpenedFile",
-    "Order",
-    "OrderCertificate",
-    "OrderGrid",
-    "OutputResiduals",
-    "ParameterDifference",
-    "PhysicalParameter",
-    "ProfileInterval",
-    "Reproduction",
-    "Residuals",
-    "RigFault",
-    "Run",
-    "SearchResult",
-    "SearchRow",
-    "Selection",
-    "SensorFilter",
-    "StoreStatus",
-    "Stribeck",
-    "Structure",
-    "Term",
-    "Trial",
-    "Validation",
-    "Verdict",
-    "__version__",
-    "block_pulse_matrix",
-    "certify_orders",
-    "compare",
-    "consistency",
-    "design_input",
-    "energies",
-    "equation",
-    "explicit_euler",
-    "flexible_link",
-    "fractional_derivative",
-    "fractional_integral",
-    "haar_inverse",
-    "haar_matrix",
-    "haar_transform",
-    "identify",
-    "identify_frequency",
-    "identify_many",
-    "information_criteria",
-    "link_model",
-    "load",
-    "load_frequency",
-    "load_model",
-    "metrics",
-    "multi_innovation_trace",
-    "open_file",
-    "operational_matrix",
-    "order_grid",
-    "order_law",
-    "physical_parameters",
-    "reproduce",
-    "resid",
-    "resume_search",
-    "rig",
-    "search_orders",
-    "search_status",
-    "select",
-    "simulate",
-]
+    from ftlm import rig as rig
+    from ftlm._core import __version__ as __version__
+    from ftlm.arm.energy_balance import energies as energies
+    from ftlm.arm.flexible_link import PARAMETER_SETS as PARAMETER_SETS
+    from ftlm.arm.flexible_link import LinkParameters as LinkParameters
+    from ftlm.arm.flexible_link import flexible_link as flexible_link
+    from ftlm.arm.flexible_link import link_model as link_model
+    from ftlm.arm.flexible_link import order_law as order_law
+    from ftlm.data.frequency_data import FrequencyData as FrequencyData
+    from ftlm.data.run import Run as Run
+    from ftlm.errors import ConvergenceError as ConvergenceError
+    from ftlm.errors import DataError as DataError
+    from ftlm.errors import FtlmError as FtlmError
+    from ftlm.errors import InternalError as InternalError
+    from ftlm.errors import ModelError as ModelError
+    from ftlm.errors import RigFault as RigFault
+    from ftlm.estimation.consistency import Consistency as Consistency
+    from ftlm.estimation.consistency import ParameterDifference as ParameterDifference
+    from ftlm.estimation.consistency import consistency as consistency
+    from ftlm.estimation.frequency_domain import identify_frequency as identify_frequency
+    from ftlm.estimation.frequency_result import FrequencyIdentification as FrequencyIdentification
+    from ftlm.estimation.frequency_result import FrequencyValidation as FrequencyValidation
+    from ftlm.estimation.genetic import GeneticAlgorithm as GeneticAlgorithm
+    from ftlm.estimation.identify import BatchResult as BatchResult
+    from ftlm.estimation.identify import identify as identify
+    from ftlm.estimation.identify import identify_many as identify_many
+    from ftlm.estimation.linear import MultiInnovationTrace as MultiInnovationTrace
+    from ftlm.estimation.linear import multi_innovation_trace as multi_innovation_trace
+    from ftlm.estimation.methods import InstrumentalVariables as InstrumentalVariables
+    from ftlm.estimation.methods import LeastSquares as LeastSquares
+    from ftlm.estimation.methods import MultiInnovation as MultiInnovation
+    from ftlm.estimation.methods import OutputError as OutputError
+    from ftlm.estimation.output_error import ProfileInterval as ProfileInterval
+    from ftlm.estimation.physical_parameters import PhysicalParameter as PhysicalParameter
+    from ftlm.estimation.physical_parameters import physical_parameters as physical_parameters
+    from ftlm.estimation.result import Identification as Identification
+    from ftlm.estimation.verdict import Validation as Validation
+    from ftlm.estimation.verdict import Verdict as Verdict
+    from ftlm.experiment_design.design_input import design_input as design_input
+    from ftlm.experiment_design.result import DesignedInput as DesignedInput
+    from ftlm.fractional_calculus import block_pulse_matrix as block_pulse_matrix
+    from ftlm.fractional_calculus import fractional_derivative as fractional_derivative
+    from ftlm.fractional_calculus import fractional_integral as fractional_integral
+    from ftlm.fractional_calculus import haar_inverse as haar_inverse
+    from ftlm.fractional_calculus import haar_matrix as haar_matrix
+    from ftlm.fractional_calculus import haar_transform as haar_transform
+    from ftlm.fractional_calculus import operational_matrix as operational_matrix
+    from ftlm.io.dialect import Assumption as Assumption
+    from ftlm.io.dialect import Layout as Layout
+    from ftlm.io.load import load as load
+    from ftlm.io.load_frequency import load_frequency as load_frequency
+    from ftlm.io.preview import FileColumn as FileColumn
+    from ftlm.io.preview import OpenedFile as OpenedFile
+    from ftlm.io.preview import open_file as open_file
+    from ftlm.model.model import Estimate as Estimate
+    from ftlm.model.model import Model as Model
+    from ftlm.model.serialization import load_model as load_model
+    from ftlm.order_search.certificate import certify_orders as certify_orders
+    from ftlm.order_search.result import OrderCertificate as OrderCertificate
+    from ftlm.order_search.result import SearchResult as SearchResult
+    from ftlm.order_search.result import SearchRow as SearchRow
+    from ftlm.order_search.result import StoreStatus as StoreStatus
+    from ftlm.order_search.search import resume_search as resume_search
+    from ftlm.order_search.search import search_orders as search_orders
+    from ftlm.order_search.search import search_status as search_status
+    from ftlm.reproduction.reproduction import Reproduction as Reproduction
+    from ftlm.reproduction.reproduction import reproduce as reproduce
+    from ftlm.simulation.simulate import explicit_euler as explicit_euler
+    from ftlm.simulation.simulate import simulate as simulate
+    from ftlm.structure.equation import Equation as Equation
+    from ftlm.structure.equation import Friction as Friction
+    from ftlm.structure.equation import Stribeck as Stribeck
+    from ftlm.structure.equation import Term as Term
+    from ftlm.structure.order import Order as Order
+    from ftlm.structure.order_grid import OrderGrid as OrderGrid
+    from ftlm.structure.order_grid import order_grid as order_grid
+    from ftlm.structure.parser import equation as equation
+    from ftlm.structure.sensor_filter import SensorFilter as SensorFilter
+    from ftlm.structure.structure import Structure as Structure
+    from ftlm.structure_selection.cross_validation import Trial as Trial
+    from ftlm.structure_selection.result import Selection as Selection
+    from ftlm.structure_selection.select import select as select
+    from ftlm.validation.comparison import Comparison as Comparison
+    from ftlm.validation.comparison import Metrics as Metrics
+    from ftlm.validation.comparison import compare as compare
+    from ftlm.validation.comparison import metrics as metrics
+    from ftlm.validation.information_criteria import InformationCriteria as InformationCriteria
+    from ftlm.validation.information_criteria import information_criteria as information_criteria
+    from ftlm.validation.residual_tests import CorrelationTest as CorrelationTest
+    from ftlm.validation.residual_tests import FeedbackTest as FeedbackTest
+    from ftlm.validation.residual_tests import OutputResiduals as OutputResiduals
+    from ftlm.validation.residual_tests import Residuals as Residuals
+    from ftlm.validation.residual_tests import resid as resid
 
 #: Module of each public name.
 _MODULE_BY_NAME = {
-    name: home
-    for home, names in {
+    name: module
+    for module, names in {
         "_core": "__version__",
         "arm.energy_balance": "energies",
-        "arm.flexible_link": "flexible_link link_model order_law LinkParameters PARAMETERS",
-        "errors": "ConvergenceError DataError FtlmError InternalError ModelError RigFault",
-        "structure.equation": "Equation Friction Stribeck Term",
-        "structure.parser": "equation",
-        "structure.order_grid": "Lattice lattice",
-        "structure.order": "Order",
+        "arm.flexible_link": "PARAMETER_SETS LinkParameters flexible_link link_model order_law",
         "data.frequency_data": "FrequencyData",
         "data.run": "Run",
-        "model.model": "Estimate Model load_model",
-        "structure.structure": "SensorFilter Structure",
-        "experiment_design.design_input": "design_input",
-        "experiment_design.result": "DesignedInput",
-        "io.dialect": "Assumption Layout",
-        "io.load": "load",
-        "io.preview": "FileColumn OpenedFile open_file",
-        "io.load_frequency": "load_frequency",
-        "estimation.genetic": "Genetic",
-        "estimation.output_error": "ProfileInterval",
-        "estimation.linear": "Trace multi_innovation_trace",
-        "estimation.consistency": "Agreement Difference agreement",
+        "errors": "ConvergenceError DataError FtlmError InternalError ModelError RigFault",
+        "estimation.consistency": "Consistency ParameterDifference consistency",
         "estimation.frequency_domain": "identify_frequency",
         "estimation.frequency_result": "FrequencyIdentification FrequencyValidation",
-        "estimation.identify": "identify Identified identify_many",
+        "estimation.genetic": "GeneticAlgorithm",
+        "estimation.identify": "BatchResult identify identify_many",
+        "estimation.linear": "MultiInnovationTrace multi_innovation_trace",
+        "estimation.methods": "InstrumentalVariables LeastSquares MultiInnovation OutputError",
+        "estimation.output_error": "ProfileInterval",
         "estimation.physical_parameters": "PhysicalParameter physical_parameters",
         "estimation.result": "Identification",
         "estimation.verdict": "Validation Verdict",
-        "validation.comparison": "Comparison compare Metrics metrics",
-        "validation.information_criteria": "InformationCriteria information_criteria",
-        "validation.residual_tests": "FeedbackTest CorrelationTest OutputResiduals Residuals resid",
-        "reproduction.reproduction": "Reproduction reproduce",
+        "experiment_design.design_input": "design_input",
+        "experiment_design.result": "DesignedInput",
+        "fractional_calculus": "block_pulse_matrix fractional_derivative fractional_integral haar_inverse haar_matrix "
+        "haar_transform operational_matrix",
+        "io.dialect": "Assumption Layout",
+        "io.load": "load",
+        "io.load_frequency": "load_frequency",
+        "io.preview": "FileColumn OpenedFile open_file",
+        "model.model": "Estimate Model",
+        "model.serialization": "load_model",
         "order_search.certificate": "certify_orders",
-        "order_search.search": "resume_search search_orders search_status",
         "order_search.result": "OrderCertificate SearchResult SearchRow StoreStatus",
+        "order_search.search": "resume_search search_orders search_status",
+        "reproduction.reproduction": "Reproduction reproduce",
+        "simulation.simulate": "explicit_euler simulate",
+        "structure.equation": "Equation Friction Stribeck Term",
+        "structure.order": "Order",
+        "structure.order_grid": "OrderGrid order_grid",
+        "structure.parser": "equation",
+        "structure.sensor_filter": "SensorFilter",
+        "structure.structure": "Structure",
+        "structure_selection.cross_validation": "Trial",
         "structure_selection.result": "Selection",
         "structure_selection.select": "select",
-        "structure_selection.cross_validation": "Trial",
-        "simulation.simulate": "explicit_euler simulate",
-        "fractional_calculus": "block_pulse_matrix fractional_derivative fractional_integral haar_inverse "
-        "haar_matrix haar_transform operational_matrix",
+        "validation.comparison": "Comparison Metrics compare metrics",
+        "validation.information_criteria": "InformationCriteria information_criteria",
+        "validation.residual_tests": "CorrelationTest FeedbackTest OutputResiduals Residuals resid",
     }.items()
     for name in names.split()
 }
@@ -213,6 +167,8 @@ _PUBLIC_MODULES = frozenset(
         "validation",
     }
 )
+
+__all__ = list(sorted({*_MODULE_BY_NAME, "rig"}, key=lambda name: (not name.isupper(), not name[0].isupper(), name)))
 
 
 def __getattr__(name: str) -> object:

@@ -11,6 +11,7 @@ import numpy as np
 from ftlm.data.run import Run
 from ftlm.errors import ModelError
 from ftlm.estimation.identify import identify
+from ftlm.estimation.methods import EstimationMethod
 from ftlm.structure.order import Values
 from ftlm.structure.parser import equation
 from ftlm.structure.structure import Structure
@@ -35,7 +36,7 @@ class FractionalRegressor(_base.MultiOutputMixin, _base.RegressorMixin, _base.Ba
     orders
         Free orders by name: a number fixes one, ``"0.5:1.5:0.05"`` is its lattice; see :func:`ftlm.equation`.
     method
-        Of :func:`ftlm.identify`.
+        Name of a method, or a method with its options, such as :class:`ftlm.OutputError`; see :func:`ftlm.identify`.
     offset
         As of :func:`ftlm.identify`; it belongs to the fitted rows and is no part of a prediction.
     continues
@@ -61,7 +62,7 @@ class FractionalRegressor(_base.MultiOutputMixin, _base.RegressorMixin, _base.Ba
         *,
         step: float = 1.0,
         orders: Mapping[str, Values] | None = None,
-        method: Literal["output-error", "instrumental-variables", "multi-innovation", "least-squares"] = "output-error",
+        method: str | EstimationMethod = "output-error",
         offset: Literal["none", "constant", "ramp", "auto"] | None = None,
         continues: bool = False,
         threads: int = 1,

@@ -11,7 +11,7 @@ import numpy as np
 
 import ftlm
 from ftlm.order_search.checkpoint import Rounds, Store
-from ftlm.order_search.options import Settings
+from ftlm.order_search.options import SearchSettings
 from ftlm.order_search.search import make_job
 
 HERE = Path(__file__).resolve().parent
@@ -42,8 +42,8 @@ def main():
     lattice = ftlm.order_grid(increment=0.05, beta=(0.0, 1.0), mu=(0.0, 1.0))
     options = {"m": 32, "pruning": False, "threads": 1, "top": 5}
     whole = ftlm.search_orders(given, structure, lattice, store=folder / "search.ftlm", **options)
-    settings = Settings.check("output-error", "l1", "multi-innovation", 7, 1.0, "haar", 5, 1, pruning=False)
-    job = make_job(given, structure, lattice, settings, m=32)
+    settings = SearchSettings(top=5, pruning=False)
+    job = make_job(given, structure, lattice, settings, m=32, threads=1)
     with Store(folder / "half.ftlm", [job.request("y")]) as store:
         work = job.equation_problem()
         part = work.build_evaluator().rounds(0, 1, [], None, 1, None, None)

@@ -143,7 +143,7 @@ def test_scipy_alone_says_the_same(runs, output, terms, first, words, offset: bo
         offset="constant" if offset else "none",
         initial="caputo",
     )
-    found = ftlm.identify(runs["lqr"], made, method="output-error", intervals="quadratic")
+    found = ftlm.identify(runs["lqr"], made, method=ftlm.OutputError(intervals="quadratic"))
     ours = {n: found.model.compare(r).fit_percent[output] for n, r in runs.items()}
     assert ours == pytest.approx(scipy, abs=0.3)
 
@@ -160,7 +160,7 @@ def test_where_one_signal_stands_for_the_rest_there_is_no_machine(runs) -> None:
         laws=("orders", "velocities"),
     )
     made = replace(link.with_orders({"mu4": 1.0}), initial="caputo")
-    found = ftlm.identify(runs["psf"], made, method="output-error", intervals="quadratic")
+    found = ftlm.identify(runs["psf"], made, method=ftlm.OutputError(intervals="quadratic"))
     assert found.fit_percent["theta22"] > 92.0
     assert found.coefficients["b4"] == pytest.approx(-0.83, abs=0.05)
     assert found.orders["beta4"] < 0.02

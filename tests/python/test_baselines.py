@@ -8,7 +8,7 @@ import pytest
 
 import ftlm
 from ftlm.estimation import genetic
-from ftlm.estimation.genetic import Genetic, genetic_search, polynomial_mutation, simulated_binary_crossover
+from ftlm.estimation.genetic import GeneticAlgorithm, genetic_search, polynomial_mutation, simulated_binary_crossover
 from ftlm.simulation.discretization import prepare
 from ftlm.validation.comparison import compare_means
 
@@ -22,9 +22,9 @@ def found(small_run):
     return ftlm.identify(
         small_run,
         ftlm.equation(EQUATION),
-        method="genetic",
-        order_grid=LATTICE,
-        genetic=Genetic(seeds=(0, 1), evaluations=12000, population=100, bounds=BOUNDS),
+        method=ftlm.GeneticAlgorithm(
+            order_grid=LATTICE, seeds=(0, 1), evaluations=12000, population=100, bounds=BOUNDS
+        ),
     )
 
 
@@ -61,9 +61,9 @@ def test_orders_keep_to_their_steps_and_below_alpha(found):
 
 def searched(run, threads=1, **options):
     structure = ftlm.equation(EQUATION)
-    settings = Genetic(**{"seeds": (3,), "evaluations": 600, "population": 40, "bounds": BOUNDS, **options})
+    given = {"order_grid": LATTICE, "seeds": (3,), "evaluations": 600, "population": 40, "bounds": BOUNDS, **options}
     return genetic_search(
-        prepare([run], structure, 256, power_of_two=True), structure, LATTICE, settings, threads=threads
+        prepare([run], structure, 256, power_of_two=True), structure, GeneticAlgorithm(**given), threads=threads
     )
 
 
@@ -93,8 +93,7 @@ def test_as_many_evaluations_as_the_lattice_has_candidates(small_run):
     found = genetic_search(
         prepare([small_run], structure, 256, power_of_two=True),
         structure,
-        lattice,
-        Genetic(seeds=(0,), population=8, bounds=BOUNDS),
+        GeneticAlgorithm(order_grid=lattice, seeds=(0,), population=8, bounds=BOUNDS),
         progress=lambda done, total: told.append((done, total)),
     )
     assert candidates <= found.evaluations[0] <= candidates + 8
@@ -107,17 +106,17 @@ def test_all_equations_of_a_stage_under_their_order_law(clean_a):
     found = ftlm.identify(
         clean_a,
         structure,
-        method="genetic",
+        method=ftlm.GeneticAlgorithm(
+            order_grid=ftlm.order_grid(alpha=(2.0, 2.0)), seeds=(0,), evaluations=400, population=40
+        ),
         m=256,
-        order_grid=ftlm.order_grid(alpha=(2.0, 2.0)),
-        genetic=Genetic(seeds=(0,), evaluations=400, population=40),
     )
     assert set(found.orders) == set(structure.order_names)
     law = ftlm.order_law(1, form="published")["beta1"].at(found.orders)
     assert found.model.equations[0].terms[0].order.constant == pytest.approx(law, abs=1e-9)
     assert np.isfinite(found.settings["errors"]["stage"]["0"])
     with pytest.raises(
-        ftlm.ModelError, match=r"candidates, too many to evaluate one by one; give Genetic\(evaluations"
+        ftlm.ModelError, match=r"candidates, too many to evaluate one by one; give GeneticAlgorithm\(evaluations"
     ):
         ftlm.identify(clean_a, structure, method="genetic", m=256)
 
@@ -146,24 +145,24 @@ def test_operators_keep_to_what_they_promise():
         ({"seeds": "12"}, "give one or more whole numbers"),
         ({"bounds": {"a": (1.0, 0.0)}}, "are no interval"),
         ({"bounds": {"a": (0.0, np.nan)}}, "are no interval"),
+        ({"bounds": ((0.0, 1.0),)}, "is no mapping"),
+        ({"seeds": 3}, "give one or more whole numbers"),
+        ({"norm": "l0"}, "norm = 'l0' is not known"),
+        ({"order_grid": {"alpha": 1}}, "is dict, not"),
     ],
 )
 def test_settings_that_mean_nothing_are_refused(options, message):
     with pytest.raises(ftlm.ModelError, match=message):
-        Genetic(**options)
+        GeneticAlgorithm(**options)
 
 
 def test_what_cannot_be_done_is_said(small_run, monkeypatch):
     structure = ftlm.equation(EQUATION)
     with pytest.raises(ftlm.ModelError, match="bounds of 'q': there is no such number; free are alpha, nu, a, c, b"):
-        ftlm.identify(small_run, structure, method="genetic", genetic=Genetic(bounds={"q": (0, 1)}))
-    with pytest.raises(ftlm.ModelError, match="genetic= is not used by method='least-squares'; leave it out, or use "):
-        ftlm.identify(small_run, structure, method="least-squares", genetic=Genetic())
-    with pytest.raises(ftlm.ModelError, match="genetic is dict, not Genetic"):
-        ftlm.identify(small_run, structure, method="genetic", genetic={"seeds": 1})
-    late = small_run.slice(2.0, None)
+        ftlm.identify(small_run, structure, method=ftlm.GeneticAlgorithm(bounds={"q": (0, 1)}))
+    late = small_run.window(2.0, None)
     with pytest.raises(ftlm.ModelError, match="knows no initial terms and needs runs that start at rest"):
-        ftlm.identify(late, structure, method="genetic", genetic=Genetic(evaluations=400))
+        ftlm.identify(late, structure, method=ftlm.GeneticAlgorithm(evaluations=400))
     monkeypatch.setitem(sys.modules, "pygad", None)
     with pytest.raises(ftlm.ModelError, match=r"pip install 'ftlm\[genetic\]'"):
-        ftlm.identify(small_run, structure, method="genetic", genetic=Genetic(evaluations=400))
+        ftlm.identify(small_run, structure, method=ftlm.GeneticAlgorithm(evaluations=400))

@@ -40,12 +40,14 @@ def check_one_by_one(run, whole, **options):
     assert all(part.candidates < BOXED for part in parts)
     rows = sorted((row for part in parts for row in rows_of(part)), key=lambda row: row[0])
     assert rows_of(whole) == rows[: len(whole.table)]
-    assert sum(whole.pruned.values()) + len(whole.table) == whole.candidates
+    assert sum(whole.exclusion_counts.values()) + len(whole.table) == whole.candidates
     assert [part.excluded_by_box for part in parts] == [0, 0]
-    assert 0 < whole.boxed <= whole.pruned["bound"]
-    assert f"{whole.pruned['bound']} bound ({whole.boxed} of them in boxes excluded whole)" in str(whole)
+    assert 0 < whole.excluded_by_box <= whole.exclusion_counts["bound"]
+    assert f"{whole.exclusion_counts['bound']} bound ({whole.excluded_by_box} of them in boxes excluded whole)" in str(
+        whole
+    )
     assert "of these in boxes excluded whole" in whole._repr_html_()
-    assert f"{number(whole.boxed)} are in boxes" in search_summary({"y": whole}).to_html()
+    assert f"{number(whole.excluded_by_box)} are in boxes" in search_summary({"y": whole}).to_html()
 
 
 @pytest.mark.slow

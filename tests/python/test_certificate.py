@@ -48,8 +48,8 @@ def rmse(run, equation, alpha, beta):
 
 
 def test_no_search_between_the_values_of_the_lattice_does_better(run, equation, proved):
-    assert proved.open == 0
-    assert 0.95 * proved.best * (1 - 1e-6) <= proved.at_least <= proved.best
+    assert proved.open_cells == 0
+    assert 0.95 * proved.best * (1 - 1e-6) <= proved.lower_bound <= proved.best
     assert proved.tolerance <= 0.05 + 1e-6
     assert rmse(run, equation, *proved.orders.values()) == pytest.approx(proved.best, rel=1e-6)
     fine: dict = {"alpha": "1.3:1.798:0.003", "beta": "0.5:0.899:0.003"}
@@ -62,7 +62,7 @@ def test_no_search_between_the_values_of_the_lattice_does_better(run, equation, 
         coefficients="least-squares",
         m=128,
     )
-    assert proved.at_least <= found.score
+    assert proved.lower_bound <= found.score
     assert proved.best <= found.score * 1.01
     assert set(proved.orders) == {"alpha", "beta"}
     assert proved.intervals == {"alpha": (1.3, 1.8), "beta": (0.5, 0.9)}
@@ -86,7 +86,7 @@ def test_the_best_may_stand_on_an_edge(run, equation):
 def test_several_runs_of_their_own_steps_and_threads(run, equation, proved):
     again = ftlm.certify_orders(run, equation, LATTICE, tolerance=0.05, m=128, threads=1)
     assert again == proved
-    twice = ftlm.certify_orders([run, run.slice(1.0, 5.0)], equation, LATTICE, tolerance=0.2, m=128)
+    twice = ftlm.certify_orders([run, run.window(1.0, 5.0)], equation, LATTICE, tolerance=0.2, m=128)
     assert 0 < twice.lower_bound <= twice.best
 
 
@@ -103,7 +103,7 @@ def test_it_says_in_words_what_is_proved_and_what_is_not(run, equation, proved):
     assert nothing.tolerance == 1
     assert "nothing is proved" in str(nothing)
     document = json.loads(json.dumps(proved.to_dict()))
-    assert document["at_least"] == proved.at_least
+    assert document["lower_bound"] == proved.lower_bound
     assert document["orders"] == proved.orders
     searched = ftlm.search_orders(run, equation, ftlm.order_grid(increment=0.3), m=32)
     whole = replace(searched, certificate=proved)
@@ -168,11 +168,11 @@ def test_the_command_line_prints_it_behind_the_table(csv, proved):
         "rest",
         "--m",
         "128",
-        "--step",
+        "--increment",
         "0.1",
-        "--lattice",
+        "--order-grid",
         "alpha=1.3:1.8:0.1",
-        "--lattice",
+        "--order-grid",
         "beta=0.5:0.9:0.1",
         "--coefficients",
         "least-squares",
@@ -183,7 +183,7 @@ def test_the_command_line_prints_it_behind_the_table(csv, proved):
     assert "candidates:" in told.output
     assert "certificate: no orders with alpha from 1.3 to 1.8" in told.output
     told = CliRunner().invoke(app, [*words, *ranked, "--certify", "0.05", "--json"])
-    assert json.loads(told.output)["y"]["certificate"]["at_least"] == pytest.approx(proved.at_least, rel=1e-3)
+    assert json.loads(told.output)["y"]["certificate"]["lower_bound"] == pytest.approx(proved.lower_bound, rel=1e-3)
     plain = CliRunner().invoke(app, [*words, *ranked, "--json"])
     assert "certificate" not in json.loads(plain.output)["y"]
     for options, said in [

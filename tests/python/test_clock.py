@@ -35,7 +35,9 @@ def in_seconds(values, scale):
 @pytest.mark.parametrize("seed", [0, 2])
 def test_a_flat_fit_does_not_depend_on_the_unit_of_time(seed):
     found = {
-        unit: ftlm.identify(lag(seed, scale), ftlm.equation(FLAT), threads=1, intervals="quadratic").fit
+        unit: ftlm.identify(
+            lag(seed, scale), ftlm.equation(FLAT), threads=1, method=ftlm.OutputError(intervals="quadratic")
+        ).fit
         for unit, scale in UNITS.items()
     }
     seconds = found["s"]

@@ -90,8 +90,8 @@ def test_the_reference_takes_the_bias_out():
     errors: dict[str, list[float]] = {"measured": [], "r": []}
     for seed in range(3):
         run = loops.loop("closed, coloured, biased", seed, rows=6000)
-        for how, options in (("measured", {}), ("r", {"reference": "r"})):
-            found = ftlm.identify(run, STRUCTURE, **options)
+        for how, reference in (("measured", None), ("r", "r")):
+            found = ftlm.identify(run, STRUCTURE, method=ftlm.OutputError(reference=reference))
             errors[how].append((found.coefficients["b"] - loops.TRUTH["b"]) / found.standard_errors["b"])
             assert bool(loop_warnings(found)) == (how == "measured")
             assert found.fit.converged
@@ -101,7 +101,7 @@ def test_the_reference_takes_the_bias_out():
 def test_residuals_are_orthogonal_to_what_follows_the_reference():
     # The oracle: sensitivities by differences of the exact step response's convolutions with the answer to r.
     run = loops.loop("closed, coloured", 3)
-    found = ftlm.identify(run, STRUCTURE, reference="r")
+    found = ftlm.identify(run, STRUCTURE, method=ftlm.OutputError(reference="r"))
     assert found.fit.converged
     values = found.parameter_values
     (answer,), _ = instrument_runs([run], STRUCTURE, "r")
@@ -140,27 +140,26 @@ def test_a_weak_reference_is_named():
     weak = ftlm.Run.from_arrays(
         step=run.step, inputs={"u": run["u"], "r": np.repeat(rng.choice([-1.0, 1.0], 30), 50)}, outputs={"y": run["y"]}
     )
-    found = ftlm.identify(weak, STRUCTURE, reference="r")
+    found = ftlm.identify(weak, STRUCTURE, method=ftlm.OutputError(reference="r"))
     assert [w for w in found.warnings if "weak instrument" in w]
 
 
 @pytest.mark.parametrize(
-    ("options", "error", "words"),
+    ("reference", "error", "words"),
     [
-        ({"reference": "q"}, ftlm.DataError, "has no signal 'q'"),
-        ({"reference": "u"}, ftlm.ModelError, "is a signal of the model"),
-        ({"reference": 3}, ftlm.ModelError, "not the name of a signal"),
-        ({"reference": "still"}, ftlm.DataError, "does not move"),
-        ({"reference": "r", "method": "instrumental-variables"}, ftlm.ModelError, "reference= is not used by"),
+        ("q", ftlm.DataError, "has no signal 'q'"),
+        ("u", ftlm.ModelError, "is a signal of the model"),
+        (3, ftlm.ModelError, "not the name of a signal"),
+        ("still", ftlm.DataError, "does not move"),
     ],
 )
-def test_what_is_no_reference_is_refused(options, error, words):
+def test_what_is_no_reference_is_refused(reference, error, words):
     run = loops.loop("closed, white", 0)
     more = ftlm.Run.from_arrays(
         step=run.step, inputs={"u": run["u"], "r": run["r"], "still": np.ones(run.length)}, outputs={"y": run["y"]}
     )
     with pytest.raises(error, match=words):
-        ftlm.identify(more, STRUCTURE, **options)
+        ftlm.identify(more, STRUCTURE, method=ftlm.OutputError(reference=reference))
 
 
 def test_instrumental_variables_count_the_error_of_their_orders():
@@ -169,7 +168,7 @@ def test_instrumental_variables_count_the_error_of_their_orders():
     near = ftlm.order_grid(alpha=(1.5, 1.9))
     for seed in range(3):
         run = loops.open_run(seed, noise=0.05)
-        found = ftlm.identify(run, STRUCTURE, method="instrumental-variables", order_grid=near)
+        found = ftlm.identify(run, STRUCTURE, method=ftlm.InstrumentalVariables(order_grid=near))
         truth = {**loops.TRUTH, "alpha": 1.73}
         held += [found.intervals[n][0] <= v <= found.intervals[n][1] for n, v in truth.items()]
         assert found.standard_errors["alpha"] >= 0.5 * abs(found.orders["alpha"] - 1.73)

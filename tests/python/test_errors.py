@@ -134,13 +134,13 @@ BAD = {
     # Settings
     "threads of 0": (MODEL, "threads = 0 is outside [1, 1024]", lambda: search(threads=0)),
     "keep of 0": (MODEL, "top = 0 is outside [1, 100000]", lambda: search(top=0)),
-    "p of 0": (MODEL, "innovation length p = 0", lambda: identify(method="multi-innovation", innovation_length=0)),
+    "p of 0": (MODEL, "innovation_length = 0", lambda: identify(method=ftlm.MultiInnovation(innovation_length=0))),
     "K0 of 0": (
         MODEL,
-        "prior covariance K0 = 0 is not positive",
-        lambda: identify(method="multi-innovation", prior_covariance=0),
+        "prior_covariance = 0 is not positive",
+        lambda: identify(method=ftlm.MultiInnovation(prior_covariance=0)),
     ),
-    "K0 below 0": (MODEL, "prior covariance K0 = -3 is not positive", lambda: search(prior_covariance=-3)),
+    "K0 below 0": (MODEL, "prior_covariance = -3 is not positive", lambda: search(prior_covariance=-3)),
     "unknown method": (MODEL, "method = 'lsq' is not known", lambda: identify(method="lsq")),
     "unknown criterion": (MODEL, "criterion = 'rmse' is not known", lambda: search(criterion="rmse")),
     "unknown norm": (MODEL, "norm = 'linf' is not known", lambda: search(norm="linf")),

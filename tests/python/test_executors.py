@@ -10,6 +10,7 @@ import subprocess
 import sys
 import time
 from concurrent.futures import Executor, Future, ProcessPoolExecutor, ThreadPoolExecutor
+from dataclasses import replace
 
 import pytest
 
@@ -224,20 +225,11 @@ def test_spawned_processes_give_the_same_bytes_of_a_stage_and_resume(stage_run, 
 @pytest.mark.parametrize("laws", [(), ("orders", "coefficients")])
 def test_an_identification_by_the_lattice_shares_its_searches_out(stage_run, laws):
     structure = ftlm.flexible_link(form="published", laws=laws, coupling="measured")
-    options = {
-        "method": "least-squares",
-        "order_grid": ftlm.OrderGrid(increment=0.3, alpha=(1.8, 2.0)),
-        "m": 64,
-        "top": 5,
-    }
+    method = ftlm.LeastSquares(order_grid=ftlm.OrderGrid(increment=0.3, alpha=(1.8, 2.0)), top=5)
     with ThreadPoolExecutor(2) as pool:
-        found = ftlm.identify(stage_run, structure, executor=pool, **options)
-    assert json.dumps(found.to_dict()) == json.dumps(ftlm.identify(stage_run, structure, **options).to_dict())
-    with (
-        ThreadPoolExecutor(1) as pool,
-        pytest.raises(ModelError, match="executor= is not used by method='output-error'"),
-    ):
-        ftlm.identify(stage_run, structure, executor=pool)
+        found = ftlm.identify(stage_run, structure, method=replace(method, executor=pool), m=64)
+    alone = ftlm.identify(stage_run, structure, method=method, m=64)
+    assert json.dumps(found.to_dict()) == json.dumps(alone.to_dict())
 
 
 def test_of_a_stage_the_record_is_sent_once_and_tasks_are_ranges(stage_run, stage_expected):

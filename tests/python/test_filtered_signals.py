@@ -165,7 +165,9 @@ def above_run(filtered: tuple[str, ...], begin: float, every: int) -> ftlm.Run:
 def test_a_derivative_above_its_equations_order_takes_none_of_the_beginning(filtered):
     # Signals begin at a level, and what came through a filter with the motion of what that held: neither is a jump.
     run = above_run(filtered, 1.7, 4)
-    found = ftlm.identify(run, ftlm.equation(ABOVE, sensor_filter=sensor(filtered)), intervals="quadratic")
+    found = ftlm.identify(
+        run, ftlm.equation(ABOVE, sensor_filter=sensor(filtered)), method=ftlm.OutputError(intervals="quadratic")
+    )
     for name, value in ABOVE_TRUTH.items():
         assert found.coefficients[name] == pytest.approx(value, rel=0.01), name
     compared = found.model.compare(run)
@@ -427,11 +429,15 @@ def test_the_command_line_names_filtered_signals():
     assert built == ftlm.equation(WORDS, sensor_filter=sensor(("y", "v")))
     assert StructureOptions(filtered=["v"]).structure(WORDS).sensor_filter == ftlm.SensorFilter.low_pass(["v"])
     for options, text, words in [
-        ({"low_pass": "2"}, WORDS, "--low-pass is of signals that --filtered names"),
-        ({"filtered": ["y"], "low_pass": "slow"}, WORDS, "--low-pass 'slow' is not HZ or HZ:DAMPING"),
+        ({"low_pass": "2"}, WORDS, "--sensor-filter is of signals that --filtered-signals names"),
+        ({"filtered": ["y"], "low_pass": "slow"}, WORDS, "--sensor-filter 'slow' is not HZ or HZ:DAMPING"),
         ({"filtered": ["w"]}, WORDS, "filtered signal 'w' does not occur"),
-        ({"filtered": ["theta12"]}, "flexible-link:1", "of equations in words; the flexible link has --stock-filter"),
-        ({"filtered": ["theta12"]}, "arm", "--filtered: --structure arm has its own; leave it out"),
+        (
+            {"filtered": ["theta12"]},
+            "flexible-link:1",
+            "of equations in words; the flexible link has --sensor-filter stock",
+        ),
+        ({"filtered": ["theta12"]}, "arm", "--filtered-signals: --structure arm has its own; leave it out"),
         ({"cross_stage": True, "inertial": True}, "flexible-link:1", "use one of them"),
         ({}, "arm:3", "--structure 'arm:3' is not known; use arm:1, :2 or :both"),
     ]:

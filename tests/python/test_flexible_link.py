@@ -8,6 +8,7 @@ import pytest
 from msgspec import UNSET
 
 import ftlm
+from ftlm.order_search.options import SearchSettings
 from ftlm.order_search.search import make_job
 
 FREE = {1: ("alpha1", "beta2", "alpha2", "gamma1", "mu2"), 2: ("alpha3", "beta4", "alpha4", "gamma3", "mu4")}
@@ -351,13 +352,13 @@ def test_the_whole_arm_is_searched_stage_by_stage():
         **{f"{n}{d}": v for d in (2, 4) for n, v in (("beta", (0.1, 0.2)), ("mu", (0.8, 0.9)))},
     )
     whole = ftlm.identify(
-        run, ftlm.flexible_link(form="published", stage="both"), method="least-squares", order_grid=coarse
+        run, ftlm.flexible_link(form="published", stage="both"), method=ftlm.LeastSquares(order_grid=coarse)
     )
     for stage in (1, 2):
         kept = ("alpha", f"gamma{2 * stage - 1}", f"beta{2 * stage}", f"mu{2 * stage}")
         own = replace(coarse, orders={n: v for n, v in coarse.orders.items() if n in kept})
         alone = ftlm.identify(
-            run, ftlm.flexible_link(form="published", stage=stage), method="least-squares", order_grid=own
+            run, ftlm.flexible_link(form="published", stage=stage), method=ftlm.LeastSquares(order_grid=own)
         )
         assert alone.orders.items() <= whole.orders.items()
         assert alone.coefficients.items() <= whole.coefficients.items()
@@ -384,6 +385,8 @@ def test_hints_are_kept_by_what_changes_a_structure_and_stand_in_no_file_text_or
     assert fixed.hints.order_names_by_coefficient["a1"] == "beta1"
     assert replace(structure, hints=UNSET) == structure
     assert "hints" not in repr(structure) + str(structure)
-    job = make_job([clean_a], structure.equation("theta11"), ftlm.order_grid(increment=0.5), m=64, row_basis="time")
+    job = make_job(
+        [clean_a], structure.equation("theta11"), ftlm.order_grid(increment=0.5), SearchSettings(row_basis="time"), m=64
+    )
     assert b"hints" not in msgspec.msgpack.encode(job.request("theta11"))
     assert set(structure.equation("theta11").order_names) == {"alpha1", "beta1", "gamma1", "mu1"}

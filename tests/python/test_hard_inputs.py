@@ -8,6 +8,7 @@ import numpy as np
 import pytest
 
 import ftlm
+from ftlm.estimation.methods import method_with_options
 from ftlm.estimation.model_checks import MAX_PARAMETER_CORRELATION, MAX_RELATIVE_STANDARD_ERROR
 from ftlm.structure_selection.candidates import NestedStructures
 from ftlm.structure_selection.cross_validation import fit
@@ -40,7 +41,7 @@ def identified(runs, method, **orders):
     structure = ftlm.equation(WORDS, orders=orders)
     searched = method != "output-error" and structure.order_names
     options = {"order_grid": ftlm.order_grid(increment=0.2)} if searched else {}
-    return ftlm.identify(runs, structure, method=method, threads=1, **options)
+    return ftlm.identify(runs, structure, method=method_with_options(method, options), threads=1)
 
 
 def truth_is_inside(found, width=4.0):

@@ -217,6 +217,6 @@ def test_the_printed_fit_is_that_of_the_residuals_where_numbers_cannot_be_told_a
     whole = resonant_plant(seed, wrong=True)
     run = whole.window(0.0, (rows - 1) * whole.step)
     structure = ftlm.equation("D^alpha y = d D^mu y + e D^nu y + a y + b u", initial="rest")
-    found = ftlm.identify(run, structure, threads=1, intervals="quadratic")
+    found = ftlm.identify(run, structure, threads=1, method=ftlm.OutputError(intervals="quadratic"))
     assert found.fit.standard_errors["mu"] > 0.2
     assert found.output_error["y"].rmse == pytest.approx(found.fit.noise["y"], rel=0.1)

@@ -21,7 +21,9 @@ def run():
 
 @pytest.fixture(scope="module")
 def simple(run):
-    return ftlm.identify(run, ftlm.equation("D^2 y = d D y + a y + b u", initial="rest"), intervals="quadratic")
+    return ftlm.identify(
+        run, ftlm.equation("D^2 y = d D y + a y + b u", initial="rest"), method=ftlm.OutputError(intervals="quadratic")
+    )
 
 
 def test_a_simpler_model_says_where_the_richer_one_starts(simple):
@@ -39,10 +41,18 @@ def test_what_is_not_known_does_nothing_at_first():
 
 
 def test_a_richer_structure_from_a_simpler_one_is_never_worse(run, simple):
-    rich = ftlm.identify(run, ftlm.equation(RICH, initial="rest"), start=simple, intervals="quadratic", threads=1)
-    assert rich.fit.noise["y"] <= simple.joint.noise["y"] * (1 + 1e-6)
+    rich = ftlm.identify(
+        run,
+        ftlm.equation(RICH, initial="rest"),
+        method=ftlm.OutputError(start=simple, intervals="quadratic"),
+        threads=1,
+    )
+    assert rich.fit.noise["y"] <= simple.fit.noise["y"] * (1 + 1e-6)
     from_model = ftlm.identify(
-        run, ftlm.equation(RICH, initial="rest"), start=simple.model, intervals="quadratic", threads=1
+        run,
+        ftlm.equation(RICH, initial="rest"),
+        method=ftlm.OutputError(start=simple.model, intervals="quadratic"),
+        threads=1,
     )
     assert from_model.parameter_values == rich.parameter_values
 
@@ -51,8 +61,10 @@ def test_a_start_leads_where_automatic_ones_do_not():
     """A start at the truth beside automatic starts ends at the lowest optimum of both."""
     run = noisy_run("3T", 40, 3)
     truth = {"alpha": 2.2, "nu": 0.9, "a1": -0.625, "a0": -1.25, "b0": 1.25}
-    with_start = ftlm.identify(run, structure("3T"), start=truth, intervals="quadratic", threads=1)
-    alone = ftlm.identify(run, structure("3T"), intervals="quadratic", threads=1)
+    with_start = ftlm.identify(
+        run, structure("3T"), method=ftlm.OutputError(start=truth, intervals="quadratic"), threads=1
+    )
+    alone = ftlm.identify(run, structure("3T"), method=ftlm.OutputError(intervals="quadratic"), threads=1)
     assert with_start.fit.cost <= alone.fit.cost * (1 + 1e-9)
     np.testing.assert_allclose(with_start.fit.values, alone.fit.values, rtol=1e-3)
 
@@ -68,7 +80,15 @@ def test_the_command_takes_a_saved_model(run, simple, tmp_path):
     assert json.loads(done.stdout)["output_error"]["y"]["rmse"] <= simple.output_error["y"].rmse * (1 + 1e-3)
     unused = CliRunner().invoke(
         app,
-        [*words, "--method", "least-squares", "--lattice", "alpha=1.5:2:0.1", "--start", str(tmp_path / "simple.json")],
+        [
+            *words,
+            "--method",
+            "least-squares",
+            "--order-grid",
+            "alpha=1.5:2:0.1",
+            "--start",
+            str(tmp_path / "simple.json"),
+        ],
     )
     assert unused.exit_code == 2
     assert "--start is not used by --method least-squares" in unused.output
@@ -79,17 +99,17 @@ def test_the_command_takes_a_saved_model(run, simple, tmp_path):
 def test_words_for_a_start_that_is_none(run, simple):
     rich = ftlm.equation(RICH, initial="rest")
     with pytest.raises(ftlm.ModelError, match="start value 'c' does not occur"):
-        ftlm.identify(run, rich, start={"c": 1.0})
+        ftlm.identify(run, rich, method=ftlm.OutputError(start={"c": 1.0}))
     with pytest.raises(ftlm.ModelError, match="start= has none of the numbers that are free: alpha, mu, d, a, b"):
-        ftlm.identify(run, rich, start={})
+        ftlm.identify(run, rich, method=ftlm.OutputError(start={}))
     with pytest.raises(ftlm.ModelError, match="start= has alpha = 9, out of its bounds"):
-        ftlm.identify(run, rich, start={"alpha": 9.0})
+        ftlm.identify(run, rich, method=ftlm.OutputError(start={"alpha": 9.0}))
     with pytest.raises(ftlm.ModelError, match="start value of a"):
-        ftlm.identify(run, rich, start={"a": "much"})
+        ftlm.identify(run, rich, method=ftlm.OutputError(start={"a": "much"}))
     with pytest.raises(ftlm.ModelError, match="start is int; give an identification"):
-        ftlm.identify(run, rich, start=3)
+        ftlm.identify(run, rich, method=ftlm.OutputError(start=3))
     with pytest.raises(ftlm.ModelError, match="start= is not used by method='least-squares'"):
-        ftlm.identify(run, ftlm.equation("D^2 y = a y + b u"), method="least-squares", start=simple)
+        ftlm.identify(run, ftlm.equation("D^2 y = a y + b u"), method=ftlm.LeastSquares(start=simple))
     other = ftlm.Model(ftlm.equation("D z = -1.0 z + 1.0 u"))
     with pytest.raises(ftlm.ModelError, match="output of start 'z' does not occur"):
-        ftlm.identify(run, rich, start=other)
+        ftlm.identify(run, rich, method=ftlm.OutputError(start=other))

@@ -212,7 +212,7 @@ import numpy as np, sys, ftlm
 with np.load(sys.argv[1]) as kept:
     run = ftlm.Run.from_arrays(step=0.02, inputs={"u": kept["u"]}, outputs={"y": kept["y"]})
 structure = ftlm.equation("D^alpha y = a y + b u")
-ftlm.identify(run.slice(0, 5), structure, threads=1)
+ftlm.identify(run.window(0, 5), structure, threads=1)
 before = held()
 found = ftlm.identify(run, structure, threads=1)
 print(found.orders["alpha"], held() - before)

@@ -249,7 +249,7 @@ def test_the_length_follows_the_noise_never_the_fit(halves):
         resolve_initial_conditions(run, worse) == resolve_initial_conditions(run, structure) == history(run, structure)
     )
     assert history(run, ftlm.equation("D^4.2 y = a y + b u"))[-3:] == (2.0, 3.0, 4.0)
-    short = run.slice(None, 3.0)
+    short = run.window(None, 3.0)
     assert history(short, structure) == (0.0, 0.25, 0.5, 0.75, 1.0, 2.0)
 
 
@@ -273,8 +273,8 @@ def test_started_leaves_stated_terms_alone(halves):
 def test_equation_error_methods_carry_the_history_too(halves, method):
     (_, run), _ = halves
     structure = ftlm.equation("D^0.7 y = -a y + b u")
-    options = {"prior_covariance": 1e6} if method == "multi-innovation" else {}
-    found = ftlm.identify(run, structure, method=method, **options)
+    chosen = ftlm.MultiInnovation(prior_covariance=1e6) if method == "multi-innovation" else method
+    found = ftlm.identify(run, structure, method=chosen)
     assert found.settings["initial"] == "history, 8 powers of t up to 2"
     assert found.coefficients == pytest.approx({"a": 0.5, "b": 1.0}, rel=0.1)
 

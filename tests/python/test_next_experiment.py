@@ -62,7 +62,9 @@ TRUTH = {"alpha": 1.6, "a1": -0.8, "a0": -4.0, "b0": 3.0}
 @pytest.fixture(scope="module")
 def found() -> ftlm.Identification:
     structure = replace(ftlm.equation(FREE), initial="rest")
-    return ftlm.identify(first_run(PLANT), structure, threads=1, intervals="quadratic", start=TRUTH)
+    return ftlm.identify(
+        first_run(PLANT), structure, threads=1, method=ftlm.OutputError(intervals="quadratic", start=TRUTH)
+    )
 
 
 @pytest.fixture(scope="module")
@@ -350,7 +352,7 @@ def test_peak_swing_and_slew_are_kept_and_said(found: ftlm.Identification, desig
 
 
 def test_the_widest_axis_is_shorter_by_its_own_criterion(found: ftlm.Identification) -> None:
-    options = {"names": ["alpha", "a1"], "limits": {"y": 0.9}, "duration": 4.0}
+    options = {"parameters": ["alpha", "a1"], "limits": {"y": 0.9}, "duration": 4.0}
     both = {c: ftlm.design_input(found, criterion=c, **options) for c in ("D", "E")}
     laid = ModelFit.of(found.model, parameter_set_of(found.model).noise)
     widest, all_of_it = Criterion("E", (0, 1), (1.0, abs(laid.values[1]))), Criterion("D", (0, 1), (1.0, 1.0))
@@ -417,9 +419,9 @@ BAD = {
     "slew": ({"slew": 1e-3}, None, "slew of u = 0.001 a second takes"),
     "limit of an input": ({"limits": {"u": 1}}, None, "limits names 'u'.*none of y"),
     "limit below 0": ({"limits": {"y": -1}}, None, "limits of y = -1 is not above 0"),
-    "names": ({"names": ["alhpa"]}, None, r"names\[0\] = 'alhpa'.*did you mean 'alpha'"),
-    "no names": ({"names": []}, None, "names is empty"),
-    "twice": ({"names": ["a0", "a0"]}, None, "'a0' twice"),
+    "parameters": ({"parameters": ["alhpa"]}, None, r"names\[0\] = 'alhpa'.*did you mean 'alpha'"),
+    "no names": ({"parameters": []}, None, "names is empty"),
+    "twice": ({"parameters": ["a0", "a0"]}, None, "'a0' twice"),
     "criterion": ({"criterion": "A"}, None, "criterion = 'A' is not known"),
     "duration": ({"duration": -1.0}, None, "duration = -1 is not a length"),
     "not a number": ({"step": math.nan}, None, "step = nan is not a step"),
@@ -432,8 +434,8 @@ BAD = {
     "tiny noise": ({"noise": 1e-320}, None, "noise of y = .* is no size"),
     "criteria": ({"criterion": np.array(["D", "E"])}, None, "criterion = array"),
     "progress": ({"progress": 5}, None, "progress is a int"),
-    "no list": ({"names": 5}, None, "names is a int"),
-    "no name": ({"names": [["alpha"]]}, None, r"names\[0\] = \['alpha'\] is no free number"),
+    "no list": ({"parameters": 5}, None, "names is a int"),
+    "no name": ({"parameters": [["alpha"]]}, None, r"names\[0\] = \['alpha'\] is no free number"),
     "long seed": ({"seed": -(10**5000)}, None, "seed = an integer of 16610 bits"),
     "seed": ({"seed": -1}, None, "seed = -1"),
     "period": ({"period": 0.01}, None, "period = 0.01 s is not between"),
@@ -511,8 +513,8 @@ def test_it_prints_goes_into_a_frame_and_json_and_is_drawn(designed: ftlm.Design
     frame = designed.to_frame()
     assert frame.loc["a0", "designed"] == designed.errors["designed"]["a0"]
     document = json.loads(json.dumps(designed.to_dict(), allow_nan=False))
-    assert document["chosen"] == ["alpha"]
-    assert document["reached"]["y"]["limit"] == 0.9
+    assert document["parameters"] == ["alpha"]
+    assert document["predicted_extremes"]["y"]["limit"] == 0.9
     figure = ftlm.plot.design(designed)
     assert [a.get_xlabel() for a in figure.axes] == ["time [s]", "time [s]", "frequency [Hz]"]
     with pytest.raises(ftlm.ModelError, match="give what design_input returns"):
@@ -530,7 +532,7 @@ def test_a_rig_takes_what_is_written(tmp_path: Path) -> None:
     noise = 1e-4 * np.random.default_rng(0).standard_normal(t.size)
     run = clean.with_outputs({"theta11": clean["theta11"] + noise})
     start = {"alpha": 1.9, "a": -12.0, "b": 30.0}
-    known = ftlm.identify(run, structure, threads=1, intervals="quadratic", start=start)
+    known = ftlm.identify(run, structure, threads=1, method=ftlm.OutputError(intervals="quadratic", start=start))
     made = ftlm.design_input(known, duration=3.0, limits={"theta11": 0.3})
     made.save(tmp_path / "next.csv")
     recorded = ftlm.rig.record(input="csv", file=tmp_path / "next.csv", rate=50.0, duration=made.run.duration)
@@ -547,11 +549,11 @@ def test_the_command_says_writes_and_refuses(found: ftlm.Identification, tmp_pat
     words = [
         "design-input",
         model,
-        "--like",
+        "--reference-run",
         reference_run,
-        "--limit",
+        "--limits",
         "y=0.9",
-        "--for",
+        "--parameters",
         "alpha",
         "--peak",
         "u=0.8",
@@ -569,8 +571,8 @@ def test_the_command_says_writes_and_refuses(found: ftlm.Identification, tmp_pat
         ("-o", str(tmp_path / "next.mat")): "does not end in .csv",
         ("--slew", "fast"): "neither a number nor INPUT=NUMBER",
         ("--slew", "1e-3"): "raise --slew or --duration",
-        ("--limit", "z=1"): "limits names 'z'",
-        ("--for", "beta"): "is no free number of the model",
+        ("--limits", "z=1"): "limits names 'z'",
+        ("--parameters", "beta"): "is no free number of the model",
     }
     for more, said in refused.items():
         failed = CliRunner().invoke(app, [*words, *more])
@@ -580,7 +582,9 @@ def test_the_command_says_writes_and_refuses(found: ftlm.Identification, tmp_pat
 
 @pytest.mark.slow
 def test_plant_a_is_told_three_times_better_than_by_the_papers_square() -> None:
-    first = ftlm.identify(plants.noisy_run("A", 40, 0), plants.structure("A"), intervals="quadratic")
+    first = ftlm.identify(
+        plants.noisy_run("A", 40, 0), plants.structure("A"), method=ftlm.OutputError(intervals="quadratic")
+    )
     made = ftlm.design_input(first)
     assert made.gain > 10
     square = plants.noisy_run("A", 40, 0)

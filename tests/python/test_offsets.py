@@ -242,7 +242,7 @@ def test_an_offset_that_is_the_input_or_that_a_method_lacks_is_refused():
         with pytest.raises(ftlm.DataError, match=r"u is constant on every run, so b u and the offset .* of y"):
             ftlm.identify(step, structure, method=method)
     with pytest.raises(ftlm.ModelError, match="the genetic baseline knows no offset"):
-        ftlm.identify(fractional_run(1, 0.5), structure, method="genetic", genetic=ftlm.Genetic(seeds=(1,)))
+        ftlm.identify(fractional_run(1, 0.5), structure, method=ftlm.GeneticAlgorithm(seeds=(1,)))
     with pytest.raises(ftlm.ModelError, match="cannot be followed in a stream"):
         Streaming(structure, step=0.1, longest=10.0, inputs=("u",))
 
@@ -431,7 +431,7 @@ def test_auto_says_where_an_offset_cannot_be_told():
         ftlm.Model(ftlm.equation("D y = -2 y + 3 u", offset="auto"))
     with pytest.raises(ftlm.ModelError, match="a store keeps those of one"):
         ftlm.identify(
-            still, ftlm.equation("D^alpha y = -a y + b u"), method="least-squares", offset="auto", store="never"
+            still, ftlm.equation("D^alpha y = -a y + b u"), method=ftlm.LeastSquares(store="never"), offset="auto"
         )
 
 

@@ -30,7 +30,7 @@ def test_a_run_comes_back_bit_for_bit(run, tmp_path):
     loaded = ftlm.load(path)
     assert (loaded.name, loaded.step, loaded.start) == (run.name, run.step, run.start)
     assert (loaded.inputs, loaded.outputs, loaded.units) == (run.inputs, run.outputs, run.units)
-    assert loaded.metadata == run.about
+    assert loaded.metadata == run.metadata
     assert all(np.array_equal(loaded[n], run[n]) for n in run.signals)
     with pytest.raises(ftlm.DataError, match="exists"):
         run.to_parquet(path)

@@ -155,7 +155,7 @@ def test_a_fit_has_its_inputs_where_they_are_asked_for(joint, small_run):
 def test_poles_are_those_of_the_model(joint):
     axis = saved(ftlm.plot.poles(joint)).axes[0]
     crosses = next(line for line in axis.lines if line.get_marker() == "x")
-    ours = [m.pole**0.8 for m in joint.model.modes() if m.swings]
+    ours = [m.pole**0.8 for m in joint.model.modes() if m.oscillatory]
     theirs = crosses.get_xdata() + 1j * crosses.get_ydata()
     assert theirs[np.argmax(theirs.imag)] == pytest.approx(ours[0])
     assert "s^{0.8}" in axis.get_xlabel()
@@ -174,10 +174,10 @@ def test_steps_have_their_bands(joint):
 
 def test_correlations_are_those_of_the_fit(joint):
     axis = saved(ftlm.plot.correlation(joint)).axes[0]
-    np.testing.assert_array_equal(axis.images[0].get_array(), joint.joint.correlation)
+    np.testing.assert_array_equal(axis.images[0].get_array(), joint.fit.correlation)
     assert len(axis.texts) == 6
     with pytest.raises(ftlm.errors.ModelError, match="gives no joint covariance"):
-        ftlm.plot.correlation(replace(joint, joint=None))
+        ftlm.plot.correlation(replace(joint, fit=None))
 
 
 def test_residuals_over_time_and_how_often(joint):

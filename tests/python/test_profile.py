@@ -26,6 +26,7 @@ from ftlm.estimation.confidence_intervals import (
 )
 from ftlm.estimation.model_checks import identifiability_warnings
 from ftlm.estimation.objective import Iterate
+from ftlm.estimation.output_error import Loss
 from ftlm.report.html_report import model_page
 from measured import DATA, needs_data
 
@@ -45,8 +46,9 @@ def switched(rows: int, every: int, seed: int = 100) -> np.ndarray:
     return np.repeat(np.where(rng.random(rows // every + 1) < 0.5, -1.0, 1.0), every)[:rows]
 
 
-def quadratic(run: ftlm.Run, words: str, **options: object) -> ftlm.Identification:
-    return ftlm.identify(run, ftlm.equation(words, initial="rest"), intervals="quadratic", threads=1, **options)
+def quadratic(run: ftlm.Run, words: str, loss: Loss = "squares") -> ftlm.Identification:
+    method = ftlm.OutputError(intervals="quadratic", loss=loss)
+    return ftlm.identify(run, ftlm.equation(words, initial="rest"), method=method, threads=1)
 
 
 # ------------------------------------------------------------------------------------------------ closed forms
@@ -272,7 +274,10 @@ def test_numbers_that_are_known_well_are_not_profiled(bent: ftlm.Run) -> None:
     well = ftlm.identify(run, ftlm.equation("D^2 y = c D y + a y + b u", initial="rest"), threads=1)
     assert well.profiles == {}
     asked = ftlm.identify(
-        run, ftlm.equation("D^2 y = c D y + a y + b u", initial="rest"), threads=1, intervals="profile"
+        run,
+        ftlm.equation("D^2 y = c D y + a y + b u", initial="rest"),
+        threads=1,
+        method=ftlm.OutputError(intervals="profile"),
     )
     for name, own in asked.profiles.items():
         low, high = well.intervals[name]
@@ -293,7 +298,7 @@ def test_a_profile_that_nobody_asked_for_is_left_where_it_takes_long(
     half = 1.959963984540054 * short.standard_errors["c"]
     assert short.intervals["c"] == pytest.approx((short.coefficients["c"] - half, short.coefficients["c"] + half))
     # Asked for, it takes what it needs.
-    assert "c" in ftlm.identify(bent, structure, intervals="profile").profiles
+    assert "c" in ftlm.identify(bent, structure, method=ftlm.OutputError(intervals="profile")).profiles
 
 
 def test_what_one_end_does_not_need_goes_to_the_others(found: ftlm.Identification) -> None:
@@ -330,7 +335,7 @@ def test_a_number_that_is_not_seen_has_the_whole_line() -> None:
         on_grid=values,
         covariance=np.diag([1.0, np.inf, np.inf]),
     )
-    seen = replace(plain, task=task, joint=joint).profile(threads=1)
+    seen = replace(plain, task=task, fit=joint).profile(threads=1)
     assert (seen["b"].low, seen["e"].high) == (-math.inf, math.inf)
     assert -4.0 in seen["a"]
     assert not seen["a"].is_open
@@ -396,7 +401,7 @@ def test_identify_goes_on_from_a_lower_optimum_and_says_so(bent: ftlm.Run, monke
     monkeypatch.setattr(profiling.ProfileLikelihood, "at", classmethod(beside))
     monkeypatch.setattr(profiling, "MAX_OPTIMUM_SHIFT_ERRORS", -1.0)
     structure = ftlm.equation("D^2 y = c D y + a y + b u", initial="rest")
-    same = ftlm.identify(run, structure, threads=1, intervals="profile")
+    same = ftlm.identify(run, structure, threads=1, method=ftlm.OutputError(intervals="profile"))
     # The fit was right all the while: its residuals do not fall, and its starts stay told.
     assert not [w for w in same.warnings if "the search for intervals did" in w]
     assert same.fit.starts == right.fit.starts
@@ -404,7 +409,7 @@ def test_identify_goes_on_from_a_lower_optimum_and_says_so(bent: ftlm.Run, monke
     # As if it had been lower: of one optimum found twice rounding decides which is.
     monkeypatch.setattr("ftlm.estimation.confidence_intervals.MIN_NOISE_REDUCTION", -1.0)
     monkeypatch.setattr("ftlm.estimation.confidence_intervals.is_lower_on_finer_grid", lambda *_: True)
-    again = ftlm.identify(run, structure, threads=1, intervals="profile")
+    again = ftlm.identify(run, structure, threads=1, method=ftlm.OutputError(intervals="profile"))
     assert [w for w in again.warnings if "led to this optimum, but the search for intervals did" in w]
     assert "from a lower optimum" in again.details()
     for name, value in right.coefficients.items():
@@ -416,7 +421,7 @@ def test_delays_and_orders_are_held_where_they_are_profiled() -> None:
     late = np.concatenate([np.zeros(3), u[:-3]])
     run = record(fast_pole(-0.8, -4.0, 4.0, late), u, 0.02, 10)
     structure = ftlm.equation("D^alpha y = -0.8 D y + a y + b u", initial="rest", delay={"u": (0.0, 0.5)})
-    found = ftlm.identify(run, structure, threads=1, intervals="profile")
+    found = ftlm.identify(run, structure, threads=1, method=ftlm.OutputError(intervals="profile"))
     for name, value in {"alpha": 2.0, "a": -4.0, "b": 4.0, "delay_u": 3 * STEP}.items():
         own = found.profiles[name]
         assert value in own
@@ -445,9 +450,9 @@ def test_what_has_no_profile_says_so(bent: ftlm.Run, found: ftlm.Identification)
     with pytest.raises(ftlm.ModelError, match="'least-squares' has no likelihood to profile"):
         least.profile()
     with pytest.raises(ftlm.ModelError, match="intervals = 'likelihood' is not known; use 'auto' or"):
-        ftlm.identify(bent, structure, intervals="likelihood")  # type: ignore[arg-type]
+        ftlm.identify(bent, structure, method=ftlm.OutputError(intervals="likelihood"))  # type: ignore[arg-type]
     with pytest.raises(ftlm.ModelError, match="intervals='profile' needs a cost"):
-        ftlm.identify(bent, structure, intervals="profile", reference="r")
+        ftlm.identify(bent, structure, method=ftlm.OutputError(intervals="profile", reference="r"))
     looped = replace(found, settings={**found.settings, "reference": "r"})
     with pytest.raises(ftlm.ModelError, match="no minimum of a cost"):
         looped.profile()
@@ -486,7 +491,9 @@ def test_the_link_of_the_real_arm_is_bounded_from_one_side_alone() -> None:
     )
     words = "D^2 theta12 = d D^mu theta12 + a theta12 + b D^2 theta11"
     # Asked for: along a valley without end the default says that its profile takes long, and leaves it.
-    link = ftlm.identify(thin, ftlm.equation(words, initial="caputo"), threads=1, intervals="profile")
+    link = ftlm.identify(
+        thin, ftlm.equation(words, initial="caputo"), threads=1, method=ftlm.OutputError(intervals="profile")
+    )
     assert link.standard_errors["d"] > 100 * abs(link.coefficients["d"])
     d, a, mu = (link.profiles[n] for n in ("d", "a", "mu"))
     assert d.low == -math.inf

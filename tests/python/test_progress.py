@@ -17,6 +17,7 @@ from ftlm import progress
 from ftlm.cli import framework as wait
 from ftlm.cli.main import app
 from ftlm.order_search.checkpoint import Store
+from ftlm.order_search.options import SearchSettings
 from ftlm.order_search.schedule import EquationProblem
 from ftlm.order_search.search import announce_time, expected_seconds, make_job, run_job
 from ftlm.progress import TOTAL_PARTS, Progress, ShareTracker, Stoppable, format_duration_estimate, format_time_left
@@ -214,19 +215,19 @@ ASKED = {
     "identify": ("the fit", "run.csv -u u -y y --structure", "D y = a0 y + b0 u"),
     "identify --method multi-innovation": (
         "the search",
-        "run.csv -u u -y y --step 0.1 --structure",
+        "run.csv -u u -y y --increment 0.1 --structure",
         "D^alpha y = a D^beta y + b0 u",
     ),
     "identify --method genetic --evaluations 400": (
         "the genetic algorithm on y",
-        "run.csv -u u -y y --step 0.1 --structure",
+        "run.csv -u u -y y --increment 0.1 --structure",
         "D^alpha y = a0 y + b0 u",
     ),
     "agreement": ("fitting all parts", "run.csv -u u -y y --structure", "D y = a0 y + b0 u"),
     "select": ("choosing", "run.csv -u u -y y --structure", "D y = a0 y + b0 u"),
-    "search": ("the search", "run.csv -u u -y y --step 0.1 --structure", "D^alpha y = a D^beta y + b0 u"),
+    "search": ("the search", "run.csv -u u -y y --increment 0.1 --structure", "D^alpha y = a D^beta y + b0 u"),
     "identify-frequency": ("the fit", "bode.csv -u u -y y --structure", "D^alpha y = a0 y + b0 u"),
-    "design-input": ("the design", "model.json --peak 1 --duration 5 --sampling", "0.05"),
+    "design-input": ("the design", "model.json --peak 1 --duration 5 --step", "0.05"),
 }
 
 
@@ -287,13 +288,12 @@ def test_orders_on_unseen_runs_say_how_long_all_of_their_fits_take(monkeypatch, 
     assert 0.4 < least < most < math.inf
 
 
-def job(step=0.1, **settings):
+def job(step=0.1, **options):
     t = np.arange(129) * 0.05
     u = np.sign(np.sin(2 * t))
     run = ftlm.Run.from_arrays(step=0.05, inputs={"u": u}, outputs={"y": np.cumsum(u) * 0.05})
-    return make_job(
-        run, ftlm.equation("D^alpha y = a D^beta y + c D^mu y + b D^nu u"), ftlm.order_grid(increment=step), **settings
-    )
+    structure = ftlm.equation("D^alpha y = a D^beta y + c D^mu y + b D^nu u")
+    return make_job(run, structure, ftlm.order_grid(increment=step), SearchSettings(), **options)
 
 
 def test_a_search_is_announced_by_what_coarse_lattices_of_it_take(monkeypatch):

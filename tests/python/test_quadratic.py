@@ -9,6 +9,8 @@ from scipy import signal
 
 import ftlm
 from ftlm import control
+from ftlm.control import stability_margins
+from ftlm.control.lqg import UNKNOWN_INPUT
 from test_control import uncertain
 
 RATE = 500.0
@@ -78,7 +80,7 @@ def test_the_response_at_complex_frequencies_goes_on_from_the_real_ones(sensor):
     made = ftlm.Model(ftlm.equation(BROKEN, coupling="simulated", delay={"I": 0.003}, sensor_filter=passed))
     w = np.array([0.5, 17.0, 120.0])
     for output in ("hub", "bend"):
-        plant = control.margins.Plant(made, output, "I", RATE, "simulated", sensor)
+        plant = stability_margins.Plant(made, output, "I", RATE, "simulated", sensor)
         assert np.allclose(plant.response(w.astype(complex)), plant.response(w), rtol=1e-10)
 
 
@@ -152,7 +154,7 @@ def test_an_observer_along_a_run_is_the_recursion_and_takes_noise_away():
 def closed(controller, factor):
     """Largest eigenvalue of SciPy's plant, times a factor, under a controller: plant, what acts now, controller."""
     a, b, c = whole_system()
-    own, into = controller._closed()
+    own, into = controller._transition_matrices()
     gains = controller._gains
     # The command of a sample is the controller's next state; it acts from the next sample on.
     size, width = len(a), len(own)
@@ -211,7 +213,7 @@ def test_the_first_sample_kicks_nothing_and_the_limit_winds_nothing_up():
     free = design.with_limit(math.inf)
     for _ in range(1000):
         free([0.0, 0.0], 1.0)
-    told = [abs(c.estimate[control.kalman.UNKNOWN]) for c in (controller, free)]
+    told = [abs(c.estimate[UNKNOWN_INPUT]) for c in (controller, free)]
     assert told[0] < 2.0
     assert told[1] > 5.0 * told[0]
 
@@ -261,14 +263,14 @@ def test_a_tip_comes_to_rest_on_the_virtual_arm_without_any_shaper():
 
 
 REFUSED = [
-    ({"max_deviation": {}}, "allowed = {} is no mapping"),
+    ({"max_deviation": {}}, "max_deviation = {} is no mapping"),
     ({"max_deviation": [0.1]}, "is no mapping"),
     ({"max_deviation": {"hub + bent": 0.1}}, "did you mean 'bend'"),
-    ({"max_deviation": {"hub": 0.0}}, r"allowed\['hub'\] = 0.0 is not a finite number above 0"),
+    ({"max_deviation": {"hub": 0.0}}, r"max_deviation\['hub'\] = 0.0 is not a finite number above 0"),
     ({"max_deviation": {"bend": 0.01}}, "allow for deviations of every output that integrates"),
-    ({"max_input": -1.0}, "effort = -1.0"),
-    ({"max_input": "1"}, "effort = '1' is not a number"),
-    ({"process_noise": math.inf}, "drift = inf"),
+    ({"max_input": -1.0}, "max_input = -1.0"),
+    ({"max_input": "1"}, "max_input = '1' is not a number"),
+    ({"process_noise": math.inf}, "process_noise = inf"),
     ({"noise": {"hub": 1e-4}}, "noise of bend is not known"),
     ({"noise": {"hob": 1e-4}}, "did you mean 'hub'"),
     ({"noise": 1e-4}, "noise = 0.0001 is no mapping"),
@@ -281,8 +283,8 @@ REFUSED = [
     ({"noise": {"hub": 1e308, "bend": 1e-4}}, "noise of hub = 1e.308 is outside"),
     ({"noise": {"hub": 1e30, "bend": 1e-4}}, "no observer from hub, bend .*; measure more, or narrow the band"),
     ({"max_deviation": {"hub": 5e-324}}, "= 5e-324 is outside"),
-    ({"max_deviation": {7: 0.1}}, "allowed = 7 is not a sum"),
-    ({"max_deviation": 10**5000}, "allowed = an integer of 16610 bits is no mapping"),
+    ({"max_deviation": {7: 0.1}}, "max_deviation = 7 is not a sum"),
+    ({"max_deviation": 10**5000}, "max_deviation = an integer of 16610 bits is no mapping"),
     ({"band": (1e-320, 100.0)}, "; use a narrower band"),
     ({"band": (10**5000,)}, "band = a tuple is no pair"),
     ({"measured": ["bend"], "noise": {"bend": 1e-4}}, "no observer from bend"),
@@ -350,7 +352,7 @@ def test_an_observer_reads_a_run_that_fits_it():
         seen.over(run.select(["I", "hub"]))
     with pytest.raises(ftlm.DataError, match="make it for rate=250"):
         seen.over(run.resample(0.004))
-    with pytest.raises(ftlm.ModelError, match="drift = 0"):
+    with pytest.raises(ftlm.ModelError, match="process_noise = 0"):
         control.observer(model(WHOLE), noise=QUIET, process_noise=0)
 
 
@@ -417,14 +419,14 @@ PATHS = [
     ({"path": [1.0, 2.0]}, ftlm.DataError, "no array of 16"),
     ({"path": np.zeros(100)}, ftlm.DataError, "stands still"),
     ({"path": np.r_[np.zeros(50), 1e308, 1e308]}, ftlm.DataError, r"beyond 1e.100 at row 50 .2 such"),
-    ({"of": 10**5000}, ftlm.ModelError, "of = an integer of 16610 bits is not a sum"),
+    ({"output": 10**5000}, ftlm.ModelError, "output = an integer of 16610 bits is not a sum"),
     ({"path": np.arange(100.0)}, ftlm.DataError, "does not begin at rest"),
     ({"path": np.r_[0, 0, np.arange(100.0)]}, ftlm.DataError, "does not end at rest"),
     ({"path": np.r_[0, 0, np.nan, np.inf, np.ones(50)]}, ftlm.DataError, r"not finite at row 2 .2 such"),
     ({"limit": 0.2}, ftlm.ModelError, r"needs a command of .* over the limit of 0.2; give it more time"),
     ({"limit": "1"}, ftlm.ModelError, "limit = '1' is not a number"),
-    ({"of": "hub + bned"}, ftlm.ModelError, "did you mean 'bend'"),
-    ({"of": None}, ftlm.ModelError, "of = None is not a sum"),
+    ({"output": "hub + bned"}, ftlm.ModelError, "did you mean 'bend'"),
+    ({"output": None}, ftlm.ModelError, "output = None is not a sum"),
     ({"samples": 1.5}, ftlm.ModelError, "samples = 1.5"),
     ({"seed": -1}, ftlm.ModelError, "seed = -1"),
     ({"path": control.point_to_point(0.3, 0.2, dwell_before=0.0)}, ftlm.ModelError, "rest longer before its move"),
@@ -440,7 +442,7 @@ def ready():
 def test_what_cannot_be_followed_is_refused(case, ready):
     options, kind, words = PATHS[case]
     with pytest.raises(kind, match=words):
-        control.inverse_dynamics(ready, **{"path": control.point_to_point(0.3, 0.5), "of": "hub + bend", **options})
+        control.inverse_dynamics(ready, **{"path": control.point_to_point(0.3, 0.5), "output": "hub + bend", **options})
 
 
 def test_intervals_too_wide_for_a_path_are_refused_in_words():
@@ -456,16 +458,16 @@ def test_intervals_too_wide_for_a_path_are_refused_in_words():
 @pytest.mark.parametrize(
     ("options", "words"),
     [
-        ({"size": math.nan}, "size = nan"),
-        ({"size": "20"}, "size = '20'"),
+        ({"distance": math.nan}, "size = nan"),
+        ({"distance": "20"}, "distance = '20'"),
         ({"duration": 0.0}, "duration = 0.0"),
         ({"duration": 0.01}, "fewer than ten samples"),
         ({"duration": 1e6}, "longer than 100000"),
-        ({"before": -1.0}, "before = -1.0"),
-        ({"after": math.inf}, "after = inf"),
+        ({"dwell_before": -1.0}, "dwell_before = -1.0"),
+        ({"dwell_after": math.inf}, "dwell_after = inf"),
         ({"rate": -5}, "rate = -5"),
     ],
 )
 def test_what_is_no_move_is_refused(options, words):
     with pytest.raises(ftlm.ModelError, match=words):
-        control.point_to_point(**{"size": 0.3, "duration": 0.5, **options})
+        control.point_to_point(**{"distance": 0.3, "duration": 0.5, **options})

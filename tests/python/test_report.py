@@ -65,7 +65,7 @@ def identified(square):
     lattice = ftlm.order_grid(0.05, alpha1=2.0, alpha2=2.0, gamma1=(0.9, 1.0), beta2=(0.05, 0.15), mu2=(0.8, 0.9))
     # Initial terms although the run starts at rest, so that the page has them to show.
     structure = replace(ftlm.flexible_link(form="published", stage=1), initial="caputo")
-    return ftlm.identify(square, structure, method="least-squares", order_grid=lattice)
+    return ftlm.identify(square, structure, method=ftlm.LeastSquares(order_grid=lattice))
 
 
 @pytest.fixture(scope="module")
@@ -246,7 +246,7 @@ def test_a_folder_that_cannot_be_written_is_said_before_any_work(tmp_path, ident
 def test_intervals_that_are_none_are_said(tmp_path, small_run, with_noise):
     found = ftlm.identify(with_noise(small_run, 0.02, 1), ftlm.equation("D^alpha y = a D^0.6 y + c y + b u"))
     broken = replace(found.fit, covariance=np.full_like(found.fit.covariance, np.nan))
-    result = replace(found, joint=broken)
+    result = replace(found, fit=broken)
     text = " ".join(Page(result.report(tmp_path / "p.html").read_text("utf-8")).text)
     assert text.count("undefined") >= 3 * 4
     assert "the standard errors of alpha, a, c, b are not defined" in text
@@ -500,7 +500,7 @@ def test_settings_name_what_the_result_depends_on(identified, square):
     assert str(identified.settings["m"]) in text
     assert "least-squares" in text
     at = ftlm.flexible_link(form="published").with_orders(identified.orders)
-    paper = ftlm.identify(square, at, method="multi-innovation", prior_covariance=100.0)
+    paper = ftlm.identify(square, at, method=ftlm.MultiInnovation(prior_covariance=100.0))
     rows = {str(row[0]): row[1] for row in settings_table(paper).rows}
     assert rows["innovation length, p"] == 7
     assert rows["prior covariance, K<sub>0</sub>"] == 100

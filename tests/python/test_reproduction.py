@@ -77,10 +77,7 @@ def test_tables_4_and_5_follow_from_the_saved_run(saved, table, stage):
         found = ftlm.identify(
             run,
             structure,
-            method="multi-innovation",
-            innovation_length=p,
-            order_grid=ftlm.OrderGrid(increment=0.25),
-            top=1,
+            method=ftlm.MultiInnovation(innovation_length=p, order_grid=ftlm.OrderGrid(increment=0.25), top=1),
         )
         row = written[f"p = {p}"]
         assert found.orders == row["orders"]
@@ -115,7 +112,7 @@ def test_table_7_follows_from_the_saved_run(saved):
     written = json.loads((saved / "tables.json").read_text())["as it should be"]["1"]["genetic"]["theta12"]
     run = ftlm.load(saved / "square.csv").select(["I1", "theta11", "theta12"])
     single = ftlm.flexible_link(form="published", stage=1, coupling="measured", laws=()).equation("theta12")
-    settings = ftlm.Genetic(seeds=(0, 1), evaluations=800)
+    settings = ftlm.GeneticAlgorithm(seeds=(0, 1), evaluations=800)
     found = compare_optimizers(run, single, ftlm.OrderGrid(increment=0.25, alpha=(1.95, 2.0)), settings)
     both = {"genetic": found.genetic, "differential evolution": found.evolution}
     for label, rival in both.items():
@@ -316,8 +313,8 @@ def test_output_error_finds_the_simulated_arm_and_its_intervals_say_so(reproduct
     for number, stage in reproduction.stages.items():
         result = stage.candidates["output error"].result
         truth = reproduction.truth[number]
-        for name in (*result.orders, *result.joint.coefficients):
-            value = {**result.orders, **result.joint.coefficients}[name]
+        for name in (*result.orders, *result.fit.coefficients):
+            value = {**result.orders, **result.fit.coefficients}[name]
             assert abs(value - truth[name]) < 4 * result.standard_errors[name], name
         # What is left is the noise that was put on the angles.
         assert all(f.rmse == pytest.approx(1e-4, rel=0.05) for f in result.output_error.values())
@@ -402,7 +399,7 @@ def test_measured_runs_of_one_stage(reproduction, tmp_path):
         "mine.csv",
         "--sine",
         "other.csv",
-        "--step",
+        "--increment",
         "0.25",
         "--seed",
         "5",
@@ -432,8 +429,8 @@ def test_measured_runs_of_one_stage(reproduction, tmp_path):
 
 def test_a_long_run_that_does_not_start_at_rest(reproduction, tmp_path, monkeypatch):
     own = ["I2", "theta21", "theta22"]
-    moving = reproduction.square.select(own).slice(1.3, 4.3)
-    other = reproduction.sine.select(own).slice(0.7, 3.7)
+    moving = reproduction.square.select(own).window(1.3, 4.3)
+    other = reproduction.sine.select(own).window(0.7, 3.7)
     monkeypatch.setattr("ftlm.reproduction.stage_models.MAX_REGRESSION_SAMPLES", 1000)
     monkeypatch.setattr("ftlm.reproduction.stage_models.JOINT_ROWS", 500)
     told = []
@@ -501,7 +498,7 @@ def test_without_a_second_run_nothing_is_validated_and_the_page_says_so(reproduc
         (["--sine", "strange.csv"], 2, "--sine is given without --square"),
         (["--square", "strange.csv"], 3, "a stage of the arm needs I1, theta11 and theta12"),
         (["--square", "whole.csv", "--sine", "strange.csv"], 3, "lacks I1, theta12, which the square run"),
-        (["--step", "0"], 2, "step"),
+        (["--increment", "0"], 2, "step"),
         (["--evaluations", "5"], 2, "evaluations = 5 is less than two generations"),
         (["--square", "gone.csv"], 3, "gone.csv"),
     ],
@@ -558,7 +555,7 @@ def test_a_stage_that_fails_ends_the_other(reproduction):
 
 @pytest.mark.slow
 def test_threads_do_not_change_a_number(reproduction):
-    settings = ftlm.Genetic(seeds=(0, 1), evaluations=800)
+    settings = ftlm.GeneticAlgorithm(seeds=(0, 1), evaluations=800)
     one = ftlm.reproduce(increment=0.25, genetic=settings, arms=["whole orders"], records=1, threads=1)
     assert one.to_dict() == reproduction.to_dict()
 

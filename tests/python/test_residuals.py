@@ -127,7 +127,7 @@ def test_residuals_are_samples_less_the_free_run(small_model, small_run, noisy):
 
 def test_initial_terms_are_fitted_to_each_run(small_model, noisy):
     structure = replace(small_model.structure, initial="caputo")
-    late = noisy.slice(1.5, None)
+    late = noisy.window(1.5, None)
     found = ftlm.Model(structure).resid([noisy, late])
     assert found.initial_terms > 0
     assert len(found.outputs["y"].residuals) == 2
@@ -189,7 +189,7 @@ def test_residuals_print_and_are_json(small_model, noisy):
 
 def test_refusals_name_the_thing_and_the_way_out(small_model, small_run):
     with pytest.raises(ftlm.DataError, match="has 40 rows, correlations up to 25 lags need 53; give a longer run"):
-        small_model.resid(small_run.slice(0, 0.8))
+        small_model.resid(small_run.window(0, 0.8))
     for lags in (0, -1, 1.5, "x", None):
         with pytest.raises(ftlm.ModelError, match="is no number of lags"):
             small_model.resid(small_run, lags=lags)
@@ -330,8 +330,8 @@ def test_a_limit_that_cannot_be_exceeded_decides_nothing(small_model, monkeypatc
     found = small_model.resid(run)
     test = found.outputs["y"].inputs["u"]
     assert test.limit > 1
-    assert (test.decided, test.passed, test.failed, test.verdict) == (False, False, False, "undecided")
-    assert found.to_dict()["outputs"]["y"]["inputs"]["u"]["decided"] is False
+    assert (test.conclusive, test.passed, test.failed, test.verdict) == (False, False, False, "undecided")
+    assert found.to_dict()["outputs"]["y"]["inputs"]["u"]["conclusive"] is False
     assert "undecided" in str(found)
     assert any("whether residuals follow u is undecided: its limit is" in w for w in residual_warnings(found))
     assert "undecided" in found._repr_html_()
@@ -346,7 +346,7 @@ def test_an_input_that_does_not_move_decides_nothing(small_model, noisy):
     assert found.outputs["y"].inputs["v"].verdict == "undecided"
     assert found.outputs["y"].inputs["u"].verdict == "passed"
     # The input that moves decides; the other one can do nothing, and is shown as what it is.
-    assert (found.passed, found.decided, found.verdict) == (True, True, "passed")
+    assert (found.passed, found.conclusive, found.verdict) == (True, True, "passed")
     assert re.search(r"^y and v .* undecided$", str(found), re.MULTILINE)
     json.dumps(found.to_dict(), allow_nan=False)
     still = ftlm.Run.from_arrays(step=0.02, inputs={"u": np.full(noisy.length, 0.1)}, outputs={"y": noisy["y"]})

@@ -428,7 +428,7 @@ def test_outliers_are_named_with_the_way_out_and_huber_ignores_them() -> None:
     (said,) = [w for w in plain.warnings if "huber" in w]
     assert said.startswith("4 of 398 residuals of y lie beyond 5 times the usual one and hold 99 % of their squares, ")
     assert "first at row " in said
-    robust = ftlm.identify(run, ftlm.equation(FREE), loss="huber")
+    robust = ftlm.identify(run, ftlm.equation(FREE), method=ftlm.OutputError(loss="huber"))
     near_truth(robust)
     for name, error in plain.standard_errors.items():
         assert robust.standard_errors[name] < 0.3 * error
@@ -496,7 +496,7 @@ def test_huber_is_the_minimum_of_its_loss() -> None:
 def test_without_outliers_huber_is_nearly_as_sure_as_squares() -> None:
     u, y = noisy(3)
     plain = ftlm.identify(run_of(u, y), ftlm.equation(FREE))
-    robust = ftlm.identify(run_of(u, y), ftlm.equation(FREE), loss="huber")
+    robust = ftlm.identify(run_of(u, y), ftlm.equation(FREE), method=ftlm.OutputError(loss="huber"))
     assert not [w for w in plain.warnings if "huber" in w]
     for name, error in plain.standard_errors.items():
         assert robust.standard_errors[name] == pytest.approx(1.026 * error, rel=0.12)
@@ -506,9 +506,9 @@ def test_without_outliers_huber_is_nearly_as_sure_as_squares() -> None:
 def test_huber_belongs_to_output_error() -> None:
     u, y = noisy(1)
     with pytest.raises(ftlm.ModelError, match=r"loss= is not used by method='least-squares'"):
-        ftlm.identify(run_of(u, y), ftlm.equation(FREE), method="least-squares", loss="huber")
+        ftlm.identify(run_of(u, y), ftlm.equation(FREE), method=ftlm.LeastSquares(loss="huber"))
     with pytest.raises(ftlm.ModelError, match=r"loss = 'l1' is not known"):
-        ftlm.identify(run_of(u, y), ftlm.equation(FREE), loss="l1")
+        ftlm.identify(run_of(u, y), ftlm.equation(FREE), method=ftlm.OutputError(loss="l1"))
 
 
 # -------------------------------------------------------------------------------------------- colour, coarse steps

@@ -114,15 +114,15 @@ BAD_ARRAYS = {
     "intersample unknown": ({"intersample": {"u": "spline"}}, ["'spline'", "'u'", "'foh'"]),
     "intersample of an output": ({"intersample": {"y": "zoh"}}, ["'y'", "not an input"]),
     "time unit without time": ({"time_unit": "ms"}, ["time_unit='ms'"]),
-    "slice not a pair": ({"window": (1, 2, 3)}, ["window=(1, 2, 3)", "pair"]),
-    "slice text": ({"window": ("0", 1)}, ["window", "'0'"]),
-    "slice nan": ({"window": (math.nan, 1)}, ["window", "finite"]),
-    "slice outside": ({"window": (0.0, 0.6)}, ["window", "0.6", "out of range", "0.5 s"]),
-    "slice before": ({"window": (-0.1, 0.3)}, ["window", "-0.1", "out of range"]),
-    "slice decreasing": ({"window": (0.3, 0.1)}, ["window", "do not increase"]),
-    "slice short": ({"window": (0.1, 0.12)}, ["2 rows in the slice"]),
-    "slice nothing": ({"window": (0.101, 0.102)}, ["no row lies between"]),
-    "nan in the slice counts from the file": (
+    "window not a pair": ({"window": (1, 2, 3)}, ["window=(1, 2, 3)", "pair"]),
+    "window text": ({"window": ("0", 1)}, ["window", "'0'"]),
+    "window nan": ({"window": (math.nan, 1)}, ["window", "finite"]),
+    "window outside": ({"window": (0.0, 0.6)}, ["window", "0.6", "out of range", "0.5 s"]),
+    "window before": ({"window": (-0.1, 0.3)}, ["window", "-0.1", "out of range"]),
+    "window decreasing": ({"window": (0.3, 0.1)}, ["window", "do not increase"]),
+    "window short": ({"window": (0.1, 0.12)}, ["2 rows in the window"]),
+    "window nothing": ({"window": (0.101, 0.102)}, ["no row lies between"]),
+    "nan in the window counts from the file": (
         {"window": (0.1, 0.3), "inputs": {"u": put(ramp(), [2, 15, 16], np.nan)}},
         ["'u'", "row 15", "2 in all"],
     ),
@@ -694,7 +694,7 @@ def runs(draw):
 def test_csv_round_trip_is_exact_to_the_bit(run, drop, tmp_path_factory):
     path = tmp_path_factory.mktemp("csv") / "x.csv"
     if run.length - drop >= 3:
-        run = run.slice(drop * run.step, None)
+        run = run.window(drop * run.step, None)
     run.to_csv(path)
     back = load(path)
     assert (back.name, back.step, back.start) == (run.name, run.step, run.start)

@@ -78,7 +78,7 @@ def test_the_true_structure_is_chosen_from_a_richer_one(chosen):
 def test_what_is_judged_was_not_fitted(runs, chosen):
     """The figure of the left-out run is that of an identification of the other run alone."""
     for left, seen in ((runs[0], runs[1]), (runs[1], runs[0])):
-        alone = ftlm.identify(seen, chosen.winner.structure, threads=1, intervals="quadratic")
+        alone = ftlm.identify(seen, chosen.winner.structure, threads=1, method=ftlm.OutputError(intervals="quadratic"))
         own = chosen.winner.validation[left.name]["y"]
         assert own == pytest.approx(alone.model.compare(left).fit_percent["y"], abs=2e-3)
 
@@ -319,7 +319,7 @@ def test_words_where_nothing_can_be_chosen(runs):
     with pytest.raises(ftlm.ModelError, match="10001 candidates are more than 10000"):
         ftlm.select(runs, [second] * 10_001)
     with pytest.raises(ftlm.DataError, match="has 40 rows, too few to be cut into 4 blocks"):
-        ftlm.select(runs[0].slice(0, 0.8), second)
+        ftlm.select(runs[0].window(0, 0.8), second)
     with pytest.raises(ftlm.ModelError, match="motor 1 is one of those that are fitted to, which judges nothing"):
         ftlm.select(runs, second, validation=runs[1])
     idle = ftlm.Run.from_arrays(step=0.1, inputs={"u": np.zeros(300)}, outputs={"y": 1e-3 * np.sin(np.arange(300.0))})
@@ -517,7 +517,7 @@ def test_the_page_and_the_figures(chosen, tmp_path):
     assert len(data["candidates"]) == len(chosen.trials)
     frame = chosen.to_frame()
     assert list(frame["chosen"]).count(True) == 1
-    assert frame["least"].iloc[chosen.chosen] == min(f["y"] for f in chosen.winner.validation.values())
+    assert frame["worst_fold"].iloc[chosen.chosen] == min(f["y"] for f in chosen.winner.validation.values())
 
 
 def test_the_command(tmp_path):
@@ -542,9 +542,9 @@ def test_the_command(tmp_path):
     by_file = CliRunner().invoke(app, ["select", files[0], *columns, *first, "--validation", files[1]])
     assert by_file.exit_code == 0, by_file.output
     assert "1, not fitted to" in by_file.output
-    wrong = CliRunner().invoke(app, ["select", *files, *columns, "--structure", "auto", "--order", "alpha=1"])
+    wrong = CliRunner().invoke(app, ["select", *files, *columns, "--structure", "auto", "--orders", "alpha=1"])
     assert wrong.exit_code == 2
-    assert "--order: of a structure that is given, not used with --structure auto" in wrong.output
+    assert "--orders: of a structure that is given, not used with --structure auto" in wrong.output
 
 
 def test_a_fit_below_all_measure_keeps_its_column():

@@ -69,7 +69,9 @@ def swing(damping: float, *, seed: int = 3, noise: float = 0.01) -> ftlm.Run:
 
 
 def test_a_machine_that_grows_is_found_growing() -> None:
-    found = ftlm.identify(swing(0.2), ftlm.equation("D^2 y = a y + d D y + b u"), intervals="quadratic")
+    found = ftlm.identify(
+        swing(0.2), ftlm.equation("D^2 y = a y + d D y + b u"), method=ftlm.OutputError(intervals="quadratic")
+    )
     assert found.coefficients["d"] == pytest.approx(0.2, abs=0.02)
     assert found.coefficients["a"] == pytest.approx(-25.0, rel=0.01)
     assert found.fit is not None
@@ -94,7 +96,9 @@ def test_what_is_printed_of_a_machine_that_grows_is_what_it_leaves() -> None:
 
 
 def test_a_machine_that_dies_away_is_compared_with_nothing() -> None:
-    found = ftlm.identify(swing(-0.5), ftlm.equation("D^2 y = a y + d D y + b u"), intervals="quadratic")
+    found = ftlm.identify(
+        swing(-0.5), ftlm.equation("D^2 y = a y + d D y + b u"), method=ftlm.OutputError(intervals="quadratic")
+    )
     assert found.coefficients["d"] == pytest.approx(-0.5, abs=0.03)
     assert found.fit is not None
     assert found.fit.unstable_optimum is None
@@ -158,7 +162,7 @@ def test_a_link_that_would_feed_energy_is_no_link(runs_of_lqr: ftlm.Run) -> None
     # On lqr d4 = +1.5 leaves 5 % less: a mode that grows, taken away until the end of the run by its initial terms.
     run, unseen = runs_of_lqr, arm_run("psf", 10)
     link = StructureOptions(orders=["beta4=0"], fixed=["w4=0"]).structure("arm:2")
-    found = ftlm.identify(run, link, intervals="quadratic")
+    found = ftlm.identify(run, link, method=ftlm.OutputError(intervals="quadratic"))
     assert found.fit is not None
     assert found.fit.unstable_optimum is not None
     assert not found.fit.unstable_optimum.is_accepted

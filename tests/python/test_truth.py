@@ -79,7 +79,7 @@ def test_the_lattice_with_instrumental_variables_finds_the_orders_of_three_terms
         assert abs(found.orders["nu"] - 0.9) < 0.051
         assert sum(found.exclusion_counts.values()) + len(found.table) == found.candidates
         assert fit_percent(clean["y"], found.model.simulate(clean)["y"]) > 99.8
-    whole = ftlm.identify(run, structure, method="instrumental-variables", order_grid=lattice)
+    whole = ftlm.identify(run, structure, method=ftlm.InstrumentalVariables(order_grid=lattice))
     assert whole.orders == found.orders
     assert set(whole.standard_errors) == {"alpha", "nu", "a1", "a0", "b0"}
 
@@ -101,8 +101,7 @@ def test_noise_beyond_the_instruments_is_said(fitted: ftlm.Identification) -> No
     found = ftlm.identify(
         constant,
         plants.structure("3T"),
-        method="instrumental-variables",
-        order_grid=ftlm.order_grid(0.2, alpha=(1.8, 2.4)),
+        method=ftlm.InstrumentalVariables(order_grid=ftlm.order_grid(0.2, alpha=(1.8, 2.4))),
     )
     assert found.fit_percent["y"] < 90
     assert found.warnings
@@ -261,7 +260,7 @@ def test_a_richer_equation_never_fits_worse_than_a_simpler_one() -> None:
     rest = {"initial": "rest"}
     simple = ftlm.identify(run, ftlm.equation("D^alpha y = a0 y + b0 u", **rest))
     structure = ftlm.equation("D^alpha y = a2 D^kappa y + a1 D^nu y + a0 y + b0 u", **rest)
-    rich = ftlm.identify(run, structure, intervals="quadratic")
+    rich = ftlm.identify(run, structure, method=ftlm.OutputError(intervals="quadratic"))
     assert rich.fit.noise["y"] <= simple.fit.noise["y"] * (1 + 1e-4)
     # What it does not need it cannot tell, and says so.
     assert any("cannot be told" in w or "not different from 0" in w for w in rich.warnings)
@@ -297,7 +296,7 @@ def test_an_order_too_many_ends_as_a_pole_too_fast_to_see_and_not_in_a_mode_of_t
 def test_of_neighbouring_orders_of_a_stage_the_coupled_run_decides() -> None:
     run, free = plants.noisy_run("A", 40, 3), plants.structure("A")
     near = ftlm.order_grid(alpha=(1.95, 2.0), gamma1=(0.95, 1.0), beta2=(0.1, 0.15), mu2=(0.8, 0.85))
-    found = ftlm.identify(run, free, method="instrumental-variables", order_grid=near)
+    found = ftlm.identify(run, free, method=ftlm.InstrumentalVariables(order_grid=near))
     table = found.searches["stage"].table
     assert found.orders == table[found.settings.get("rank", 1) - 1].orders
     clean = plants.clean_run("A")

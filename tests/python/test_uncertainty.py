@@ -40,7 +40,7 @@ t = 0.05 * np.arange(300)
 u = np.sign(np.sin(1.3 * t)) + 0.3 * np.sin(0.7 * t)
 y = np.convolve(u, 0.05 * np.exp(-0.6 * t))[: t.size] + 0.02 * np.random.default_rng(3).standard_normal(t.size)
 run = ftlm.Run.from_arrays(inputs={"u": u}, outputs={"y": y}, step=0.05)
-found = ftlm.identify(run, ftlm.equation("D^alpha y = c y + b u"), intervals="quadratic")
+found = ftlm.identify(run, ftlm.equation("D^alpha y = c y + b u"), method=ftlm.OutputError(intervals="quadratic"))
 print(json.dumps([found.to_dict()[key] for key in ("coefficients", "orders", "standard_errors")]))
 """
 

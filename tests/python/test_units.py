@@ -22,7 +22,7 @@ def told(run, time, outputs, inputs):
 
 
 def identified(runs, structure):
-    return ftlm.identify(runs, structure, threads=1, intervals="quadratic")
+    return ftlm.identify(runs, structure, threads=1, method=ftlm.OutputError(intervals="quadratic"))
 
 
 def cart(seed):

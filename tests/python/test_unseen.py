@@ -127,7 +127,7 @@ def test_the_lower_of_two_orders_is_the_elasticity_s_whatever_the_fit_called_it(
         assert found["beta2"][0] < found["mu2"][0]
         # The stiff term of the truth has 170, the other 8.
         assert abs(found["a2"][0]) > abs(found["d2"][0])
-        joint = {**fitted.result.orders, **fitted.result.joint.coefficients}
+        joint = {**fitted.result.orders, **fitted.result.fit.coefficients}
         assert sorted(v for v, *_ in found.values()) == sorted(joint.values())
         ends = sorted((low, high) for _, low, high in found.values())
         assert ends == sorted(tuple(fitted.result.intervals[n]) for n in joint)

@@ -135,7 +135,7 @@ def test_initial_terms_are_fitted_anew_for_every_run(small_model):
 
 
 def test_several_runs_are_pooled_about_their_own_means(small_model, small_run, with_noise):
-    first, second = with_noise(small_run, 0.01, 1), with_noise(small_run.slice(0, 6), 0.05, 2)
+    first, second = with_noise(small_run, 0.01, 1), with_noise(small_run.window(0, 6), 0.05, 2)
     together = compare_means(small_model, [first, second], m=256)
     alone = [compare_means(small_model, run, m=256) for run in (first, second)]
     for kind in ("output_error", "equation_error"):
@@ -156,7 +156,7 @@ def test_several_runs_are_pooled_about_their_own_means(small_model, small_run, w
 def test_a_model_that_knows_no_m_takes_what_the_run_carries(small_model, small_run):
     unknown = replace(small_model, m=None)
     assert unknown.compare(small_run).m == 512
-    assert small_model.compare(small_run.slice(0, 4)).m == 199
+    assert small_model.compare(small_run.window(0, 4)).m == 199
     with pytest.raises(ftlm.ModelError, match=r"m = 513 is more than run 'small, simulated' carries: 513 rows are 512"):
         small_model.compare(small_run, m=513)
 

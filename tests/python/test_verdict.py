@@ -191,23 +191,23 @@ def test_each_rule_finds_its_own_fault(found, checked):
         found, comparison=replace(found.comparison, output_error={"y": replace(found.output_error["y"], nr=math.inf)})
     ).verdict(checked)
     assert (never.level, never.reason) == ("do not use", "the free run leaves the range of numbers")
-    stuck = worse(found, joint=replace(found.joint, converged=False)).verdict(checked)
+    stuck = worse(found, fit=replace(found.fit, converged=False)).verdict(checked)
     assert (stuck.level, stuck.reason) == ("with care", "the fit ended before it stood still")
     short = worse(found, residuals=None).verdict(checked)
     assert short.reason == "the runs are too short for residual tests"
 
 
 def test_a_number_is_vague_by_its_own_size(found, checked):
-    names, spread = found.joint.names, found.joint.covariance.copy()
+    names, spread = found.fit.names, found.fit.covariance.copy()
     a1, alpha = names.index("a1"), names.index("alpha")
     # Half of a1 is the limit: 0.3 of 0.6.
     for share, vague in ((0.4, False), (0.6, True)):
         spread[a1, a1] = (share * found.coefficients["a1"]) ** 2
-        judged = worse(found, joint=replace(found.joint, covariance=spread, profiles={})).verdict(checked)
+        judged = worse(found, fit=replace(found.fit, covariance=spread, profiles={})).verdict(checked)
         assert judged.trusted != vague
         assert not vague or judged.reason.startswith("the runs hardly tell a1 = -0.6")
     spread[a1, a1], spread[alpha, alpha] = 0.0, 0.3**2
-    judged = worse(found, joint=replace(found.joint, covariance=spread, profiles={})).verdict(checked)
+    judged = worse(found, fit=replace(found.fit, covariance=spread, profiles={})).verdict(checked)
     assert judged.reason == f"the runs hardly tell alpha = {found.orders['alpha']:.3g} ± 0.3"
 
 
@@ -218,8 +218,8 @@ def test_an_interval_without_end_speaks_against_a_delay_and_an_order(found, chec
         ("delay_u", 0.05, math.inf, "the runs do not bound delay_u"),
         ("alpha", 1.5, math.inf, f"the runs hardly tell alpha = {found.orders['alpha']:.3g} ± "),
     ):
-        open_ended = replace(found.joint, profiles={name: ProfileInterval(low, high, 0.95)})
-        judged = worse(found, joint=open_ended, model=late).verdict(checked)
+        open_ended = replace(found.fit, profiles={name: ProfileInterval(low, high, 0.95)})
+        judged = worse(found, fit=open_ended, model=late).verdict(checked)
         assert judged.reason.startswith(reason)
         assert judged.level == ("with care" if reason else "trust")
 
@@ -251,7 +251,7 @@ def test_a_swing_that_nothing_damps_is_with_care(found, checked):
         assert judged.level == "with care"
         assert judged.reason == "a swing of 2 rad/s may never die away (damping 0)"
     # The damping of the clean result is 0.27; it is not told apart from 0 where its own error is half of it.
-    order = found.joint.names.index("alpha")
+    order = found.fit.names.index("alpha")
     for spread, told in ((1e-3, True), (0.3, False)):
         covariance = np.array(found.model.estimate.covariance)
         covariance[:] = 0.0
@@ -347,7 +347,7 @@ def test_a_run_in_motion_says_so(found):
 def test_what_may_not_be_used_comes_before_what_needs_care(found):
     poor = worse(
         found,
-        joint=replace(found.joint, converged=False),
+        fit=replace(found.fit, converged=False),
         comparison=replace(found.comparison, output_error={"y": replace(found.output_error["y"], nr=0.8, fit=20.0)}),
     )
     judged = poor.verdict()

@@ -238,7 +238,7 @@ def hub():
 def test_rivals_have_one_budget_and_bounds_that_do_not_know_the_maker_s_values(hub):
     run, single = hub
     lattice = ftlm.OrderGrid(increment=0.25, alpha=(1.95, 2.0))
-    settings = ftlm.Genetic(seeds=(0,), evaluations=400)
+    settings = ftlm.GeneticAlgorithm(seeds=(0,), evaluations=400)
     made = compare_optimizers(run, single, lattice, settings, threads=1)
     assert made.candidates == 224
     # The maker's 2271 is not the middle of anything.
@@ -260,19 +260,19 @@ def test_differential_evolution_finds_what_is_there_and_the_same_again():
     single = ftlm.equation("D^alpha y = a1 D^nu y + a0 y + b0 u")
     lattice = ftlm.OrderGrid(increment=0.1, alpha=(1.5, 1.7))
     bounds = {"a1": (-10, 0), "a0": (-20, 0), "b0": (0, 10)}
-    settings = ftlm.Genetic(seeds=(3,), evaluations=6000, bounds=bounds)
+    settings = ftlm.GeneticAlgorithm(order_grid=lattice, seeds=(3,), evaluations=6000, bounds=bounds)
     records = prepare([run], single, None, power_of_two=True)
     told = []
     found = differential_evolution_search(
-        records, single, lattice, settings, threads=1, progress=lambda done, of: told.append((done, of))
+        records, single, settings, threads=1, progress=lambda done, of: told.append((done, of))
     )
     assert found.orders["alpha"] == pytest.approx(1.6, abs=0.05)
     assert found.coefficients["b0"] == pytest.approx(5, rel=0.1)
     assert told[-1][0] == told[-1][1] == found.evaluations[3]
-    assert differential_evolution_search(records, single, lattice, settings, threads=2) == found
+    assert differential_evolution_search(records, single, settings, threads=2) == found
     moving = prepare([run.window(1.0, 9.0)], replace(single, initial="caputo"), None, power_of_two=True)
     with pytest.raises(ftlm.ModelError, match="slice the runs to start at rest"):
-        differential_evolution_search(moving, single, lattice, settings)
+        differential_evolution_search(moving, single, settings)
 
 
 def test_multi_innovation_is_held_against_the_median_seed():

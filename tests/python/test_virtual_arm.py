@@ -187,7 +187,9 @@ def test_the_links_of_a_noisy_run_with_friction_and_offset_are_recovered_with_in
     structure = ftlm.flexible_link(stage="both", hub=False, cross_stage="inertial")
     structure = replace(structure, coupling="simulated", initial="rest")
     known = {n: truth[n] for n in ("gamma1", "gamma3")}
-    found = ftlm.identify(driven, structure.with_orders(known), threads=1, intervals="quadratic")
+    found = ftlm.identify(
+        driven, structure.with_orders(known), threads=1, method=ftlm.OutputError(intervals="quadratic")
+    )
     names = ("beta2", "mu2", "beta4", "mu4", "a2", "d2", "p2", "q2", "a4", "d4", "p4", "q4")
     values = {**found.orders, **found.coefficients}
     away = {n: (values[n] - truth[n]) / found.standard_errors[n] for n in names}

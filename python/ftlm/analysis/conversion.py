@@ -13,11 +13,12 @@ from ftlm._core import __version__
 from ftlm.analysis.frequency_response import check_no_input_nonlinearity, transfer_functions
 from ftlm.analysis.rational_approximation import approximate, identifier
 from ftlm.errors import ModelError
-from ftlm.model.model import ModelData
+from ftlm.model.model import Model
 from ftlm.structure.equation import format_equation
 from ftlm.structure.order import MAX_ORDER
 from ftlm.structure.parser import equation
 from ftlm.structure.structure import Structure
+from ftlm.utils.parameters import parameter, setting
 from ftlm.utils.validation import Floats
 
 
@@ -27,7 +28,7 @@ def _comment(text: str, mark: str) -> str:
     return "\n".join(f"{mark} {''.join(c if c.isprintable() else '?' for c in line)}" for line in lines)
 
 
-def json_text(model: ModelData) -> str:
+def json_text(model: Model) -> str:
     """Return the transfer functions of a model as JSON, exact in powers and coefficients.
 
     Parameters
@@ -61,7 +62,7 @@ def json_text(model: ModelData) -> str:
     return json.dumps(document, indent=1, ensure_ascii=False, allow_nan=False) + "\n"
 
 
-def matlab_text(model: ModelData) -> str:
+def matlab_text(model: Model) -> str:
     """Return a MATLAB script with the transfer functions as vectors, and as FOMCON ``fotf`` objects if available.
 
     Parameters
@@ -112,7 +113,7 @@ def matlab_text(model: ModelData) -> str:
     return "\n".join(lines) + "\n"
 
 
-def control_text(model: ModelData, *, band: tuple[float, float], order: int = 5) -> str:
+def control_text(model: Model, *, band: tuple[float, float], order: int = 5) -> str:
     """Return a Python script that builds the python-control system without ftlm.
 
     Parameters
@@ -153,7 +154,7 @@ def control_text(model: ModelData, *, band: tuple[float, float], order: int = 5)
 
 
 def export_text(
-    model: ModelData,
+    model: Model,
     to: Literal["control", "matlab", "json"],
     *,
     band: tuple[float, float] | None = None,
@@ -165,9 +166,12 @@ def export_text(
     if to == "matlab":
         return matlab_text(model)
     if to != "control":
-        raise ModelError(f"to = {to!r} is not known; use 'control', 'matlab' or 'json'")
+        raise ModelError(f"{setting('to')} {to!r} is not known; use 'control', 'matlab' or 'json'")
     if band is None:
-        raise ModelError("python-control has no fractional orders: give the band of frequencies, as in --band 0.1:100")
+        raise ModelError(
+            "python-control has no fractional orders: give the band of frequencies, as in "
+            f"{parameter('band', (0.1, 100))}"
+        )
     return control_text(model, band=band, order=order)
 
 
@@ -195,7 +199,10 @@ def structure_of(system: Any, inputs: Sequence[str] | None = None, outputs: Sequ
     results = _names("outputs", outputs, getattr(system, "output_labels", None), len(parts))
     twice = sorted(set(signals) & set(results))
     if twice:
-        raise ModelError(f"{', '.join(twice)}: input and output at once; pass inputs= and outputs= with other names")
+        raise ModelError(
+            f"{', '.join(twice)}: input and output at once; pass {parameter('inputs')} and {parameter('outputs')} "
+            "with other names"
+        )
     rows = zip(results, parts, strict=True)
     return equation("\n".join(_equation_text(name, signals, *part) for name, part in rows), coupling="measured")
 

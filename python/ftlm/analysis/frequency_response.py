@@ -13,12 +13,13 @@ from numpy.typing import ArrayLike, NDArray
 
 from ftlm.data.run import Run
 from ftlm.errors import DataError, ModelError
-from ftlm.model.model import ModelData
+from ftlm.model.model import Model
 from ftlm.simulation.discretization import check_linear
 from ftlm.simulation.simulate import simulate
 from ftlm.structure.equation import Equation, Term
 from ftlm.structure.input_nonlinearity import INPUT_EFFECT_LABELS
 from ftlm.structure.order import Order
+from ftlm.utils.parameters import parameter
 from ftlm.utils.validation import Complex, Floats, check_choice
 
 #: A sum of coefficient * s^power, by power.
@@ -31,7 +32,7 @@ CANCELLATION_TOLERANCE = 1e-13
 DERIVATIVE_STEP_RATIO = 1e-6
 
 
-def check_no_input_nonlinearity(model: ModelData, what: str) -> None:
+def check_no_input_nonlinearity(model: Model, what: str) -> None:
     """Raise ModelError for a saturation or a dead zone in a linear analysis."""
     for limit in model.structure.limits:
         raise ModelError(
@@ -41,7 +42,7 @@ def check_no_input_nonlinearity(model: ModelData, what: str) -> None:
         )
 
 
-def response_inputs(model: ModelData, *, coupled: bool) -> tuple[str, ...]:
+def response_inputs(model: Model, *, coupled: bool) -> tuple[str, ...]:
     """Input signals of the response: all but the outputs; of uncoupled equations, other outputs too."""
     if coupled:
         return tuple(s for s in model.structure.signals if s not in model.outputs)
@@ -117,12 +118,12 @@ class TransferFunctions:
     delay: dict[str, float]
 
 
-def coupled_outputs(model: ModelData, *, coupled: bool) -> list[tuple[str, ...]]:
+def coupled_outputs(model: Model, *, coupled: bool) -> list[tuple[str, ...]]:
     """Groups of outputs whose equations are solved together."""
     return [model.outputs] if coupled else [(o,) for o in model.outputs]
 
 
-def transfer_functions(model: ModelData, *, coupling: str = "simulated") -> TransferFunctions:
+def transfer_functions(model: Model, *, coupling: str = "simulated") -> TransferFunctions:
     """Transfer functions of a model by Cramer's rule, without the sensor filter.
 
     Parameters
@@ -173,7 +174,7 @@ def is_coupled(coupling: str) -> bool:
     return coupling == "simulated"
 
 
-def frequency_response(model: ModelData, w: ArrayLike, *, coupling: str = "simulated", sensor: bool = True) -> Complex:
+def frequency_response(model: Model, w: ArrayLike, *, coupling: str = "simulated", sensor: bool = True) -> Complex:
     """Exact frequency response with fractional orders.
 
     Parameters
@@ -259,7 +260,7 @@ def value_at(polynomial: Polynomial, s: NDArray[Any]) -> Complex:
     return total
 
 
-def response_deviation(model: ModelData, w: ArrayLike, *, coupling: str = "simulated") -> tuple[Floats, Floats]:
+def response_deviation(model: Model, w: ArrayLike, *, coupling: str = "simulated") -> tuple[Floats, Floats]:
     """Standard deviations of the frequency response, from the covariance of the model by the delta method.
 
     Parameters
@@ -282,8 +283,8 @@ def response_deviation(model: ModelData, w: ArrayLike, *, coupling: str = "simul
     covariance = None if model.estimate is None else model.estimate.covariance
     if covariance is None:
         raise ModelError(
-            "this model has no covariance, so its response has no uncertainty; identify it with method='output-error', "
-            "and without a term whose interval is infinite"
+            "this model has no covariance, so its response has no uncertainty; identify it with "
+            f"{parameter('method', 'output-error')}, and without a term whose interval is infinite"
         )
     centre = frequency_response(model, w, coupling=coupling)
     values = parameter_vector(model)
@@ -305,7 +306,7 @@ def response_deviation(model: ModelData, w: ArrayLike, *, coupling: str = "simul
     return gain, phase
 
 
-def parameter_vector(model: ModelData) -> Floats:
+def parameter_vector(model: Model) -> Floats:
     """All numbers of a model as a vector: alpha of each equation, then order and coefficient of each term."""
     numbers: list[float] = []
     for item in model.equations:
@@ -313,7 +314,7 @@ def parameter_vector(model: ModelData) -> Floats:
     return np.array(numbers)
 
 
-def with_parameter_vector(model: ModelData, numbers: Floats) -> ModelData:
+def with_parameter_vector(model: Model, numbers: Floats) -> Model:
     """Return the model with other numbers, in the order of :func:`parameter_vector`."""
     at = iter(numbers.tolist())
     equations = []
@@ -334,7 +335,7 @@ def _replace_unchecked(item: Equation, order: Order, terms: tuple[Term, ...]) ->
     return new
 
 
-def step_response(model: ModelData, time: ArrayLike, *, tolerance: float = 1e-6) -> Floats:
+def step_response(model: Model, time: ArrayLike, *, tolerance: float = 1e-6) -> Floats:
     """Response of every output to a unit step of every input, from rest.
 
     Parameters

@@ -24,7 +24,7 @@ from ftlm.analysis.frequency_response import (
     with_parameter_vector,
 )
 from ftlm.errors import ModelError
-from ftlm.model.model import ModelData, check_model
+from ftlm.model.model import Model, check_model
 from ftlm.utils.formatting import with_error
 from ftlm.utils.statistics import NORMAL_95
 from ftlm.utils.validation import Complex, Floats
@@ -88,7 +88,7 @@ class Stability:
         return f"{verdict} ({how})"
 
 
-def characteristic(model: ModelData, *, coupled: bool) -> list[Polynomial]:
+def characteristic(model: Model, *, coupled: bool) -> list[Polynomial]:
     """Characteristic sums of c s^p, one for each set of equations that act together."""
     return [
         determinant([equation_polynomials(e, names)[0] for e in model.equations if e.output in names])
@@ -127,7 +127,7 @@ def roots_in_base(polynomial: Polynomial) -> tuple[float, Complex] | None:
     return base, np.asarray(np.roots(coefficients) * unit**base, dtype=np.complex128)
 
 
-def poles(model: ModelData, *, coupling: str = "simulated") -> Complex:
+def poles(model: Model, *, coupling: str = "simulated") -> Complex:
     """Poles of a commensurate model on the principal sheet.
 
     Parameters
@@ -166,7 +166,7 @@ def poles(model: ModelData, *, coupling: str = "simulated") -> Complex:
     return np.array(sorted(every, key=lambda s: (abs(s), s.imag)), dtype=np.complex128)
 
 
-def stability(model: ModelData, *, coupling: str = "simulated") -> Stability:
+def stability(model: Model, *, coupling: str = "simulated") -> Stability:
     """Whether a model is stable: by its poles where orders are commensurate, else by the argument principle.
 
     Parameters
@@ -337,7 +337,7 @@ class Mode:
         )
 
 
-def modes(model: ModelData, *, coupling: str = "simulated") -> tuple[Mode, ...]:
+def modes(model: Model, *, coupling: str = "simulated") -> tuple[Mode, ...]:
     """Return the modes of a model for any orders, slowest first: frequency, damping and time constant of its poles.
 
     Parameters
@@ -486,7 +486,7 @@ def _terms(w: Complex, powers: Floats, values: Floats) -> tuple[Complex, Floats]
 
 
 def _standard_deviations(
-    model: ModelData, at: int, zeros: Complex, *, coupled: bool
+    model: Model, at: int, zeros: Complex, *, coupled: bool
 ) -> Sequence[tuple[float, float, float] | None]:
     """Standard deviations of Re and Im of ln s at each zero, and of ln abs(Re s): d ln s = -dD / (dD/d ln s)."""
     covariance = None if model.estimate is None else model.estimate.covariance
@@ -547,7 +547,7 @@ class SteadyState:
     order_error: float | None = None
 
 
-def steady_states(model: ModelData) -> tuple[SteadyState, ...]:
+def steady_states(model: Model) -> tuple[SteadyState, ...]:
     """Return the steady state of every output for every input that affects it, with coupled equations.
 
     Parameters
@@ -585,7 +585,7 @@ def steady_states(model: ModelData) -> tuple[SteadyState, ...]:
     return tuple(out)
 
 
-def _final_values(model: ModelData) -> dict[tuple[str, str], tuple[float, float]]:
+def _final_values(model: Model) -> dict[tuple[str, str], tuple[float, float]]:
     """Order and coefficient of the final behavior of every response."""
     transfer = transfer_functions(model)
     sensor = model.structure.sensor_filter
@@ -605,7 +605,7 @@ def _final_values(model: ModelData) -> dict[tuple[str, str], tuple[float, float]
     return out
 
 
-def dcgain(model: ModelData) -> Floats:
+def dcgain(model: Model) -> Floats:
     """Steady-state gain of every output from every input that is not modelled.
 
     Parameters
@@ -632,7 +632,7 @@ def dcgain(model: ModelData) -> Floats:
     return out
 
 
-def settling_time(model: ModelData) -> float:
+def settling_time(model: Model) -> float:
     """Seconds in which a model shows what it does: some time constants of its slowest mode.
 
     No more than fifty periods of the fastest swing, so that a picture of it shows a swing.

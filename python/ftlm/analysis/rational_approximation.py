@@ -16,8 +16,9 @@ from numpy.typing import NDArray
 from ftlm.analysis.frequency_response import check_no_input_nonlinearity, frequency_response, response_inputs
 from ftlm.analysis.poles import stability
 from ftlm.errors import ModelError
-from ftlm.model.model import ModelData
+from ftlm.model.model import Model
 from ftlm.simulation.discretization import check_linear
+from ftlm.utils.parameters import setting
 from ftlm.utils.validation import Floats, real_number, short_repr, whole_number
 
 #: Maximum errors of the approximation without a warning.
@@ -192,7 +193,7 @@ def _delay_input(builder: _Builder, source: int, delay: float) -> _Signal:
     return {last: 1.0}, {source: direct}, {}
 
 
-def approximate(model: ModelData, *, band: tuple[float, float], order: int = 5) -> Approximation:
+def approximate(model: Model, *, band: tuple[float, float], order: int = 5) -> Approximation:
     """Approximate a model by a rational state-space system.
 
     Parameters
@@ -222,12 +223,14 @@ def approximate(model: ModelData, *, band: tuple[float, float], order: int = 5) 
     try:
         low, high = (real_number("band", b) for b in band)
     except (TypeError, ValueError):
-        raise ModelError(f"band = {short_repr(band)} is no pair of frequencies; give (low, high) in rad/s") from None
+        raise ModelError(
+            f"{setting('band')} {short_repr(band)} is no pair of frequencies; give (low, high) in rad/s"
+        ) from None
     if not (math.isfinite(low) and math.isfinite(high) and 0 < low < high):
         raise ModelError(f"band = ({low:g}, {high:g}) rad/s is no interval; give 0 < low < high")
     count = whole_number(order)
     if count is None or not 1 <= count <= LARGEST_ORDER:
-        raise ModelError(f"order = {short_repr(order)} is no whole number from 1 to {LARGEST_ORDER}")
+        raise ModelError(f"{setting('order')} {short_repr(order)} is no whole number from 1 to {LARGEST_ORDER}")
     check_linear(model.equations, "a linear system in state space")
     check_no_input_nonlinearity(model, "a linear system in state space")
     inputs, outputs = response_inputs(model, coupled=True), model.outputs
@@ -273,7 +276,7 @@ def approximate(model: ModelData, *, band: tuple[float, float], order: int = 5) 
     return _with_errors(model, unjudged)
 
 
-def _with_errors(model: ModelData, system: Approximation) -> Approximation:
+def _with_errors(model: Model, system: Approximation) -> Approximation:
     """Return the approximation with its errors and warnings on its stability."""
     low, high = system.band
     omega = np.geomspace(low, high, COMPARISON_FREQUENCIES)
@@ -306,7 +309,7 @@ def _with_errors(model: ModelData, system: Approximation) -> Approximation:
     return replace(system, gain_error=gain, phase_error=phase, stable=stable, warnings=tuple(words))
 
 
-def to_control(model: ModelData, *, band: tuple[float, float], order: int = 5) -> Any:
+def to_control(model: Model, *, band: tuple[float, float], order: int = 5) -> Any:
     """Return a python-control system that approximates a model within a band.
 
     Parameters

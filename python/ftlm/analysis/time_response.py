@@ -10,7 +10,7 @@ from numpy.typing import ArrayLike
 from ftlm.analysis.frequency_response import parameter_vector, response_inputs, step_response, with_parameter_vector
 from ftlm.analysis.poles import settling_time
 from ftlm.errors import FtlmError
-from ftlm.model.model import ModelData, check_model
+from ftlm.model.model import Model, check_model
 from ftlm.utils.validation import Floats
 
 #: Default number of time points.
@@ -49,7 +49,7 @@ class Response:
     deviation: Floats | None
 
 
-def response(model: ModelData, time: ArrayLike | None = None, *, kind: str = "step") -> Response:
+def response(model: Model, time: ArrayLike | None = None, *, kind: str = "step") -> Response:
     """Response of a model to unit steps or impulses, from rest, with coupled equations.
 
     Parameters
@@ -84,7 +84,7 @@ def response(model: ModelData, time: ArrayLike | None = None, *, kind: str = "st
     return Response(kind, model.outputs, response_inputs(model, coupled=True), instants, centre, deviation)
 
 
-def _deviation(model: ModelData, time: Floats, *, impulse: bool) -> Floats | None:
+def _deviation(model: Model, time: Floats, *, impulse: bool) -> Floats | None:
     """Standard deviation from changes of one standard deviation along each direction of the covariance."""
     covariance = None if model.estimate is None else model.estimate.covariance
     if covariance is None or model.structure.has_friction:

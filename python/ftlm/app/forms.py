@@ -6,19 +6,20 @@ import json
 from collections.abc import Callable, Mapping, Sequence
 from dataclasses import asdict, dataclass, field
 from pathlib import Path
-from typing import Any, Protocol
+from typing import Any, Protocol, cast
 
 from ftlm._core import __version__
 from ftlm.arm.flexible_link import flexible_link
 from ftlm.data.run import Run
 from ftlm.errors import DataError, ModelError
 from ftlm.estimation.identify import identify
+from ftlm.estimation.methods import EstimationMethod, method_with_options
 from ftlm.estimation.result import Identification
 from ftlm.estimation.verdict import Validation
 from ftlm.io.load import load
 from ftlm.progress import ANNOUNCEMENT_THRESHOLD_S, format_time_left
 from ftlm.structure.parser import equation
-from ftlm.structure.structure import Structure
+from ftlm.structure.structure import Offset, Structure
 from ftlm.structure_selection.result import Selection
 from ftlm.structure_selection.select import select
 from ftlm.utils.resources import estimate_duration, output_error_cost
@@ -91,7 +92,7 @@ class FitRequest:
     way
         One of :data:`SELECTION_MODES`.
     method, offset, loss
-        Arguments of :func:`ftlm.identify`; "" for its defaults.
+        Method and offset of :func:`ftlm.identify` and loss of :class:`ftlm.OutputError`; "" for the defaults.
     """
 
     estimation: RunSource
@@ -124,10 +125,22 @@ class FitRequest:
             "auto": "chosen by ftlm",
         }[self.way]
 
-    def settings(self) -> dict[str, Any]:
-        """Arguments of the fit other than runs and structure."""
+    def settings(self) -> dict[str, str]:
+        """Given options of the fit other than runs and structure."""
         given = {"method": self.method, "offset": self.offset, "loss": self.loss}
         return {name: value for name, value in given.items() if value}
+
+    def estimation_method(self) -> EstimationMethod:
+        """Method of the fit with its options."""
+        return method_with_options(self.method or METHOD_NAMES[0], {"loss": self.loss} if self.loss else {})
+
+    def identify_arguments(self) -> list[str]:
+        """Arguments of `ftlm.identify` after runs and structure, as Python expressions."""
+        arguments = [f"method={format_string(self.method)}"] if self.method else []
+        if self.loss:
+            kind = type(self.estimation_method()).__name__
+            arguments = [f"method=ftlm.{kind}(loss={format_string(self.loss)})"]
+        return [*arguments, *([f"offset={format_string(self.offset)}"] if self.offset else [])]
 
     def structures(self) -> list[Structure]:
         """Structures of the request.
@@ -165,7 +178,8 @@ class FitRequest:
         told.phase(SELECTION_PHASE if self.is_choice else f"fitting{self._time_estimate(own, wanted[0])}")
         choice = None
         if not self.is_choice:
-            result = identify(own, wanted[0], progress=told, **self.settings())
+            method, offset = self.estimation_method(), cast("Offset", self.offset) if self.offset else None
+            result = identify(own, wanted[0], method=method, offset=offset, progress=told)
         else:
             candidates = "auto" if self.way == "auto" else wanted[0] if self.way == "inside" else wanted
             choice = select(own, candidates, progress=told, store=store)
@@ -210,12 +224,12 @@ class FitRequest:
             lines += self.estimation.script("run")
         else:
             lines += self.estimation.script("whole")
-            lines.append(f"run, other = whole.slice(None, {cut!r}), whole.slice({cut!r}, None)")
+            lines.append(f"run, other = whole.window(None, {cut!r}), whole.window({cut!r}, None)")
         if self.validation is not None:
             lines += self.validation.script("other")
         if not self.is_choice:
             lines.append(f"structure = {structure_expression(self.structure[0])}")
-            lines += format_call("result", "ftlm.identify", ["run", "structure"], self.settings())
+            lines += format_call("result", "ftlm.identify", ["run", "structure", *self.identify_arguments()], {})
         else:
             if self.way == "offered":
                 lines += ["candidates = [", *(f"    {structure_expression(text)}," for text in self.structure), "]"]
@@ -346,7 +360,7 @@ def parse_fields(said: Mapping[str, Any]) -> dict[str, Any]:
             asked[name] = _text(said, name)
     ends = [parse_number(name, _text(said, name)) if _text(said, name) else None for name in ("from", "to")]
     if ends != [None, None]:
-        asked["slice"] = ends
+        asked["window"] = ends
     layout: dict[str, Any] = {name: _text(said, name) for name in TEXT_LAYOUT_FIELDS if _text(said, name)}
     layout |= {name: _parse_line_count(name, _text(said, name)) for name in INTEGER_LAYOUT_FIELDS if _text(said, name)}
     if layout:

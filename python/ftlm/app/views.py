@@ -40,11 +40,11 @@ _FIELD_LABELS = {
     "dates": "Dates",
     "encoding": "Encoding",
     "sheet": "Sheet",
-    "slice": "From” and “To",
+    "window": "From” and “To",
 }
 #: Python argument with its value, or with a placeholder in capitals.
 _ARGUMENT_PATTERN = re.compile(
-    r"\b(resample|time_unit|missing|step|time|slice)=(?:'([\w-]+)'|(\d[\w.+-]*\w|\d)|[A-Z]+\b)?|layout=dict\((\w+)=[^)]*\)"
+    r"\b(resample|time_unit|missing|step|time|window)=(?:'([\w-]+)'|(\d[\w.+-]*\w|\d)|[A-Z]+\b)?|layout=dict\((\w+)=[^)]*\)"
 )
 _PHRASE_REPLACEMENTS = (
     (re.compile(r" \(commands: [^)]*\)"), ""),

@@ -13,7 +13,8 @@ from ftlm.control.arguments import POSITIVE_RANGE, check_limit, check_samples, p
 from ftlm.control.fractional_pid import least_certain_parameter
 from ftlm.control.stability_margins import LoopDesign, Plant
 from ftlm.errors import DataError, ModelError
-from ftlm.model.model import ModelData
+from ftlm.model.model import Model
+from ftlm.utils.parameters import setting
 from ftlm.utils.validation import Complex, Floats, real_number, short_repr
 
 #: Length of the transform relative to the path, and exponent of its weight exp(-t): the weight suppresses the periodic
@@ -77,7 +78,7 @@ class Trajectory:
         return {
             "rows": len(self.path),
             "largest_command": float(np.max(np.abs(self.command))),
-            "left": self.residual_vibration,
+            "residual_vibration": self.residual_vibration,
             "plain": self.plain,
         }
 
@@ -115,16 +116,17 @@ def point_to_point(
     ModelError
         Invalid numbers, or a move of fewer than ten samples.
     """
-    reach = real_number("size", distance)
+    reach = real_number("distance", distance)
     if not math.isfinite(reach):
         raise ModelError(f"size = {short_repr(distance)} is not a finite number")
     times = positive("duration", duration), positive("rate", rate)
-    rests = [real_number(n, v) for n, v in (("before", dwell_before), ("after", dwell_after))]
+    rests = [real_number(n, v) for n, v in (("dwell_before", dwell_before), ("dwell_after", dwell_after))]
     if not all(0 <= r < math.inf for r in rests):
-        raise ModelError(f"before = {dwell_before!r} and after = {dwell_after!r} are not seconds from 0")
+        raise ModelError(f"dwell_before = {dwell_before!r} and dwell_after = {dwell_after!r} are not seconds from 0")
     if times[0] * times[1] < 10:
         raise ModelError(
-            f"duration = {short_repr(duration)} s has fewer than ten samples at {times[1]:g} Hz; give it more time"
+            f"{setting('duration')} {short_repr(duration)} s has fewer than ten samples at {times[1]:g} Hz; give it "
+            "more time"
         )
     rows = (sum(rests) + times[0]) * times[1] + 1
     if rows > MAX_PATH_ROWS:
@@ -151,7 +153,7 @@ def inverse_dynamics(
     path : array_like
         Desired path, one row per sample at the loop's rate. It is at rest at both ends, with a dwell before the move as
         long as the reference must lead.
-    of : str, optional
+    output : str, optional
         Output of the model or a sum such as ``"theta11 + theta12"``, as measured by the loop; may be omitted for a
         model with one output.
     limit
@@ -182,7 +184,7 @@ def inverse_dynamics(
     count, start = check_samples(samples, seed)
     most = check_limit(limit)
     names = tuple(p.output for p in design.plants)
-    row = sum_row("of", names[0] if output is None and len(names) == 1 else output, names)
+    row = sum_row("output", names[0] if output is None and len(names) == 1 else output, names)
     size = 1 << math.ceil(math.log2(TRANSFORM_LENGTH_FACTOR * len(rows)))
     # On a line right of all poles and left of the zeros that a tip has there: s = jw, its real part above 0.
     fall = WEIGHT_DECAY * design.rate / size
@@ -191,7 +193,7 @@ def inverse_dynamics(
     weight = np.exp(-fall * np.arange(size) / design.rate)
     heard, acts, asks = design.controller_response(w[inside])
 
-    def closed_loop_response(model: ModelData) -> tuple[Complex, Complex]:
+    def closed_loop_response(model: Model) -> tuple[Complex, Complex]:
         """Command and outputs of the closed loop per reference."""
         held = np.array([replace(p, model=model).response(w[inside]) for p in design.plants])
         loop = np.sum([a * held[names.index(o)] for o, a in zip(heard, acts, strict=True)], axis=0)

@@ -17,7 +17,8 @@ from ftlm.control.realization import Realisation, catch_numerical_errors, fit_re
 from ftlm.control.stability_margins import LoopDesign, Margins, Plant, margins_of
 from ftlm.data.run import Run
 from ftlm.errors import DataError, ModelError
-from ftlm.model.model import ModelData, check_model
+from ftlm.model.model import Model, check_model
+from ftlm.utils.parameters import parameter, setting
 from ftlm.utils.validation import Complex, Floats, nearest, short_repr
 
 #: Name of the input disturbance in the estimates.
@@ -82,7 +83,7 @@ class Observer:
         if abs(run.step * self.realisation.rate - 1.0) > 1e-6:
             raise DataError(
                 f"run {run.name} has a step of {run.step:g} s, and the observer one of "
-                f"{1.0 / self.realisation.rate:g} s; make it for rate={1.0 / run.step:g}"
+                f"{1.0 / self.realisation.rate:g} s; make it for {parameter('rate')}{1.0 / run.step:g}"
             )
         a, b, c = self.matrices
         y = np.array([run[n] for n in self.measured])
@@ -118,7 +119,7 @@ class Observer:
 
 
 def observer(
-    model: ModelData,
+    model: Model,
     *,
     input: str | None = None,
     measured: Sequence[str] | None = None,
@@ -167,11 +168,11 @@ def observer(
         fit_realization(plants, band, poles),
         names,
         noise_deviations(model, names, noise),
-        positive("drift", process_noise),
+        positive("process_noise", process_noise),
     )
 
 
-def plants_of(model: ModelData, driver: str | None, rate: float, coupling: str, *, sensor: bool) -> list[Plant]:
+def plants_of(model: Model, driver: str | None, rate: float, coupling: str, *, sensor: bool) -> list[Plant]:
     """Return all outputs of a stable model from one input; raise for an unstable model."""
     check_model(model)
     plants = [plant_of(model, o, driver, rate, coupling, sensor=sensor) for o in model.outputs]
@@ -210,12 +211,10 @@ def kalman_filter(
     )
 
 
-def noise_deviations(
-    model: ModelData, measured: tuple[str, ...], given: Mapping[str, float] | None
-) -> tuple[float, ...]:
+def noise_deviations(model: Model, measured: tuple[str, ...], given: Mapping[str, float] | None) -> tuple[float, ...]:
     """Standard deviation of the noise of each measured output."""
     if given is not None and not isinstance(given, Mapping):
-        raise ModelError(f"noise = {short_repr(given)} is no mapping from outputs to standard deviations")
+        raise ModelError(f"{setting('noise')} {short_repr(given)} is no mapping from outputs to standard deviations")
     for name in given or {}:
         if name not in measured:
             near = nearest(name, measured) if isinstance(name, str) else ""
@@ -228,7 +227,7 @@ def noise_deviations(
         if value is None:
             raise ModelError(
                 f"the noise of {name} is not known, since this model does not say what its fit left; give its standard "
-                f"deviation in noise (--noise {name}=0.001)"
+                f"deviation in {parameter('noise', {name: 0.001})}"
             )
         out.append(positive(f"noise of {name}", value))
     return tuple(out)
@@ -419,7 +418,7 @@ class LqgDesign(LoopDesign):
 
 
 def lqg(
-    model: ModelData,
+    model: Model,
     *,
     max_deviation: Mapping[str, float],
     max_input: float,
@@ -443,7 +442,7 @@ def lqg(
     ----------
     model
         Linear model that is stable except for an integrator.
-    allowed : mapping
+    max_deviation : mapping
         Maximum acceptable deviations of outputs, or of sums such as ``"theta11 + theta12"`` (a tip); Bryson's rule.
     max_input
         Maximum acceptable input, in its unit.
@@ -479,8 +478,8 @@ def lqg(
     on the exact response decides.
     """
     count, start = check_samples(samples, seed)
-    dear = positive("effort", max_input)
-    walks = 0.2 * dear if process_noise is None else positive("drift", process_noise)
+    dear = positive("max_input", max_input)
+    walks = 0.2 * dear if process_noise is None else positive("process_noise", process_noise)
     plants = plants_of(model, input, rate, coupling, sensor=sensor)
     names = tuple(p.output for p in plants)
     read = select_outputs("measured", measured, names)
@@ -503,7 +502,7 @@ def lqg(
     integral, grows = int(np.sum(at_one)), int(np.sum((np.abs(poles_of_it) > 1.0) & ~at_one))
     heard = [plants[names.index(o)] for o in seen.measured]
 
-    def loop_margins(which: ModelData) -> Margins:
+    def loop_margins(which: Model) -> Margins:
         parts = [replace(p, model=which) for p in heard]
         loop = np.sum(acting * np.array([p.response(w) for p in parts]), axis=0)
         order = max(p.integral_order() for p in parts)
@@ -513,7 +512,7 @@ def lqg(
     if not (nominal.stable and nominal.sensitivity <= MAX_SENSITIVITY):
         raise ModelError(
             f"the loop is no design on the exact response of the model ({nominal}): such loops have no guaranteed "
-            "margins; make effort smaller, drift larger or the noise smaller, or allow for larger deviations"
+            "margins; make max_input smaller, process_noise larger or the noise smaller, or allow for larger deviations"
         )
     margins = tuple(loop_margins(one.model) for one in plants[0].samples(count, start))
     broken = [m for m in margins if not (m.stable and m.sensitivity <= MAX_SENSITIVITY)]
@@ -522,7 +521,7 @@ def lqg(
             f"the intervals are too wide to design on: in {len(broken)} of {len(margins)} samples of the model's "
             f"numbers the loop is not stable or has a largest sensitivity above {MAX_SENSITIVITY:g}; "
             f"{least_certain_parameter(model)}; "
-            "identify from a longer or richer run (ftlm design-input lays it out), or make effort smaller"
+            "identify from a longer or richer run (ftlm design-input lays it out), or make max_input smaller"
         )
     return LqgDesign(controller, realisation, nominal, margins, tuple(plants))
 
@@ -539,12 +538,11 @@ def _weights(max_deviation: Mapping[str, float], names: tuple[str, ...]) -> list
     """Return coefficients of sums of outputs, with their maximum acceptable deviations."""
     if not isinstance(max_deviation, Mapping) or not max_deviation:
         raise ModelError(
-            f"max_deviation = {short_repr(max_deviation)} is no mapping from outputs, or sums of them, to deviations; "
-            "give such as "
-            f"{{{names[0]!r}: 0.01}}"
+            f"{setting('max_deviation')} {short_repr(max_deviation)} is no mapping from outputs, or sums of them, to "
+            "deviations; give such as {{names[0]!r}: 0.01}"
         )
     return [
-        (sum_row("allowed", text, names), positive(f"allowed[{short_repr(text)}]", size))
+        (sum_row("max_deviation", text, names), positive(f"max_deviation[{short_repr(text)}]", size))
         for text, size in max_deviation.items()
     ]
 

@@ -18,7 +18,7 @@ from ftlm.analysis.frequency_response import (
 )
 from ftlm.analysis.poles import stability
 from ftlm.errors import ModelError
-from ftlm.model.model import ModelData
+from ftlm.model.model import Model
 from ftlm.utils.validation import Complex, Floats
 
 #: Number of frequencies of a Nyquist curve, from a thousandth of the crossover to the Nyquist frequency.
@@ -115,7 +115,7 @@ class Plant:
         See :func:`ftlm.analysis.frequency_response`.
     """
 
-    model: ModelData
+    model: Model
     output: str
     input: str
     rate: float

@@ -17,7 +17,7 @@ from typing import Any, cast
 import numpy as np
 
 from ftlm.data.construction import RunArguments
-from ftlm.data.run import RunData
+from ftlm.data.run import Run
 from ftlm.data.sampling import as_seconds, missing_mask, uniform_times
 from ftlm.data.units import is_time_name, time_unit_of
 from ftlm.errors import DataError, ModelError
@@ -112,7 +112,7 @@ def _is_time_index(name: Hashable, values: object) -> bool:
     return (isinstance(name, str) and is_time_name(name)) or as_seconds(values, "time (the index)") is not None
 
 
-def frame_of(run: RunData) -> Any:
+def frame_of(run: Run) -> Any:
     """Return a run as a pandas frame indexed by time."""
     pandas = _library("pandas")
     index = pandas.Index(run.start + run.time, name=CSV_TIME)
@@ -121,7 +121,7 @@ def frame_of(run: RunData) -> Any:
     return frame
 
 
-def dataset_of(run: RunData) -> Any:
+def dataset_of(run: Run) -> Any:
     """Return a run as an xarray dataset indexed by time."""
     xarray = _library("xarray")
     signals = {}
@@ -132,7 +132,7 @@ def dataset_of(run: RunData) -> Any:
     return xarray.Dataset(signals, coords={CSV_TIME: clock}, attrs=_frame_attributes(run))
 
 
-def _frame_attributes(run: RunData) -> dict[str, Any]:
+def _frame_attributes(run: Run) -> dict[str, Any]:
     told = {"name": run.name, "inputs": list(run.inputs), "outputs": list(run.outputs), "step": run.step}
     return {**told, "warnings": list(run.warnings)}
 
@@ -183,7 +183,7 @@ class Header:
     missing: tuple[str, ...] = ()
 
     @classmethod
-    def of(cls, run: RunData) -> Header:
+    def of(cls, run: Run) -> Header:
         """Return the header of a run."""
         return cls(
             run.name,
@@ -260,7 +260,7 @@ def header_of_line(path: Path, line: bytes) -> Header | None:
     return Header.read(path, "line 1", text.removeprefix(CSV_MARK)) if text.startswith(CSV_MARK) else None
 
 
-def write_csv(run: RunData, path: str | os.PathLike[str], *, force: bool) -> None:
+def write_csv(run: Run, path: str | os.PathLike[str], *, force: bool) -> None:
     """Write a run as text; see :meth:`ftlm.Run.to_csv`."""
     check_new(path, force=force, words=RUN_MESSAGES)
     columns = _columns(run)
@@ -269,7 +269,7 @@ def write_csv(run: RunData, path: str | os.PathLike[str], *, force: bool) -> Non
     write_atomically(path, text.encode(), force=force, words=RUN_MESSAGES)
 
 
-def write_parquet(run: RunData, path: str | os.PathLike[str], *, force: bool) -> None:
+def write_parquet(run: Run, path: str | os.PathLike[str], *, force: bool) -> None:
     """Write a run as a parquet file; see :meth:`ftlm.Run.to_parquet`."""
     target = check_new(path, force=force, words=RUN_MESSAGES)
     try:
@@ -295,11 +295,11 @@ def digest(columns: Mapping[str, Floats], header: str) -> str:
     return made.hexdigest()
 
 
-def _columns(run: RunData) -> dict[str, Floats]:
+def _columns(run: Run) -> dict[str, Floats]:
     return {CSV_TIME: _source_time(run)} | {name: run[name] for name in run.signals}
 
 
-def _source_time(run: RunData) -> Floats:
+def _source_time(run: Run) -> Floats:
     """Source time of every sample [s], rounded to short decimals."""
     exact = run.start + uniform_times(run.length, run.step)
     # Nine digits below the step suffice; the header holds the exact step.

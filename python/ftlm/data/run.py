@@ -6,7 +6,7 @@ import copy
 import html
 import os
 from collections.abc import Callable, Hashable, Iterable, Mapping, Sequence
-from dataclasses import dataclass, field, fields
+from dataclasses import dataclass
 from typing import TYPE_CHECKING, Any, NoReturn
 
 import numpy as np
@@ -38,27 +38,36 @@ from ftlm.errors import DataError
 from ftlm.structure.input_nonlinearity import InputNonlinearity
 from ftlm.structure.structure import Structure
 from ftlm.svg.figure import Figures
+from ftlm.utils.parameters import parameter
 from ftlm.utils.validation import Floats, as_mapping, bad_rows, check_signal_name, join_names, names_to_columns, nearest
 
 if TYPE_CHECKING:
     from ftlm.validation.data_advice import Advice
 
 
-@dataclass(frozen=True, eq=False, repr=False)
-class RunData:
-    """Regular samples of named inputs and outputs in SI units; base class of :class:`ftlm.Run`.
+@dataclass(eq=False, repr=False, init=False)
+class Run:
+    """One measured experiment: regular samples of named inputs and outputs in SI units.
 
-    Parameters
+    A run is immutable. `Run.from_arrays`, `Run.from_frame` and `ftlm.load` create it and check the data once. Data
+    that cannot be used raise a `DataError` that names the signal, the first bad row (counted from 0), the number of
+    bad rows and the remedy. Data are repaired, resampled or clipped only on request, and `warnings` lists every such
+    change.
+
+    Sample j holds the outputs and inputs at t = j·step. Between samples `intersample` defines an input: ``"zoh"`` (a
+    command, held until the next sample) or ``"foh"`` (a measured signal, linear).
+
+    Attributes
     ----------
-    name
+    name : str
         Name of the run in reports.
-    step, start
+    step, start : float
         Sampling interval and source time of the first sample [s].
-    inputs, outputs
+    inputs, outputs : tuple of str
         Names of the signals.
-    notes
+    notes : tuple of str
         Notes on processing and, for a rig, on the recording.
-    sample_times
+    sample_times : NonuniformSamples or None
         Nonuniform samples at their own times; None if the samples lie on the grid. The grid then holds interval means
         of held inputs and linear interpolation of all other signals.
     """
@@ -68,27 +77,183 @@ class RunData:
     start: float
     inputs: tuple[str, ...]
     outputs: tuple[str, ...]
+    notes: tuple[str, ...]
+    sample_times: NonuniformSamples | None
     _data: dict[str, Floats]
     _units: dict[str, str]
     _intersample: dict[str, Intersample]
-    notes: tuple[str, ...] = ()
-    _metadata: dict[str, Any] = field(default_factory=dict)
-    sample_times: NonuniformSamples | None = None
+    _metadata: dict[str, Any]
 
-    def __post_init__(self) -> None:
-        for name, value in (
-            ("_data", {s: make_read_only(self._data[s]) for s in self.signals}),
-            ("_units", {s: self._units[s] for s in self.signals}),
-            ("_intersample", {s: self._intersample[s] for s in self.inputs}),
-            ("_metadata", copy.deepcopy(self._metadata)),
-        ):
-            object.__setattr__(self, name, value)
-        if self.sample_times is not None:
-            own = NonuniformSamples(
-                make_read_only(self.sample_times.times),
-                {s: make_read_only(self.sample_times.data[s]) for s in self.signals},
-            )
-            object.__setattr__(self, "sample_times", own)
+    def __init__(self) -> None:
+        raise TypeError("a Run is made by Run.from_arrays, Run.from_frame or ftlm.load")
+
+    def __setattr__(self, name: str, value: object) -> NoReturn:
+        raise AttributeError(f"a Run never changes; {name!r} cannot be set")
+
+    def __delattr__(self, name: str) -> NoReturn:
+        raise AttributeError(f"a Run never changes; {name!r} cannot be deleted")
+
+    def __reduce__(self) -> tuple[object, ...]:
+        return _restore_run, (vars(self),)
+
+    @classmethod
+    def _from_checked(cls, **values: Any) -> Run:
+        """Make a run from checked fields; arrays become read-only, data of signals that are not listed are left out."""
+        run = object.__new__(cls)
+        vars(run).update(values)
+        samples = run.sample_times
+        if samples is not None:
+            data = {s: make_read_only(samples.data[s]) for s in run.signals}
+            samples = NonuniformSamples(make_read_only(samples.times), data)
+        vars(run).update(
+            sample_times=samples,
+            _data={s: make_read_only(run._data[s]) for s in run.signals},
+            _units={s: run._units[s] for s in run.signals},
+            _intersample={s: run._intersample[s] for s in run.inputs},
+            _metadata=copy.deepcopy(run._metadata),
+        )
+        return run
+
+    @classmethod
+    def from_arrays(
+        cls,
+        *,
+        step: float | None = None,
+        time: object = None,
+        inputs: Mapping[str, object] | None,
+        outputs: Mapping[str, object],
+        units: Mapping[str, str] | None = None,
+        intersample: Mapping[str, str] | None = None,
+        name: str = "run",
+        resample: float | None = None,
+        window: Sequence[float | None] | None = None,
+        time_unit: str = "s",
+        missing: str = "refuse",
+    ) -> Run:
+        """Make a run from one-dimensional arrays.
+
+        Parameters
+        ----------
+        step : float, optional
+            Time between rows [s], > 0. Exactly one of `step` and `time` is given.
+        time : array_like, shape (N,), optional
+            Time of every row in `time_unit`, or dates (datetime64, datetime), which count from the first row on;
+            increasing. It is regular when every row lies within 2 % of a step of its
+            place on a regular grid; a mean step that differs from a short decimal number by rounding alone is taken
+            as that number.
+        inputs, outputs : mapping of str to array_like, shape (N,), N ≥ 3
+            Signals by name: lists, NumPy arrays, pandas or polars series of real numbers up to 1e150 in size. `inputs`
+            may be empty; at least one output is needed. A name begins with a letter or an underscore and holds
+            letters, digits, ``_ . [ ]``.
+        units : mapping of str to str, optional
+            Unit of a signal's numbers, converted to SI here. A signal without a unit is taken as it is.
+        intersample : mapping of str to {"zoh", "foh"}, optional
+            Intersample behavior of an input; default ``"zoh"``.
+        name : str, default "run"
+            Name of the run in reports.
+        resample : float, optional
+            Resample to this step [s]: interval means of held inputs, linear interpolation of all other signals.
+            Recorded in `warnings`. Nonuniform or missing samples are kept in `sample_times`: the output error is
+            simulated with the original inputs and evaluated at the original output times. Equation-error methods use
+            the resampled signals.
+        window : pair of float or None, optional
+            Use the rows with a ≤ t < b only, [s] since the first row; applied before any other check of the rows.
+        time_unit : {"s", "ms", "us", "min", "h"}, default "s"
+            Unit of `time`.
+        missing : {"refuse", "weight", "hold"}, default "refuse"
+            Treatment of missing values: NaN, None in a list, masked values, rows that a regular `time`
+            lacks. ``"weight"``: missing outputs stay NaN and get no weight in output-error estimation and validation;
+            other methods raise. ``"hold"``: in addition, missing inputs hold their last value (linear interpolation
+            for ``"foh"``). `warnings` lists the missing samples.
+
+        Returns
+        -------
+        Run
+
+        Raises
+        ------
+        DataError
+            If a signal is not one-dimensional, not real numbers, empty, shorter than three rows, not finite or too
+            large; if lengths differ; if a name, unit or behaviour is unknown or used twice; if time is not finite,
+            repeated, decreasing, jittered or has a gap; if `step` is not positive.
+        """
+        arguments = RunArguments(
+            as_mapping("inputs", {} if inputs is None else inputs),
+            as_mapping("outputs", outputs),
+            step=step,
+            time=time,
+            units=units,
+            intersample=intersample,
+            name=name,
+            resample=resample,
+            window=window,
+            time_unit=time_unit,
+            missing=missing,
+        )
+        return cls._from_checked(**arguments.checked_fields())
+
+    @classmethod
+    def from_frame(
+        cls,
+        frame: object,
+        *,
+        time: Hashable | None = None,
+        step: float | None = None,
+        inputs: Mapping[str, Hashable] | Sequence[str] | str | None,
+        outputs: Mapping[str, Hashable] | Sequence[str] | str,
+        units: Mapping[str, str] | None = None,
+        intersample: Mapping[str, str] | None = None,
+        name: str = "run",
+        resample: float | None = None,
+        window: Sequence[float | None] | None = None,
+        time_unit: str | None = None,
+        missing: str = "refuse",
+    ) -> Run:
+        """Make a run from a pandas or polars frame, an xarray dataset, a dict of arrays or a structured array.
+
+        Parameters
+        ----------
+        frame : frame
+            Columns are taken as ``frame[column]``.
+        time : hashable, optional
+            Time column, or the name of the frame's index. Default without `step`: the index if it holds dates or is
+            called t, time or seconds; for a dataset its only dimension.
+        step : float, optional
+            Time between rows [s], > 0.
+        inputs, outputs : mapping of str to column, or list of str
+            Columns by signal name; a list names columns that keep their names.
+        units, intersample, name, resample, window, missing
+            As in `Run.from_arrays`.
+        time_unit : {"s", "ms", "us", "min", "h"}, optional
+            Unit of the time column; default the unit in its name, as in ``time [ms]`` (with a warning), else s. A
+            contradicting name raises an error.
+
+        Returns
+        -------
+        Run
+
+        Raises
+        ------
+        DataError
+            If a column is unknown or there more than once, and for everything `Run.from_arrays` refuses.
+        """
+        from ftlm.data.export import arguments_from_frame
+
+        arguments = arguments_from_frame(
+            frame,
+            time=time,
+            step=step,
+            inputs=inputs,
+            outputs=outputs,
+            units=units,
+            intersample=intersample,
+            name=name,
+            resample=resample,
+            window=window,
+            time_unit=time_unit,
+            missing=missing,
+        )
+        return cls._from_checked(**arguments.checked_fields())
 
     @property
     def signals(self) -> tuple[str, ...]:
@@ -139,12 +304,11 @@ class RunData:
         gone = {name: missing_mask(data[name]) for name in self.outputs}
         return {name: rows for name, rows in gone.items() if rows.any()}
 
-    def with_interpolated_gaps(self) -> RunData:
+    def with_interpolated_gaps(self) -> Run:
         """Return a copy with linearly interpolated gaps, for plots and data checks; never used for estimation."""
         if not any(missing_mask(self._data[name]).any() for name in self.outputs):
             return self
-        told = {f.name: getattr(self, f.name) for f in fields(RunData)}
-        return RunData(**{**told, "_data": {name: interpolate_gaps(values) for name, values in self._data.items()}})
+        return self._with(_data={name: interpolate_gaps(values) for name, values in self._data.items()})
 
     @property
     def metadata(self) -> dict[str, Any]:
@@ -160,178 +324,6 @@ class RunData:
 
     def __contains__(self, name: object) -> bool:
         return name in self.signals
-
-    def _unknown_signal_error(self, name: object) -> DataError:
-        return DataError(
-            f"signal {name!r} is not in run {self.name!r}{nearest(name, self.signals)}; "
-            f"its signals are {join_names(self.signals)}"
-        )
-
-
-class Run(RunData):
-    """One measured experiment: regular samples of named inputs and outputs in SI units.
-
-    A run is immutable. `Run.from_arrays`, `Run.from_frame` and `ftlm.load` create it and check the data once. Data
-    that cannot be used raise a `DataError` that names the signal, the first bad row (counted from 0), the number of
-    bad rows and the remedy. Data are repaired, resampled or clipped only on request, and `warnings` lists every such
-    change.
-
-    Sample j holds the outputs and inputs at t = j·step. Between samples `intersample` defines an input: ``"zoh"`` (a
-    command, held until the next sample) or ``"foh"`` (a measured signal, linear).
-    """
-
-    def __init__(self) -> None:
-        raise TypeError("a Run is made by Run.from_arrays, Run.from_frame or ftlm.load")
-
-    def __setattr__(self, name: str, value: object) -> NoReturn:
-        raise AttributeError(f"a Run never changes; {name!r} cannot be set")
-
-    def __delattr__(self, name: str) -> NoReturn:
-        raise AttributeError(f"a Run never changes; {name!r} cannot be deleted")
-
-    def __reduce__(self) -> tuple[object, ...]:
-        return run_of, (RunData(**self._fields()),)
-
-    @classmethod
-    def from_arrays(
-        cls,
-        *,
-        step: float | None = None,
-        time: object = None,
-        inputs: Mapping[str, object] | None,
-        outputs: Mapping[str, object],
-        units: Mapping[str, str] | None = None,
-        intersample: Mapping[str, str] | None = None,
-        name: str = "run",
-        resample: float | None = None,
-        window: Sequence[float | None] | None = None,
-        time_unit: str = "s",
-        missing: str = "refuse",
-    ) -> Run:
-        """Make a run from one-dimensional arrays.
-
-        Parameters
-        ----------
-        step : float, optional
-            Time between rows [s], > 0. Exactly one of `step` and `time` is given.
-        time : array_like, shape (N,), optional
-            Time of every row in `time_unit`, or dates (datetime64, datetime), which count from the first row on;
-            increasing. It is regular when every row lies within 2 % of a step of its
-            place on a regular grid; a mean step that differs from a short decimal number by rounding alone is taken
-            as that number.
-        inputs, outputs : mapping of str to array_like, shape (N,), N ≥ 3
-            Signals by name: lists, NumPy arrays, pandas or polars series of real numbers up to 1e150 in size. `inputs`
-            may be empty; at least one output is needed. A name begins with a letter or an underscore and holds
-            letters, digits, ``_ . [ ]``.
-        units : mapping of str to str, optional
-            Unit of a signal's numbers, converted to SI here. A signal without a unit is taken as it is.
-        intersample : mapping of str to {"zoh", "foh"}, optional
-            Intersample behavior of an input; default ``"zoh"``.
-        name : str, default "run"
-            Name of the run in reports.
-        resample : float, optional
-            Resample to this step [s]: interval means of held inputs, linear interpolation of all other signals.
-            Recorded in `warnings`. Nonuniform or missing samples are kept in `sample_times`: the output error is
-            simulated with the original inputs and evaluated at the original output times. Equation-error methods use
-            the resampled signals.
-        slice : pair of float or None, optional
-            Use the rows with a ≤ t < b only, [s] since the first row; applied before any other check of the rows.
-        time_unit : {"s", "ms", "us", "min", "h"}, default "s"
-            Unit of `time`.
-        missing : {"refuse", "weight", "hold"}, default "refuse"
-            Treatment of missing values: NaN, None in a list, masked values, rows that a regular `time`
-            lacks. ``"weight"``: missing outputs stay NaN and get no weight in output-error estimation and validation;
-            other methods raise. ``"hold"``: in addition, missing inputs hold their last value (linear interpolation
-            for ``"foh"``). `warnings` lists the missing samples.
-
-        Returns
-        -------
-        Run
-
-        Raises
-        ------
-        DataError
-            If a signal is not one-dimensional, not real numbers, empty, shorter than three rows, not finite or too
-            large; if lengths differ; if a name, unit or behaviour is unknown or used twice; if time is not finite,
-            repeated, decreasing, jittered or has a gap; if `step` is not positive.
-        """
-        asked = RunArguments(
-            as_mapping("inputs", {} if inputs is None else inputs),
-            as_mapping("outputs", outputs),
-            step=step,
-            time=time,
-            units=units,
-            intersample=intersample,
-            name=name,
-            resample=resample,
-            window=window,
-            time_unit=time_unit,
-            missing=missing,
-        )
-        return build_run(asked)
-
-    @classmethod
-    def from_frame(
-        cls,
-        frame: object,
-        *,
-        time: Hashable | None = None,
-        step: float | None = None,
-        inputs: Mapping[str, Hashable] | Sequence[str] | str | None,
-        outputs: Mapping[str, Hashable] | Sequence[str] | str,
-        units: Mapping[str, str] | None = None,
-        intersample: Mapping[str, str] | None = None,
-        name: str = "run",
-        resample: float | None = None,
-        window: Sequence[float | None] | None = None,
-        time_unit: str | None = None,
-        missing: str = "refuse",
-    ) -> Run:
-        """Make a run from a pandas or polars frame, an xarray dataset, a dict of arrays or a structured array.
-
-        Parameters
-        ----------
-        frame : frame
-            Columns are taken as ``frame[column]``.
-        time : hashable, optional
-            Time column, or the name of the frame's index. Default without `step`: the index if it holds dates or is
-            called t, time or seconds; for a dataset its only dimension.
-        step : float, optional
-            Time between rows [s], > 0.
-        inputs, outputs : mapping of str to column, or list of str
-            Columns by signal name; a list names columns that keep their names.
-        units, intersample, name, resample, window, missing
-            As in `Run.from_arrays`.
-        time_unit : {"s", "ms", "us", "min", "h"}, optional
-            Unit of the time column; default the unit in its name, as in ``time [ms]`` (with a warning), else s. A
-            contradicting name raises an error.
-
-        Returns
-        -------
-        Run
-
-        Raises
-        ------
-        DataError
-            If a column is unknown or there more than once, and for everything `Run.from_arrays` refuses.
-        """
-        from ftlm.data.export import arguments_from_frame
-
-        asked = arguments_from_frame(
-            frame,
-            time=time,
-            step=step,
-            inputs=inputs,
-            outputs=outputs,
-            units=units,
-            intersample=intersample,
-            name=name,
-            resample=resample,
-            window=window,
-            time_unit=time_unit,
-            missing=missing,
-        )
-        return build_run(asked)
 
     def __repr__(self) -> str:
         lines = [self._headline()]
@@ -363,7 +355,7 @@ class Run(RunData):
         ----------
         start, stop : float or None
             [s] since this run's first row, 0 ≤ start < stop ≤ N·step; None for the first row or past the last one.
-            The row at `stop` is left out, so ``run.slice(0, b)`` and ``run.slice(b, None)`` share no row.
+            The row at `stop` is left out, so ``run.window(0, b)`` and ``run.window(b, None)`` share no row.
 
         Returns
         -------
@@ -375,9 +367,9 @@ class Run(RunData):
         DataError
             If a limit lies outside the run, the limits do not increase, or fewer than three rows remain.
         """
-        first, last = window_rows(uniform_times(self.length, self.step), (start, stop), "slice")
+        first, last = window_rows(uniform_times(self.length, self.step), (start, stop), "window")
         if last - first < MIN_RUN_SAMPLES:
-            raise DataError(f"slice: {last - first} rows remain, {MIN_RUN_SAMPLES} are needed; widen the limits")
+            raise DataError(f"window: {last - first} rows remain, {MIN_RUN_SAMPLES} are needed; widen the limits")
         data = {name: values[first:last] for name, values in self._data.items()}
         # Digits beyond the twelfth are rounding errors of the sum.
         begin = self.start if first == 0 else float(f"{self.start + first * self.step:.12g}")
@@ -605,7 +597,6 @@ class Run(RunData):
         if not outputs:
             raise DataError(f"select: no output is left; keep at least one of {join_names(self.outputs)}")
         inputs = tuple(name for name in kept if name in self.inputs)
-        # RunData keeps units and intersample behavior of its own signals only.
         return self._with(inputs=inputs, outputs=outputs)
 
     def require_outputs(self, names: Iterable[str]) -> None:
@@ -636,7 +627,10 @@ class Run(RunData):
                 )
             if is_constant(values):
                 thing, what = f"output {name!r} of run {self.name!r}", f"constant, every row is {float(there[0])!r}"
-                way_out = "check the sensor and the column, or load a part of the record in which it moves with window="
+                way_out = (
+                    "check the sensor and the column, or load a part of the record in which it moves with "
+                    f"{parameter('window')}"
+                )
                 raise bad_rows(thing, what, 0, values.size, way_out)
 
     def plot(self, *signals: str) -> Figures:
@@ -751,11 +745,14 @@ class Run(RunData):
 
         return dataset_of(self)
 
-    def _fields(self) -> dict[str, Any]:
-        return {f.name: getattr(self, f.name) for f in fields(RunData)}
+    def _unknown_signal_error(self, name: object) -> DataError:
+        return DataError(
+            f"signal {name!r} is not in run {self.name!r}{nearest(name, self.signals)}; "
+            f"its signals are {join_names(self.signals)}"
+        )
 
     def _with(self, **changes: Any) -> Run:
-        return run_of(RunData(**{**self._fields(), **changes}))
+        return Run._from_checked(**{**vars(self), **changes})
 
     def _headline(self) -> str:
         return (
@@ -768,16 +765,8 @@ class Run(RunData):
         return name + unit + (f" {self._intersample[name]}" if name in self._intersample else "")
 
 
-def build_run(asked: RunArguments) -> Run:
-    """Validate the arguments of a run and build it."""
-    return run_of(asked.build_run_data())
-
-
-def run_of(record: RunData) -> Run:
-    """Return validated run data as a :class:`Run`."""
-    run = object.__new__(Run)
-    RunData.__init__(run, **{f.name: getattr(record, f.name) for f in fields(RunData)})
-    return run
+def _restore_run(values: Mapping[str, Any]) -> Run:
+    return Run._from_checked(**values)
 
 
 #: Cached results per set of runs: those of the single equations and of the whole structure.
@@ -804,7 +793,7 @@ def check_compatible(runs: Iterable[Run]) -> None:
             name = differing[0]
             raise DataError(
                 f"{who} have different units: signal {name!r} is in {units[name]!r} and {first_units[name]!r}, "
-                f"{len(differing)} in all; give the same units= when loading"
+                f"{len(differing)} in all; give the same {parameter('units')} when loading"
             )
 
 

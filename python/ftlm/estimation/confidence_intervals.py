@@ -12,7 +12,7 @@ import threading
 from collections.abc import Callable, Generator, Sequence
 from dataclasses import dataclass, replace
 from statistics import NormalDist
-from typing import Any
+from typing import Any, Literal
 
 import numpy as np
 
@@ -20,13 +20,14 @@ from ftlm.data.run import Run
 from ftlm.errors import ConvergenceError, FtlmError, ModelError
 from ftlm.estimation.free_parameters import FreeProblem
 from ftlm.estimation.objective import Iterate, Objective, covariance, covariance_of
-from ftlm.estimation.output_error import JointFit, ProfileInterval, fit_output_error
-from ftlm.estimation.result import IdentificationRecord
-from ftlm.order_search.options import Intervals, Loss
+from ftlm.estimation.output_error import JointFit, Loss, ProfileInterval, fit_output_error
+from ftlm.estimation.result import Identification
 from ftlm.utils.linalg import dot, projections, thin_svd
+from ftlm.utils.parameters import parameter
 from ftlm.utils.resources import interruptible_pool
 from ftlm.utils.validation import Floats, real_number
 
+Intervals = Literal["auto", "quadratic", "profile"]
 #: Largest relative error of a bound of the Wald interval, from one linear step of all other parameters. Above it the
 #: parameter is profiled.
 MAX_QUADRATIC_ERROR = 0.1
@@ -614,8 +615,7 @@ def with_intervals(
     if found.incomplete_names:
         warnings.append(
             f"the cost is no parabola along {', '.join(found.incomplete_names)}, and its profile there would take "
-            "long: these "
-            "intervals are rough; intervals='profile' finds them"
+            f"long: these intervals are rough; {parameter('intervals', 'profile')} finds them"
         )
     return replace(joint, profiles=found.intervals), warnings
 
@@ -636,16 +636,18 @@ def is_lower_on_finer_grid(grid: Objective, before: Floats, after: Floats) -> bo
     return costs[1] < costs[0]
 
 
-def likelihood_of(result: IdentificationRecord) -> ProfileLikelihood:
+def likelihood_of(result: Identification) -> ProfileLikelihood:
     """Return the profile likelihood around the optimum of an output-error result."""
     if result.fit is None or result.task is None:
-        raise ModelError(f"method {result.method!r} has no likelihood to profile; identify by method='output-error'")
+        raise ModelError(
+            f"method {result.method!r} has no likelihood to profile; identify by {parameter('method', 'output-error')}"
+        )
     problem = FreeProblem.of(replace(result.task.structure, initial=result.fit.initial))
     return ProfileLikelihood.of(result.fit, problem, result.task.runs)
 
 
 def result_profiles(
-    result: IdentificationRecord,
+    result: Identification,
     names: Sequence[str],
     level: float,
     threads: int,
@@ -654,8 +656,8 @@ def result_profiles(
     """Return profile-likelihood intervals of a result; see :meth:`ftlm.Identification.profile`."""
     if "reference" in result.settings:
         raise ModelError(
-            "a fit with reference= is where residuals are orthogonal to instruments, and no minimum of a cost: it has "
-            "no profile; use its standard errors"
+            f"a fit with {parameter('reference')} is where residuals are orthogonal to instruments, and no minimum "
+            "of a cost: it has no profile; use its standard errors"
         )
     valley = likelihood_of(result)
     unknown = [n for n in names if n not in valley.names]
@@ -670,6 +672,6 @@ def result_profiles(
     if found.lower_optimum is not None:
         raise ConvergenceError(
             "the profile leads to an optimum below this fit's, so its estimates are not the likeliest; identify again "
-            "with intervals='profile', which goes on from there"
+            f"with {parameter('intervals', 'profile')}, which goes on from there"
         )
     return found.intervals

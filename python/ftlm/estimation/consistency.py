@@ -14,11 +14,13 @@ from ftlm.data.run import Run, as_runs
 from ftlm.data.sampling import MIN_RUN_SAMPLES
 from ftlm.errors import DataError, FtlmError, ModelError
 from ftlm.estimation.identify import identify
+from ftlm.estimation.methods import EstimationMethod, resolve_method
 from ftlm.estimation.result import Identification
-from ftlm.structure.structure import Structure
+from ftlm.structure.structure import Offset, Structure
 from ftlm.svg.html_page import Page, ReportMixin, Section, Table
 from ftlm.utils.files import to_frame
 from ftlm.utils.formatting import Cell, format_bound
+from ftlm.utils.parameters import parameter, setting
 from ftlm.utils.statistics import NORMAL_95, chi_squared_99
 from ftlm.utils.validation import whole_number
 from ftlm.validation.comparison import compare, finite
@@ -208,8 +210,8 @@ class Consistency(ReportMixin):
         """Return the parameters as a pandas frame by parameter and segment."""
         rows = [
             {
-                "number": name,
-                "part": self.names[part],
+                "parameter": name,
+                "segment": self.names[part],
                 "value": self._values(part)[name],
                 "standard_error": error,
                 "low": result.intervals[name][0],
@@ -218,26 +220,26 @@ class Consistency(ReportMixin):
             for part, result in enumerate(self.results)
             for name, error in result.standard_errors.items()
         ]
-        return to_frame(rows, ["number", "part"])
+        return to_frame(rows, ["parameter", "segment"])
 
     def to_dict(self) -> dict[str, Any]:
         """Return the result as a dictionary for JSON."""
         return {
-            "same": self.consistent,
+            "consistent": self.consistent,
             "reason": self.reason,
-            "parts": list(self.names),
+            "segments": list(self.names),
             "differences": [
                 {
-                    "number": d.name,
-                    "parts": [self.names[k] for k in d.parts],
-                    "standard_errors": finite(d.difference_in_errors),
-                    "apart": d.disjoint,
+                    "parameter": d.name,
+                    "segments": [self.names[k] for k in d.parts],
+                    "difference_in_errors": finite(d.difference_in_errors),
+                    "disjoint": d.disjoint,
                 }
                 for d in self.differences
             ],
             "distance": None if self.distance is None else finite(self.distance),
             "degrees": self.degrees,
-            "fits": {
+            "cross_validation": {
                 name: dict(zip(self.names, row, strict=True))
                 for name, row in zip(self.names, self.cross_validation, strict=True)
             },
@@ -268,9 +270,12 @@ def consistency(
     runs: Run | Sequence[Run],
     structure: Structure,
     *,
-    parts: int | None = None,
+    segments: int | None = None,
+    method: str | EstimationMethod = "output-error",
+    offset: Offset | None = None,
+    m: int | None = None,
+    threads: int | None = None,
     progress: Callable[[int, int], None] | None = None,
-    **options: Any,
 ) -> Consistency:
     """Identify segments of a run separately and test whether they share one model.
 
@@ -286,10 +291,10 @@ def consistency(
         Structure to identify. Each segment with a nonzero start has its own initial terms or history.
     segments
         Number of segments of one run, by default 2; not used with several runs.
+    method, offset, m, threads
+        See :func:`ftlm.identify`; a method that gives standard errors, without a store and a start.
     progress
         Callback with (segments done, total segments).
-    **options
-        Options of :func:`ftlm.identify` except `store` and `start`, with a method that gives standard errors.
 
     Returns
     -------
@@ -307,12 +312,15 @@ def consistency(
         A segment whose fit fails.
     """
     every = as_runs(runs)
-    given = None if parts is None else whole_number(parts)
-    if parts is not None and (given is None or given < DEFAULT_SEGMENTS):
-        raise ModelError(f"parts = {parts!r}; use a whole number, at least {DEFAULT_SEGMENTS}")
+    given = None if segments is None else whole_number(segments)
+    if segments is not None and (given is None or given < DEFAULT_SEGMENTS):
+        raise ModelError(f"{setting('segments')} {segments!r}; use a whole number, at least {DEFAULT_SEGMENTS}")
     if len(every) > 1 and given is not None:
-        raise ModelError(f"{len(every)} runs are parts by themselves; leave parts= out, or give one run")
-    kept = [n for n in ("store", "start") if options.get(n) is not None]
+        raise ModelError(
+            f"{len(every)} runs are segments by themselves; leave {parameter('segments')} out, or give one run"
+        )
+    chosen = resolve_method(method)
+    kept = [n for n in ("store", "start") if getattr(chosen, n, None) is not None]
     if kept:
         raise ModelError(f"{kept[0]}= is of one identification, and each part has its own; leave it out")
     pieces = split_run(every[0], given or DEFAULT_SEGMENTS) if len(every) == 1 else list(every)
@@ -320,13 +328,13 @@ def consistency(
     results: list[Identification] = []
     for name, piece in zip(names, pieces, strict=True):
         try:
-            results.append(identify(piece, structure, **options))
+            results.append(identify(piece, structure, method=chosen, offset=offset, m=m, threads=threads))
         except FtlmError as error:
             raise type(error)(f"{name}: {error}") from error
         if not results[0].standard_errors:
             raise ModelError(
                 f"method {results[0].method!r} gives no standard errors of {structure}, and without them nothing tells "
-                "whether numbers differ; use method='output-error', and leave something to estimate"
+                f"whether numbers differ; use {parameter('method', 'output-error')}, and leave something to estimate"
             )
         if progress is not None:
             progress(len(results), len(pieces))

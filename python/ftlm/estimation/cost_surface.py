@@ -11,7 +11,7 @@ from ftlm.errors import FtlmError, ModelError
 from ftlm.estimation.free_parameters import FreeProblem
 from ftlm.estimation.objective import Iterate, Objective
 from ftlm.estimation.output_error import JointFit
-from ftlm.estimation.result import IdentificationRecord, Task
+from ftlm.estimation.result import Identification, Task
 from ftlm.svg.heat_map import Landscape
 from ftlm.utils.linalg import dot, projections, thin_svd
 from ftlm.utils.validation import Floats
@@ -22,7 +22,7 @@ POINTS_PER_AXIS, HALF_WIDTH_ERRORS = 11, 4.0
 OPTIMUM_EVALUATIONS = 20
 
 
-def correlated_orders(result: IdentificationRecord) -> tuple[str, str, float] | None:
+def correlated_orders(result: Identification) -> tuple[str, str, float] | None:
     """Return the two most correlated orders of a joint fit, and their correlation.
 
     Parameters
@@ -47,7 +47,7 @@ def correlated_orders(result: IdentificationRecord) -> tuple[str, str, float] | 
 
 
 def output_error_landscape(
-    result: IdentificationRecord, orders: tuple[str, str] | None = None, *, refit: bool = True
+    result: Identification, orders: tuple[str, str] | None = None, *, refit: bool = True
 ) -> Landscape | None:
     """Compute the cost of an output-error fit over two orders, four standard errors around the optimum.
 

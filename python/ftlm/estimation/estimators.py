@@ -5,34 +5,34 @@ from __future__ import annotations
 import contextlib
 import math
 import os
-from collections.abc import Callable, Mapping, Sequence
+from collections.abc import Mapping, Sequence
 from concurrent.futures import Executor
-from dataclasses import asdict, dataclass, field, replace
+from dataclasses import asdict, replace
 from typing import Any
 
 import numpy as np
 
 from ftlm.data.run import Run
-from ftlm.errors import FtlmError, ModelError
-from ftlm.estimation.confidence_intervals import with_intervals
+from ftlm.errors import FtlmError
+from ftlm.estimation.confidence_intervals import Intervals, with_intervals
+from ftlm.estimation.fit import Fit, ProgressCallback, initial_terms_text, make_model, offset_setting
 from ftlm.estimation.free_parameters import FreeProblem, values_of_model, warm_starts
-from ftlm.estimation.genetic import Genetic, genetic_search
 from ftlm.estimation.linear import estimate_coefficients, step_bias_warnings
 from ftlm.estimation.model_checks import coefficient_law_warnings, identifiability_warnings, sample_warnings
 from ftlm.estimation.nuisance_parameters import errors_with_orders, fit_with_initial_conditions
 from ftlm.estimation.objective import Iterate, Objective, long_run_covariance
-from ftlm.estimation.output_error import JointFit
+from ftlm.estimation.output_error import JointFit, Loss
 from ftlm.estimation.result import Task
-from ftlm.model.model import Model, ModelData
+from ftlm.model.model import Model
 from ftlm.order_search.checkpoint import Store
-from ftlm.order_search.options import Intervals, Loss, Settings
+from ftlm.order_search.options import SearchSettings
 from ftlm.order_search.result import SearchResult
 from ftlm.order_search.search import announce_time, make_job, run_job
 from ftlm.progress import ShareTracker
 from ftlm.simulation.discretization import prepare
 from ftlm.structure.order_grid import OrderGrid
-from ftlm.structure.structure import History, Initial, Structure
 from ftlm.utils.linalg import orthonormal, projections, vector_norm
+from ftlm.utils.parameters import parameter
 from ftlm.utils.validation import Floats
 from ftlm.validation.comparison import compare_means
 
@@ -126,65 +126,6 @@ def _covariance(grid: Objective, attempt: Iterate, influence: Floats) -> Floats:
 
 #: Largest number of block pulses a run for the final instrumental-variable fit if m is not given.
 MAX_IV_PULSES = 1 << 14
-#: Largest ratio of the final errors of two seeds. Above it some seeds have missed the optimum.
-MAX_SEED_ERROR_RATIO = 1.2
-ProgressCallback = Callable[[int, int], None] | None
-
-
-@dataclass(frozen=True)
-class Fit:
-    """Result of one estimator, before validation.
-
-    Parameters
-    ----------
-    task
-        Task as the estimator used it.
-    method
-        Name of the estimator.
-    model
-        Estimated model.
-    parameters
-        Number of free parameters.
-    settings
-        Settings that the result depends on, besides the task.
-    warnings
-        Warnings of the estimator itself.
-    searches, errors, joint, covariance
-        Order searches, standard errors of coefficients at the orders found, the joint fit, and the covariance of the
-        model parameters, if the estimator gives them.
-    """
-
-    task: Task
-    method: str
-    model: Model
-    parameters: int
-    settings: dict[str, Any]
-    warnings: list[str]
-    searches: dict[str, SearchResult] = field(default_factory=dict)
-    errors: Mapping[str, float] = field(default_factory=dict)
-    joint: JointFit | None = None
-    covariance: tuple[tuple[float, ...], ...] | None = None
-
-
-def make_model(
-    task: Task, method: str, structure: Structure, orders: Mapping[str, float], m: int, **about: Any
-) -> Model:
-    """Return the structure of the task as a model with all parameters fixed."""
-    units = {n: u for n, u in task.runs[0].units.items() if n in structure.signals}
-    told = {"method": method, "runs": ", ".join(r.name for r in task.runs), **about}
-    return Model(structure, orders=orders, units=units, m=m, about=told)
-
-
-def initial_terms_text(initial: Initial) -> str:
-    """Return decided initial terms as text for the settings."""
-    if isinstance(initial, History):
-        return f"history, {len(initial)} powers of t up to {initial[-1]:g}"
-    return initial if isinstance(initial, str) else f"t^{list(initial)}"
-
-
-def offset_setting(structure: Structure) -> dict[str, str]:
-    """Return the offset as a setting; empty without an offset."""
-    return {} if structure.offset == "none" else {"offset": structure.offset}
 
 
 def loss_setting(joint: JointFit) -> dict[str, Any]:
@@ -200,7 +141,7 @@ def estimate_output_error(
     answers: Sequence[Run] | None = None,
     loss: Loss = "squares",
     intervals: Intervals = "auto",
-    begin: ModelData | Mapping[str, float] | None = None,
+    begin: Model | Mapping[str, float] | None = None,
     more: Mapping[str, float] | None = None,
     alone: bool = False,
 ) -> Fit:
@@ -217,7 +158,7 @@ def estimate_output_error(
     begins: list[dict[str, float]] = []
     if begin is not None:
         free = FreeProblem.of(replace(structure, initial="rest"))
-        given = values_of_model(free, begin, more or {}) if isinstance(begin, ModelData) else begin
+        given = values_of_model(free, begin, more or {}) if isinstance(begin, Model) else begin
         begins = warm_starts(free, given)
     # A fit that is made twice, with a history or without, is rare; profiles of intervals take a third, where they do.
     course = ShareTracker(progress)
@@ -247,7 +188,7 @@ def estimate_output_error(
         structure = replace(structure, initial="history")
         warnings.append(
             f"{', '.join(r.name for r in task.runs)}: the first values look like rest, but the residuals of a fit from "
-            "rest ask for what was before; initial='history' was used"
+            f"rest ask for what was before; {parameter('initial', 'history')} was used"
         )
     orders, coefficients = list(joint.orders.values()), list(joint.coefficients.values())
     identified = structure.with_orders(joint.orders).with_coefficients(problem.coefficients_by_name(coefficients))
@@ -279,15 +220,18 @@ def estimate_output_error(
 
 def estimate_order_search(
     task: Task,
-    settings: Settings,
+    settings: SearchSettings,
     m: int | None,
+    threads: int,
     progress: ProgressCallback,
     store: str | os.PathLike[str] | None,
     executor: Executor | None,
 ) -> Fit:
     """Search the orders on the order grid, then estimate the coefficients by the same linear method."""
     method, structure = settings.coefficients, task.structure
-    searches = run_order_searches(task, settings, m, progress, store, executor) if structure.order_names else {}
+    searches = (
+        run_order_searches(task, settings, m, threads, progress, store, executor) if structure.order_names else {}
+    )
     orders = {n: v for search in searches.values() for n, v in search.orders.items()}
     rank = 1
     if "stage" in searches and method == "instrumental-variables" and structure.coupling == "simulated":
@@ -337,15 +281,16 @@ def fixed_orders(task: Task) -> set[str]:
 
 def run_order_searches(
     task: Task,
-    settings: Settings,
+    settings: SearchSettings,
     m: int | None,
+    threads: int,
     progress: ProgressCallback,
     store: str | os.PathLike[str] | None,
     executor: Executor | None,
 ) -> dict[str, SearchResult]:
     """Run the order searches of all independent groups of equations, with one checkpoint file."""
     jobs = {
-        name: make_job(task.runs, part, task.part_order_grid(part), m=m, progress=progress, **asdict(settings))
+        name: make_job(task.runs, part, task.part_order_grid(part), settings, m=m, threads=threads, progress=progress)
         for name, part in task.structure.independent_groups().items()
     }
     with contextlib.ExitStack() as stack:
@@ -358,7 +303,7 @@ def run_order_searches(
         }
 
 
-def coupled_rank(task: Task, settings: Settings, m: int | None, search: SearchResult) -> int:
+def coupled_rank(task: Task, settings: SearchSettings, m: int | None, search: SearchResult) -> int:
     """Return the rank of the kept row whose coupled simulation has the highest likelihood.
 
     The table ranks equations separately, which hardly distinguishes neighboring orders. The criterion is the sum of ln
@@ -377,53 +322,3 @@ def coupled_rank(task: Task, settings: Settings, m: int | None, search: SearchRe
         if cost < best:
             best, rank = cost, row.rank
     return rank
-
-
-def estimate_genetic(
-    task: Task, settings: Genetic, norm: str, m: int | None, threads: int, progress: ProgressCallback
-) -> Fit:
-    """Estimate orders and coefficients by a genetic algorithm, one equation at a time or jointly."""
-    structure = task.structure
-    parts = {"stage": structure} if structure.has_order_law else {o: structure.equation(o) for o in structure.outputs}
-    free = {name: (*part.order_names, *part.coefficient_names) for name, part in parts.items()}
-    names = [n for own in free.values() for n in own]
-    strange = [n for n in settings.bounds if n not in names]
-    if strange:
-        raise ModelError(f"bounds of {strange[0]!r}: there is no such number; free are {', '.join(names)}")
-    record = prepare(task.runs, structure, m, power_of_two=True)[0]
-    ends = {}
-    for name, part in parts.items():
-        own = replace(settings, bounds={n: b for n, b in settings.bounds.items() if n in free[name]})
-        records = prepare(task.runs, part, record.m, power_of_two=True)
-        ends[name] = genetic_search(
-            records, part, task.part_order_grid(part), own, norm=norm, threads=threads, progress=progress
-        )
-    orders = {n: v for end in ends.values() for n, v in end.orders.items()}
-    coefficients = {n: v for end in ends.values() for n, v in end.coefficients.items()}
-    bounds = {n: b for end in ends.values() for n, b in end.bounds.items()}
-    seeds, identified = list(settings.seeds), structure.with_orders(orders).with_coefficients(coefficients)
-    model = make_model(task, "genetic", identified, orders, record.m, seeds=str(seeds))
-    warnings = coefficient_law_warnings(model)
-    for name, (low, high) in bounds.items():
-        value = {**orders, **coefficients}[name]
-        if min(value - low, high - value) < 1e-3 * (high - low) and value not in (0.0, 2.0):
-            warnings.append(f"{name} = {value:.4g} is on its bound for the genetic algorithm; widen it")
-    for name, end in ends.items():
-        low, high = min(end.errors.values()), max(end.errors.values())
-        if high > MAX_SEED_ERROR_RATIO * low:
-            warnings.append(
-                f"{name}: the seeds of the genetic algorithm end at errors from {low:.4g} to {high:.4g}; "
-                "it has not found the optimum of each"
-            )
-    used = {
-        "method": "genetic",
-        "norm": norm,
-        "m": record.m,
-        "initial": "rest",
-        "seeds": seeds,
-        "population": settings.population,
-        "bounds": {n: list(b) for n, b in bounds.items()},
-        "errors": {name: {str(seed): e for seed, e in end.errors.items()} for name, end in ends.items()},
-        "evaluations": {name: sum(end.evaluations.values()) for name, end in ends.items()},
-    }
-    return Fit(task, "genetic", model, len(orders) + len(coefficients), used, warnings)

@@ -4,22 +4,28 @@ from __future__ import annotations
 
 import math
 import time
-from collections.abc import Callable, Mapping, Sequence
-from dataclasses import dataclass, field
-from typing import Any
+from collections.abc import Callable, Iterable, Mapping, Sequence
+from dataclasses import dataclass, field, replace
+from typing import Any, ClassVar, get_args
 
 import numpy as np
 from numpy.typing import NDArray
 
 from ftlm import _core
+from ftlm.data.run import Run
 from ftlm.errors import ModelError
+from ftlm.estimation.fit import Fit, ProgressCallback, check_no_friction, make_model
+from ftlm.estimation.model_checks import coefficient_law_warnings
+from ftlm.estimation.result import Task
+from ftlm.order_search.options import Norm
 from ftlm.progress import Progress
-from ftlm.simulation.discretization import Record, order_grid_tuple
+from ftlm.simulation.discretization import Record, order_grid_tuple, prepare
 from ftlm.structure.equation import Equation
 from ftlm.structure.order import Order
-from ftlm.structure.order_grid import OrderGrid
+from ftlm.structure.order_grid import OrderGrid, check_order_grid, check_order_grid_names
 from ftlm.structure.structure import Structure
-from ftlm.utils.validation import Floats, check_threads, whole_number
+from ftlm.utils.parameters import parameter, setting
+from ftlm.utils.validation import Floats, check_choice, check_threads, whole_number
 
 #: Increment of the coded orders. It is as fine as the paper prints, so regressors are shared.
 ORDER_RESOLUTION = 0.001
@@ -38,52 +44,10 @@ MAX_GENERATION_FACTOR = 4
 DURATION_FACTOR_RANGE = (0.1, 1.5)
 #: Fitness of candidates that diverge or cannot become parents. PyGAD accepts finite numbers only.
 INFEASIBLE_FITNESS = -1e300
+#: Largest ratio of the final errors of two seeds. Above it some seeds have missed the optimum.
+MAX_SEED_ERROR_RATIO = 1.2
 #: Largest number of evaluations used without an explicit request: an order grid under an order law has millions.
 MAX_DEFAULT_EVALUATIONS = 1_000_000
-
-
-@dataclass(frozen=True)
-class Genetic:
-    """Settings of the genetic algorithm.
-
-    Parameters
-    ----------
-    seeds
-        One run of the algorithm a seed; the best of all is the result, and the errors of all are kept.
-    evaluations
-        Evaluations a seed, rounded up to a whole generation; by default as many as the lattice has candidates.
-    population
-        Candidates of one generation, at least 8.
-    bounds
-        (low, high) of coefficients by name. By default ±2 times the value that the maker states, or else ±4 times the
-        coefficient with which its term alone would be as large as the output, at the middle of the orders' intervals.
-
-    Raises
-    ------
-    ModelError
-        Seeds that are none, a population outside [8, 100000], evaluations of less than two generations, bounds that are
-        no interval.
-    """
-
-    seeds: Sequence[int] = (0, 1, 2)
-    evaluations: int | None = None
-    population: int = 200
-    bounds: Mapping[str, tuple[float, float]] = field(default_factory=dict)
-
-    def __post_init__(self) -> None:
-        population = whole_number(self.population)
-        if population is None or not 8 <= population <= 100_000:
-            raise ModelError(f"population = {self.population!r} is outside [8, 100000]")
-        if self.evaluations is not None and (whole_number(self.evaluations) or 0) < 2 * self.population:
-            raise ModelError(
-                f"evaluations = {self.evaluations!r} is less than two generations of {self.population}; give more"
-            )
-        seeds = [whole_number(s) for s in self.seeds] if not isinstance(self.seeds, str) else [None]
-        if not seeds or any(s is None or not 0 <= s < 1 << 32 for s in seeds):
-            raise ModelError(f"seeds = {self.seeds!r}: give one or more whole numbers from 0 to 4294967295")
-        for name, pair in self.bounds.items():
-            if not (isinstance(pair, (tuple, list)) and len(pair) == 2 and -math.inf < pair[0] < pair[1] < math.inf):
-                raise ModelError(f"bounds of {name} = {pair!r} are no interval; write (low, high)")
 
 
 @dataclass(frozen=True)
@@ -129,10 +93,8 @@ class GeneticProblem:
 
     Parameters
     ----------
-    records, structure, lattice, settings
+    records, structure, settings
         See :func:`genetic_search`.
-    norm
-        ``"l1"`` or ``"l2"``.
     threads
         Number of threads that simulate.
     """
@@ -141,12 +103,10 @@ class GeneticProblem:
         self,
         records: list[Record],
         structure: Structure,
-        order_grid: OrderGrid,
-        settings: Genetic,
-        norm: str,
+        settings: GeneticAlgorithm,
         threads: int,
     ) -> None:
-        values = order_grid.values(structure)
+        values = (settings.order_grid or OrderGrid()).values(structure)
         self.order_names, self.coefficient_names = structure.order_names, structure.coefficient_names
         self.names = (*self.order_names, *self.coefficient_names)
         self.law = structure.has_order_law
@@ -156,7 +116,7 @@ class GeneticProblem:
             if name not in self.names:
                 raise ModelError(f"bounds of {name!r}: there is no such number; free are {', '.join(self.names)}")
             self.bounds[name] = (float(pair[0]), float(pair[1]))
-        self.rows = [self._rows(e, records, norm) for e in structure.equations]
+        self.rows = [self._rows(e, records, settings.norm) for e in structure.equations]
         self.threads = threads
         self.size = self._candidates(structure, records, values)
 
@@ -231,7 +191,7 @@ class GeneticProblem:
 def default_bounds(
     name: str, records: Sequence[Record], structure: Structure, values: Mapping[str, tuple[float, ...]]
 ) -> tuple[float, float]:
-    """Return the default bounds of a coefficient; see :class:`Genetic`."""
+    """Return the default bounds of a coefficient; see :class:`GeneticAlgorithm`."""
     stated = structure.reference.get(name, 0.0)
     if stated:
         return -STATED_RANGE * abs(stated), STATED_RANGE * abs(stated)
@@ -251,10 +211,8 @@ def default_bounds(
 def genetic_search(
     records: list[Record],
     structure: Structure,
-    order_grid: OrderGrid,
-    settings: Genetic,
+    settings: GeneticAlgorithm,
     *,
-    norm: str = "l1",
     threads: int | None = None,
     progress: Callable[[int, int], None] | None = None,
 ) -> GeneticRun:
@@ -276,18 +234,19 @@ def genetic_search(
     if records[0].offset != "none":
         raise ModelError(
             f"the genetic baseline knows no offset, and offset = {records[0].offset!r}; "
-            "use method='output-error', or offset='none'"
+            f"use {parameter('method', 'output-error')}, or {parameter('offset', 'none')}"
         )
     if records[0].start != (False, []):
         raise ModelError(
             "the genetic baseline knows no initial terms and needs runs that start at rest; "
-            "slice the runs, or give the structure initial='rest'"
+            f"slice the runs, or give the structure {parameter('initial', 'rest')}"
         )
-    problem = GeneticProblem(records, structure, order_grid, settings, norm, check_threads(threads))
+    problem = GeneticProblem(records, structure, settings, check_threads(threads))
     wanted = settings.evaluations or problem.size
     if settings.evaluations is None and wanted > MAX_DEFAULT_EVALUATIONS:
         raise ModelError(
-            f"the lattice has {wanted} candidates, too many to evaluate one by one; give Genetic(evaluations=…)"
+            f"the order grid has {wanted} candidates, too many to evaluate one by one; give "
+            "GeneticAlgorithm(evaluations=…)"
         )
     wanted = max(wanted, 2 * settings.population)
     total = wanted * len(settings.seeds)
@@ -424,10 +383,8 @@ MAX_LOG_ERROR = 1e3
 def differential_evolution_search(
     records: list[Record],
     structure: Structure,
-    order_grid: OrderGrid,
-    settings: Genetic,
+    settings: GeneticAlgorithm,
     *,
-    norm: str = "l1",
     threads: int | None = None,
     progress: Callable[[int, int], None] | None = None,
 ) -> GeneticRun:
@@ -447,7 +404,7 @@ def differential_evolution_search(
         raise ModelError("differential evolution needs SciPy; pip install 'ftlm[genetic]'") from None
     if records[0].start != (False, []) or records[0].offset != "none":
         raise ModelError("differential evolution knows no initial terms and no offset; slice the runs to start at rest")
-    problem = GeneticProblem(records, structure, order_grid, settings, norm, check_threads(threads))
+    problem = GeneticProblem(records, structure, settings, check_threads(threads))
     wanted = settings.evaluations or problem.size
     bounds = [problem.bounds[n] for n in problem.names]
     generation = CANDIDATES_PER_GENE * sum(low < high for low, high in bounds)
@@ -485,3 +442,120 @@ def differential_evolution_search(
     # SciPy counts calls, of a generation each.
     evaluations = {seed: int(end.nfev) * generation for seed, end in ends.items()}
     return GeneticRun(orders, coefficients, each, evaluations, problem.bounds)
+
+
+@dataclass(frozen=True, kw_only=True)
+class GeneticAlgorithm:
+    """Genetic algorithm on the free run, the paper's baseline; for comparison only.
+
+    Orders and coefficients are searched together. It needs PyGAD (``pip install 'ftlm[genetic]'``).
+
+    Parameters
+    ----------
+    order_grid
+        Bounds of the orders, and the number of candidates that `evaluations` refers to; see :func:`ftlm.order_grid`.
+    norm
+        ``"l1"`` (paper (45)) or ``"l2"`` (paper (46)).
+    seeds
+        One run of the algorithm a seed; the best of all is the result, and the errors of all are kept.
+    evaluations
+        Evaluations a seed, rounded up to a whole generation; by default as many as the order grid has candidates.
+    population
+        Candidates of one generation, at least 8.
+    bounds
+        (low, high) of coefficients by name. By default ±2 times the value that the maker states, or else ±4 times the
+        coefficient with which its term alone would be as large as the output, at the middle of the orders' intervals.
+
+    Raises
+    ------
+    ModelError
+        Seeds that are none, a population outside [8, 100000], evaluations of less than two generations, bounds that are
+        no interval, an order grid or a norm that is none.
+    """
+
+    name: ClassVar[str] = "genetic"
+    order_grid: OrderGrid | None = None
+    norm: Norm = "l1"
+    seeds: Sequence[int] = (0, 1, 2)
+    evaluations: int | None = None
+    population: int = 200
+    bounds: Mapping[str, tuple[float, float]] = field(default_factory=dict)
+
+    def __post_init__(self) -> None:
+        check_order_grid(self.order_grid)
+        check_choice("norm", self.norm, get_args(Norm))
+        population = whole_number(self.population)
+        if population is None or not 8 <= population <= 100_000:
+            raise ModelError(f"{setting('population')} {self.population!r} is outside [8, 100000]")
+        if self.evaluations is not None and (whole_number(self.evaluations) or 0) < 2 * self.population:
+            raise ModelError(
+                f"{setting('evaluations')} {self.evaluations!r} is less than two generations of {self.population}; "
+                "give more"
+            )
+        given = self.seeds if isinstance(self.seeds, Iterable) and not isinstance(self.seeds, str) else [None]
+        seeds = [whole_number(s) for s in given]
+        if not seeds or any(s is None or not 0 <= s < 1 << 32 for s in seeds):
+            raise ModelError(f"{setting('seeds')} {self.seeds!r}: give one or more whole numbers from 0 to 4294967295")
+        if not isinstance(self.bounds, Mapping):
+            raise ModelError(f"bounds = {self.bounds!r} is no mapping; write {{name: (low, high)}}")
+        for name, pair in self.bounds.items():
+            if not (isinstance(pair, (tuple, list)) and len(pair) == 2 and -math.inf < pair[0] < pair[1] < math.inf):
+                raise ModelError(f"bounds of {name} = {pair!r} are no interval; write (low, high)")
+
+    def fit(
+        self,
+        runs: Sequence[Run],
+        structure: Structure,
+        *,
+        m: int | None = None,
+        threads: int | None = None,
+        progress: ProgressCallback = None,
+    ) -> Fit:
+        """Estimate orders and coefficients, one equation at a time or jointly; see :func:`ftlm.identify`."""
+        check_no_friction(structure, self.name)
+        check_order_grid_names(self.order_grid, structure)
+        task = Task(tuple(runs), structure, self.order_grid)
+        parts = (
+            {"stage": structure} if structure.has_order_law else {o: structure.equation(o) for o in structure.outputs}
+        )
+        free = {name: (*part.order_names, *part.coefficient_names) for name, part in parts.items()}
+        names = [n for own in free.values() for n in own]
+        strange = [n for n in self.bounds if n not in names]
+        if strange:
+            raise ModelError(f"bounds of {strange[0]!r}: there is no such number; free are {', '.join(names)}")
+        record = prepare(task.runs, structure, m, power_of_two=True)[0]
+        ends = {}
+        for name, part in parts.items():
+            bounded = {n: b for n, b in self.bounds.items() if n in free[name]}
+            own = replace(self, order_grid=task.part_order_grid(part), bounds=bounded)
+            records = prepare(task.runs, part, record.m, power_of_two=True)
+            ends[name] = genetic_search(records, part, own, threads=threads, progress=progress)
+        orders = {n: v for end in ends.values() for n, v in end.orders.items()}
+        coefficients = {n: v for end in ends.values() for n, v in end.coefficients.items()}
+        bounds = {n: b for end in ends.values() for n, b in end.bounds.items()}
+        seeds, identified = list(self.seeds), structure.with_orders(orders).with_coefficients(coefficients)
+        model = make_model(task, self.name, identified, orders, record.m, seeds=str(seeds))
+        warnings = coefficient_law_warnings(model)
+        for name, (low, high) in bounds.items():
+            value = {**orders, **coefficients}[name]
+            if min(value - low, high - value) < 1e-3 * (high - low) and value not in (0.0, 2.0):
+                warnings.append(f"{name} = {value:.4g} is on its bound for the genetic algorithm; widen it")
+        for name, end in ends.items():
+            low, high = min(end.errors.values()), max(end.errors.values())
+            if high > MAX_SEED_ERROR_RATIO * low:
+                warnings.append(
+                    f"{name}: the seeds of the genetic algorithm end at errors from {low:.4g} to {high:.4g}; "
+                    "it has not found the optimum of each"
+                )
+        used = {
+            "method": self.name,
+            "norm": self.norm,
+            "m": record.m,
+            "initial": "rest",
+            "seeds": seeds,
+            "population": self.population,
+            "bounds": {n: list(b) for n, b in bounds.items()},
+            "errors": {name: {str(seed): e for seed, e in end.errors.items()} for name, end in ends.items()},
+            "evaluations": {name: sum(end.evaluations.values()) for name, end in ends.items()},
+        }
+        return Fit(task, self.name, model, len(orders) + len(coefficients), used, warnings, at_optimum=False)

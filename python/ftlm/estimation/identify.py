@@ -2,11 +2,10 @@
 
 from __future__ import annotations
 
-import os
-from collections.abc import Callable, Mapping, Sequence
+from collections.abc import Callable, Sequence
 from concurrent.futures import BrokenExecutor, CancelledError, Executor, Future, as_completed
 from dataclasses import dataclass, replace
-from typing import Any, Literal
+from typing import Any
 
 import msgspec
 import numpy as np
@@ -14,9 +13,8 @@ from msgspec import UNSET
 
 from ftlm.data.run import Run, as_runs
 from ftlm.errors import ConvergenceError, DataError, FtlmError, InternalError, ModelError
-from ftlm.estimation.closed_loop import instrument_runs, mark_reference_fit
-from ftlm.estimation.estimators import Fit, estimate_genetic, estimate_order_search, estimate_output_error
-from ftlm.estimation.genetic import Genetic
+from ftlm.estimation.fit import Fit
+from ftlm.estimation.methods import EstimationMethod, resolve_method
 from ftlm.estimation.model_checks import (
     dead_channel_warnings,
     discretization_warnings,
@@ -33,24 +31,16 @@ from ftlm.estimation.nuisance_parameters import (
     unrequested_offset_warnings,
 )
 from ftlm.estimation.output_error import parameter_set
-from ftlm.estimation.result import Identification, Task
+from ftlm.estimation.result import Identification
 from ftlm.estimation.verdict import result_findings, saved_findings
-from ftlm.model.model import Estimate, ModelData
-from ftlm.order_search.options import (
-    INTERVAL_CHOICES,
-    LOSS_CHOICES,
-    METHOD_CHOICES,
-    Intervals,
-    Loss,
-    Settings,
-    check_options_used,
-)
+from ftlm.model.model import Estimate
+from ftlm.order_search.search import check_executor, threads_per_task
 from ftlm.simulation.discretization import default_m
-from ftlm.structure.order_grid import OrderGrid, check_order_grid, check_order_grid_names
-from ftlm.structure.structure import History, Structure, check_offset
+from ftlm.structure.structure import History, Offset, Structure, check_offset
 from ftlm.utils.files import PACKAGE_LOGGER
+from ftlm.utils.parameters import parameter
 from ftlm.utils.statistics import NEGLIGIBLE_RESIDUAL_SHARE
-from ftlm.utils.validation import check_choice
+from ftlm.utils.validation import check_threads
 from ftlm.validation.comparison import Comparison, compare_samples, finite, simulate_runs
 from ftlm.validation.information_criteria import InformationCriteria, information_criteria
 from ftlm.validation.residual_tests import DEFAULT_LAGS, Residuals, residual_warnings, run_residual_tests
@@ -104,7 +94,7 @@ def _history_offset_warnings(fit: Fit) -> list[str]:
     return [
         f"what {', '.join(fit.model.outputs)} did before the runs is estimated with {joint.initial_terms} powers of "
         f"time; an unknown constant in the equation explains as much with {less} numbers fewer: if a sensor's zero, a "
-        "load or a mean may be there, offset='auto' estimates it"
+        f"load or a mean may be there, {parameter('offset', 'auto')} estimates it"
     ]
 
 
@@ -125,7 +115,7 @@ def fit_offset_test(fit: Fit) -> OffsetTest | None:
         values = dict(zip(fit.joint.names, fit.joint.values.tolist(), strict=True))
         asked = replace(structure, initial=fit.joint.initial)
         return offset_test(fit.task.runs, asked, values, every=fit.joint.refinement)
-    if fit.method == "genetic":
+    if not fit.at_optimum:
         return None
     values = {**fit.model.orders, **fit.model.coefficients}
     return offset_test(fit.task.runs, replace(structure, coefficient_law=()), values, every=DEFAULT_PULSES_PER_SAMPLE)
@@ -143,34 +133,17 @@ def identify(
     runs: Run | Sequence[Run],
     structure: Structure,
     *,
-    method: Literal[
-        "output-error", "instrumental-variables", "multi-innovation", "least-squares", "genetic"
-    ] = "output-error",
-    criterion: Literal["output-error", "equation-error"] | None = None,
-    order_grid: OrderGrid | None = None,
-    norm: Literal["l1", "l2"] | None = None,
-    innovation_length: int | None = None,
-    prior_covariance: float | None = None,
-    row_basis: Literal["haar", "time"] | None = None,
+    method: str | EstimationMethod = "output-error",
+    offset: Offset | None = None,
     m: int | None = None,
-    top: int | None = None,
-    genetic: Genetic | None = None,
     threads: int | None = None,
     progress: Callable[[int, int], None] | None = None,
-    store: str | os.PathLike[str] | None = None,
-    executor: Executor | None = None,
-    offset: Literal["none", "constant", "ramp", "auto"] | None = None,
-    reference: str | None = None,
-    loss: Loss | None = None,
-    intervals: Intervals | None = None,
-    start: Identification | ModelData | Mapping[str, float] | None = None,
 ) -> Identification:
     """Identify a structure from measured runs.
 
-    ``"output-error"`` estimates continuous orders and coefficients together, with confidence intervals and automatic
+    Output error estimates continuous orders and coefficients together, with confidence intervals and automatic
     initialization. The equation-error methods search free orders on the order grid: each equation by itself, or all
-    together under an order law. They then estimate the coefficients at these orders. An option that the method does not
-    use raises ModelError; None means that an option is not given.
+    together under an order law. They then estimate the coefficients at these orders.
 
     Parameters
     ----------
@@ -179,31 +152,10 @@ def identify(
     structure
         What to identify; see :func:`ftlm.equation` and :func:`ftlm.flexible_link`.
     method
-        ``"output-error"``: all equations and runs together, maximum likelihood for white noise.
-        ``"instrumental-variables"``: refined instrumental variables, orders from the lattice, coefficients without the
-        bias of noise. ``"multi-innovation"``: the paper's (44) in closed form. ``"least-squares"``: its limit for a
-        weak prior. ``"genetic"``: orders and coefficients by a genetic algorithm on the free run, the paper's
-        baseline, for comparison only (``pip install 'ftlm[genetic]'``).
-    criterion, order_grid, norm, top
-        Of the order search, by default ``"output-error"``, every lattice of :func:`ftlm.lattice`'s own, ``"l1"`` and
-        20; see :func:`ftlm.search_orders`. Refused by ``"output-error"``, whose bounds are the structure's own, and
-        where every order is a number. ``"genetic"`` uses lattice (its bounds) and norm.
-    threads, progress
-        Threads, by default all cores, and what is called with (work done, work in all).
-    innovation_length, prior_covariance, row_basis
-        p, K0 and the coordinates of paper (42)-(44), by default 7, 1 and ``"haar"``; of ``"multi-innovation"`` alone. p
-        is a weight of the data against the prior, nothing else.
-    m
-        Block pulses a run; default 2 048, or what the runs carry (a power of two for Haar rows). Instrumental variables
-        search on these and, without m, end on all samples (at most 16 384 pulses).
-    genetic
-        Seeds, evaluations, population and bounds of the genetic algorithm.
-    store
-        File in which the order searches are kept: the same call goes on with them after a power cut, and
-        :func:`ftlm.resume_search` with the searches alone; see :func:`ftlm.search_orders`.
-    executor
-        Any :class:`concurrent.futures.Executor` to work for the order searches; see :func:`ftlm.search_orders`. For
-        many runs each by itself: :func:`ftlm.identify_many`.
+        Method of estimation with its options: :class:`ftlm.OutputError`, :class:`ftlm.InstrumentalVariables`,
+        :class:`ftlm.MultiInnovation`, :class:`ftlm.LeastSquares` or :class:`ftlm.GeneticAlgorithm`. A name stands for
+        the defaults: ``"output-error"``, ``"instrumental-variables"``, ``"multi-innovation"``, ``"least-squares"`` or
+        ``"genetic"``.
     offset
         ``"constant"``: an unknown constant on the right-hand side of each equation, such as a sensor's zero, a load or
         friction that the model lacks; ``"ramp"``: one that drifts in proportion to time as well. One each run, in
@@ -212,25 +164,11 @@ def identify(
         runs ask for one at 99 %, none where they do not, with the statistic in ``.settings["offset_test"]``; it fits
         once with the constant and, where none is asked for, once without. Default what the structure says. Where it
         says none and a constant would explain much, a warning does.
-    reference
-        Name of a signal of the runs that drives a closed loop from outside, such as its set point: the instrument of
-        ``"output-error"``. Residuals are then made orthogonal to what the part of every input that follows the
-        reference does, which noise that the loop feeds back is no part of.
-    loss
-        Of output error: ``"squares"`` (default), or ``"huber"``, which counts residuals beyond 1.345 of the usual ones
-        by their size, so that outliers decide nothing; without any it has 95 % of the precision. Figures stay those of
-        all samples.
-    intervals
-        Of output error: ``"quadratic"``, estimate ± 1.96 standard errors, true where the cost is a parabola;
-        ``"profile"``, by profile likelihood for every number, some ten to a hundred free runs each;
-        ``"auto"`` (default), by profile likelihood for the numbers for which two free runs each say that the quadratic
-        picture is off by over a tenth. See :meth:`ftlm.Identification.profile`.
-
-    start
-        Of output error: what is known already, from where it starts besides its automatic starts, so that it never
-        ends with a larger cost than one gets from there: an identification or a model of the same outputs, simpler or
-        not, or values of free numbers by name. What it does not have starts at the coefficient 0; an order that is
-        free now and was a number there starts at that number.
+    m
+        Block pulses a run; default 2 048, or what the runs carry (a power of two for Haar rows). Instrumental variables
+        search on these and, without m, end on all samples (at most 16 384 pulses).
+    threads, progress
+        Threads, by default all cores, and what is called with (work done, work in all).
 
     Returns
     -------
@@ -243,101 +181,48 @@ def identify(
         Runs that do not fit the structure, or a constant output; a reference that is not there or does not move; a
         store of other searches, in use, damaged, or that cannot be written.
     ModelError
-        A method that is not known, an option that it does not use, a lattice without or with too many candidates,
-        settings out of range, a store or an executor without an order search, a store with ``offset="auto"``, a start
-        that has none of the free numbers, others, or values out of their bounds.
+        A method that is not known, an order grid without or with too many candidates, settings out of range, options of
+        an order search without a free order, a store with ``offset="auto"``, a start that has none of the free
+        parameters, others, or values out of their bounds.
     ConvergenceError
         Regressors that cannot be told apart at the given orders, or an executor that has lost its workers.
     """
     several = as_runs(runs)
-    check_choice("method", method, METHOD_CHOICES)
+    chosen = resolve_method(method)
     if not isinstance(structure, Structure):
         raise ModelError(f"structure is {type(structure).__name__}; use ftlm.equation(…) or ftlm.flexible_link(…)")
+    check_threads(threads)
     if offset is not None:
         structure = replace(structure, offset=check_offset(offset))
-    if structure.has_friction:
-        _check_friction(structure, method, reference)
-    check_order_grid(order_grid)
-    check_order_grid_names(order_grid, structure)
-    if not (genetic is None or isinstance(genetic, Genetic)):
-        raise ModelError(f"genetic is {type(genetic).__name__}, not Genetic; use ftlm.Genetic(seeds=…)")
-    words: dict[str, Any] = {
-        "criterion": criterion,
-        "norm": norm,
-        "innovation_length": innovation_length,
-        "prior_covariance": prior_covariance,
-        "rows": row_basis,
-        "keep": top,
-    }
-    words = {n: value for n, value in words.items() if value is not None}
-    if loss is not None:
-        check_choice("loss", loss, LOSS_CHOICES)
-    if intervals is not None:
-        check_choice("intervals", intervals, INTERVAL_CHOICES)
-    if intervals == "profile" and reference is not None:
-        raise ModelError(
-            "intervals='profile' needs a cost that has its minimum at the estimate, and reference= has none; use "
-            "intervals='quadratic', or leave it out"
-        )
-    others = {
-        "loss": loss,
-        "intervals": intervals,
-        "lattice": order_grid,
-        "genetic": genetic,
-        "store": store,
-        "executor": executor,
-        "reference": reference,
-        "start": start,
-    }
-    given = [*(n for n, value in others.items() if value is not None), *words]
-    estimator = "least-squares" if method in ("output-error", "genetic") else method
-    settings = Settings.check(coefficients=estimator, threads=threads, **words)
-    check_options_used(method, given, free=bool(structure.order_names))
-    if executor is not None and threads is None:
-        settings = replace(settings, threads=1)
-    if structure.offset == "auto" and store is not None:
-        raise ModelError(
-            "offset='auto' may need two searches, and a store keeps those of one; use offset='none' or "
-            "offset='constant' with store="
-        )
-    if not (start is None or isinstance(start, (Identification, ModelData, Mapping))):
-        raise ModelError(f"start is {type(start).__name__}; give an identification, a model, or values by name")
-    begin = start.model if isinstance(start, Identification) else start
-    more = start.parameter_values if isinstance(start, Identification) else {}
-    answers, weak = (None, []) if reference is None else instrument_runs(several, structure, reference)
+    if structure.offset == "auto":
+        _check_offset_test(structure, chosen)
 
     def estimate(asked: Structure) -> Fit:
-        task = Task(tuple(several), asked, order_grid)
-        if method == "output-error":
-            return estimate_output_error(
-                task, m, settings.threads, progress, answers, loss or "squares", intervals or "auto", begin, more
-            )
-        if method == "genetic":
-            return estimate_genetic(task, genetic or Genetic(), settings.norm, m, settings.threads, progress)
-        return estimate_order_search(task, settings, m, progress, store, executor)
+        fit = chosen.fit(several, asked, m=m, threads=threads, progress=progress)
+        if not isinstance(fit, Fit):
+            raise ModelError(f"the method {chosen.name!r} fitted a {type(fit).__name__}, not a Fit")
+        return fit
 
-    PACKAGE_LOGGER.info("identifying %s from %s by %s", structure.name, ", ".join(r.name for r in several), method)
-    fit = fit_with_offset_decision(several, structure, estimate)
-    if reference is not None:
-        fit = mark_reference_fit(fit, reference, weak)
-    result = assess_fit(fit)
+    PACKAGE_LOGGER.info("identifying %s from %s by %s", structure.name, ", ".join(r.name for r in several), chosen.name)
+    result = assess_fit(fit_with_offset_decision(several, structure, estimate))
     PACKAGE_LOGGER.info("identified: %s", result.verdict())
     for warning in result.warnings:
         PACKAGE_LOGGER.warning("%s", warning)
     return result
 
 
-def _check_friction(structure: Structure, method: str, reference: str | None) -> None:
-    """Raise ModelError for options that do not support friction."""
-    words = f"the equation of {structure.outputs[structure.friction_equations[0]]} has friction, which"
-    if method != "output-error":
-        raise ModelError(f"{words} method={method!r} does not know; use method='output-error'")
-    if reference is not None:
-        raise ModelError(f"{words} the instrument reference={reference!r} does not know; leave one of the two out")
-    if structure.offset == "auto":
+def _check_offset_test(structure: Structure, method: EstimationMethod) -> None:
+    """Raise ModelError if ``offset="auto"``, which may fit twice, is not possible."""
+    if structure.has_friction:
         raise ModelError(
-            f"{words} the test of offset='auto' does not know; use offset='constant', whose interval says whether it "
-            "is 0, or offset='none'"
+            f"the equation of {structure.outputs[structure.friction_equations[0]]} has friction, which the test of "
+            f"{parameter('offset', 'auto')} does not know; use {parameter('offset', 'constant')}, whose interval "
+            f"says whether it is 0, or {parameter('offset', 'none')}"
+        )
+    if getattr(method, "store", None) is not None:
+        raise ModelError(
+            f"{parameter('offset', 'auto')} may need two searches, and a store keeps those of one; use "
+            f"{parameter('offset', 'none')} or {parameter('offset', 'constant')} with {parameter('store')}"
         )
 
 
@@ -458,9 +343,12 @@ def identify_many(
     runs: Sequence[Run | Sequence[Run]],
     structure: Structure,
     *,
-    executor: Executor | None = None,
+    method: str | EstimationMethod = "output-error",
+    offset: Offset | None = None,
+    m: int | None = None,
+    threads: int | None = None,
     progress: Callable[[int, int], None] | None = None,
-    **options: Any,
+    executor: Executor | None = None,
 ) -> list[BatchResult]:
     """Identify each of many runs separately.
 
@@ -470,13 +358,15 @@ def identify_many(
         Runs, or sequences of runs that are fitted together.
     structure
         Structure to identify, the same for all.
-    executor
-        Any :class:`concurrent.futures.Executor`, such as processes or ``dask.distributed.Client(…).get_executor()``.
-        Each run is sent to one worker, with one thread by default. None: one after the other in this process.
+    method, offset, m
+        See :func:`ftlm.identify`; the method without a store.
+    threads
+        Threads of one identification; with an executor one by default.
     progress
         Callback with (runs done, total runs).
-    **options
-        Options of :func:`ftlm.identify` except `store`.
+    executor
+        Any :class:`concurrent.futures.Executor`, such as processes or ``dask.distributed.Client(…).get_executor()``.
+        Each run is sent to one worker. None: one after the other in this process.
 
     Returns
     -------
@@ -486,7 +376,8 @@ def identify_many(
     Raises
     ------
     ModelError
-        No runs, an item that is no run, or a store.
+        No runs, an item that is no run, a method that is not known, or one with a store, or with an executor besides
+        that of this call.
     KeyboardInterrupt
         Ctrl-C.
     """
@@ -499,8 +390,13 @@ def identify_many(
         names.append(", ".join(r.name for r in group))
     if not items:
         raise ModelError("there are no runs; give at least one")
-    if options.get("store") is not None:
+    check_executor(executor)
+    chosen = resolve_method(method)
+    if getattr(chosen, "store", None) is not None:
         raise ModelError("a store keeps one identification; call identify for each run with a store of its own")
+    if executor is not None and getattr(chosen, "executor", None) is not None:
+        raise ModelError(f"the method has an executor besides {parameter('executor')}; leave one of the two out")
+    options = {"method": chosen, "offset": offset, "m": m, "threads": threads}
     if executor is None:
         every = []
         for name, item in zip(names, items, strict=True):
@@ -508,7 +404,7 @@ def identify_many(
             if progress is not None:
                 progress(len(every), len(items))
         return every
-    options = {"threads": 1, **options}
+    options["threads"] = threads_per_task(threads, executor)
     pending: list[Future[Any]] = []
     try:
         for item in items:

@@ -4,7 +4,7 @@ from __future__ import annotations
 
 from collections.abc import Sequence
 from dataclasses import dataclass, field, replace
-from typing import Any, Literal
+from typing import Any
 
 import numpy as np
 from numpy.typing import NDArray
@@ -12,12 +12,13 @@ from numpy.typing import NDArray
 from ftlm import _core
 from ftlm.data.run import Run
 from ftlm.errors import DataError, FtlmError, InternalError, ModelError
-from ftlm.order_search.options import Settings
+from ftlm.order_search.options import RowBasis, SearchSettings
 from ftlm.simulation.discretization import InitialTuple, Record, named_coefficients, prepare, structure_tuple
 from ftlm.structure.equation import Equation
 from ftlm.structure.structure import Initial, Structure
 from ftlm.svg.figure import Figure
 from ftlm.svg.line_chart import line_chart
+from ftlm.utils.parameters import parameter, setting
 from ftlm.utils.validation import Floats, whole_number
 
 #: Maximum number of iterations of refined instrumental variables, and the relative change of a coefficient below which
@@ -44,7 +45,7 @@ class CoefficientFit:
 
 
 def estimate_coefficients(
-    runs: Sequence[Run], structure: Structure, settings: Settings, m: int | None
+    runs: Sequence[Run], structure: Structure, settings: SearchSettings, m: int | None
 ) -> CoefficientFit:
     """Estimate the coefficients at given orders by the method that the settings name."""
     records = prepare(runs, structure, m, power_of_two=settings.needs_haar)
@@ -73,7 +74,7 @@ def _linear(
     return [r.core() for r in records], structure, list(first.inputs), fixed, first.start
 
 
-def _multi_innovation(item: Equation, records: list[Record], settings: Settings, prior: float) -> list[float]:
+def _multi_innovation(item: Equation, records: list[Record], settings: SearchSettings, prior: float) -> list[float]:
     """Return the coefficients by the closed form of equation (44)."""
     haar = settings.row_basis == "haar"
     (raw, *_), _ = _core.multi_innovation(*_linear(item, records), settings.innovation_length, prior, haar, False)
@@ -102,7 +103,8 @@ def _instrumental(fit: CoefficientFit, structure: Structure, records: list[Recor
         if not converged:
             fit.warnings.append(
                 f"{outputs}: instrumental variables did not stand still in {iterations} steps; the coefficients are "
-                "those of the least output error met. Too much noise for these terms: use method='output-error'"
+                "those of the least output error met. Too much noise for these terms: use "
+                f"{parameter('method', 'output-error')}"
             )
         if damped:
             fit.warnings.append(f"{outputs}: the free run of these coefficients is unstable; do not trust them")
@@ -114,7 +116,9 @@ def _instrumental(fit: CoefficientFit, structure: Structure, records: list[Recor
             fit.errors.update({str(t.coefficient): s / abs(t.factor) for t, s in pairs})
 
 
-def step_bias_warnings(runs: Sequence[Run], structure: Structure, settings: Settings, fit: CoefficientFit) -> list[str]:
+def step_bias_warnings(
+    runs: Sequence[Run], structure: Structure, settings: SearchSettings, fit: CoefficientFit
+) -> list[str]:
     """Return a warning if the step changes a coefficient by more than its standard error allows.
 
     The scheme has order 2. One third of the change from twice the step therefore remains (Richardson).
@@ -136,11 +140,11 @@ def step_bias_warnings(runs: Sequence[Run], structure: Structure, settings: Sett
     amount = f"about {moved[worst]:.2g}" if moved[worst] <= 10 else "more than 10"
     return [
         f"at {fit.m} pulses the step alone moves coefficient {worst} by {amount} standard errors, which do "
-        f"not count it; {finer}use method='output-error', which refines the step"
+        f"not count it; {finer}use {parameter('method', 'output-error')}, which refines the step"
     ]
 
 
-def _prior_warnings(output: str, raw: list[float], weak: list[float], settings: Settings) -> list[str]:
+def _prior_warnings(output: str, raw: list[float], weak: list[float], settings: SearchSettings) -> list[str]:
     """Return a warning if the prior covariance, not the data, determines the size of a coefficient."""
     shares = [abs(a - b) / abs(b) for a, b in zip(raw, weak, strict=True) if b]
     worst = max(shares, default=0.0)
@@ -149,7 +153,7 @@ def _prior_warnings(output: str, raw: list[float], weak: list[float], settings: 
     return [
         f"{output}: the prior (K0 = {settings.prior_covariance:g}, coefficients near 0) moves a coefficient by "
         f"{100 * min(worst, 9.99):.0f} % from what the data alone say; p = {settings.innovation_length} only weighs "
-        "the data against it. Raise prior_covariance or use method='least-squares'"
+        f"the data against it. Raise prior_covariance or use {parameter('method', 'least-squares')}"
     ]
 
 
@@ -181,7 +185,7 @@ def multi_innovation_trace(
     *,
     innovation_length: int = 7,
     prior_covariance: float = 1.0,
-    row_basis: Literal["haar", "time"] = "haar",
+    row_basis: RowBasis = "haar",
     m: int | None = None,
     every: int = 1,
 ) -> MultiInnovationTrace:
@@ -194,7 +198,7 @@ def multi_innovation_trace(
     equation
         One equation whose orders are numbers.
     innovation_length, prior_covariance, row_basis, m
-        See :func:`identify`.
+        See :class:`ftlm.MultiInnovation` and :func:`ftlm.identify`.
     every
         Give every n-th step (and the last).
 
@@ -212,13 +216,15 @@ def multi_innovation_trace(
     -----
     O(m k^3) for the recursion and one division of series for each step given.
     """
-    settings = Settings.check(
+    settings = SearchSettings(
         innovation_length=innovation_length, prior_covariance=prior_covariance, row_basis=row_basis
     )
     if len(equation.equations) != 1 or equation.order_names:
         raise ModelError("a trace needs one equation whose orders are numbers; use .equation(…).with_orders(…)")
     if equation.offset != "none":
-        raise ModelError(f"a trace follows no offset, and offset = {equation.offset!r}; use offset='none'")
+        raise ModelError(
+            f"a trace follows no offset, and offset = {equation.offset!r}; use {parameter('offset', 'none')}"
+        )
     stride = whole_number(every)
     if stride is None or stride < 1:
         raise ModelError(f"every = {every!r} is no whole number from 1; 1 gives every step")
@@ -269,7 +275,9 @@ def trace_chart(traces: Sequence[tuple[str, MultiInnovationTrace]], *, title: st
     steps = traces[0][1].step
     for name, trace in traces:
         if not np.array_equal(trace.step, steps):
-            raise DataError(f"trace {name!r} is given at other steps than {traces[0][0]!r}; use the same every=")
+            raise DataError(
+                f"trace {name!r} is given at other steps than {traces[0][0]!r}; use the same {parameter('every')}"
+            )
     return line_chart(
         steps,
         [(name, trace.error) for name, trace in traces],
@@ -285,8 +293,8 @@ class Streaming:
     """Online estimator of the coefficients of a structure for a run that starts at rest.
 
     Each sample costs the same, whatever the length of the run: the past is held by about a hundred numbers a signal.
-    After the last sample the coefficients are those of ``identify(method="multi-innovation", rows="time")`` at the
-    same orders on the run's own grid, to rounding.
+    After the last sample the coefficients are those of ``identify(method=MultiInnovation(row_basis="time"))`` at
+    the same orders on the run's own grid, to rounding.
 
     Parameters
     ----------
@@ -325,8 +333,8 @@ class Streaming:
             )
         if structure.offset != "none":
             raise ModelError(
-                f"offset = {structure.offset!r} cannot be followed in a stream; identify the recorded run, or use "
-                "offset='none'"
+                f"{setting('offset')} {structure.offset!r} cannot be followed in a stream; identify the recorded "
+                f"run, or use {parameter('offset', 'none')}"
             )
         if (
             structure.delay

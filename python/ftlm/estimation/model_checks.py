@@ -13,12 +13,13 @@ from ftlm.data.run import Run
 from ftlm.data.sampling import drop_missing
 from ftlm.estimation.free_parameters import FreeProblem
 from ftlm.estimation.output_error import OUTLIER_DEVIATIONS, JointFit
-from ftlm.estimation.result import IdentificationRecord
+from ftlm.estimation.result import Identification
 from ftlm.model.model import Model
 from ftlm.simulation.discretization import compared_values, has_nonuniform_samples
 from ftlm.simulation.output_samples import OutputSamples
 from ftlm.structure.structure import Structure
 from ftlm.utils.linalg import dot
+from ftlm.utils.parameters import parameter
 from ftlm.utils.statistics import NEGLIGIBLE_RESIDUAL_SHARE, is_white, robust_deviation
 from ftlm.utils.validation import Floats
 from ftlm.validation.comparison import Comparison, compare, validation_warnings
@@ -192,9 +193,8 @@ def _outlier_warning(runs: Sequence[Run], joint: JointFit, output: str) -> str |
     power = f" and {held} {100 * share:.0f} % of their squares" if share >= MIN_OUTLIER_POWER_FRACTION else ""
     return (
         f"{far} of {count} residuals of {output} {verb} beyond {OUTLIER_DEVIATIONS:g} times the usual one{power}, "
-        f"{first}: "
-        f"{'an outlier' if far == 1 else 'outliers'}, or moments "
-        "that the model does not explain; squares let them cost precision: loss='huber' weighs them down"
+        f"{first}: {'an outlier' if far == 1 else 'outliers'}, or moments that the model does not explain; squares "
+        f"let them cost precision: {parameter('loss', 'huber')} weighs them down"
     )
 
 
@@ -331,7 +331,8 @@ def friction_direction_warnings(model: Model, free: Sequence[OutputSamples]) -> 
 
     return [
         f"the velocity of {model.outputs[i]} never changes its sign in a run: while it slides, friction is a constant "
-        "like the offset, and only the rests tell them apart; add a run that moves both ways, or use offset='none'"
+        "like the offset, and only the rests tell them apart; add a run that moves both ways, or use "
+        f"{parameter('offset', 'none')}"
         for i in model.structure.friction_equations
         if not any(turns(run.outputs[i]) for run in free)
     ]
@@ -374,7 +375,7 @@ def stability_warnings(model: Model) -> list[str]:
     return [f"the model is {verdict}: its free run grows without bound, however well it fits a run of this length"]
 
 
-def validate(result: IdentificationRecord, runs: Run | Sequence[Run]) -> Comparison:
+def validate(result: Identification, runs: Run | Sequence[Run]) -> Comparison:
     """Compare a result with other runs and add warnings; see :meth:`ftlm.Identification.validate`."""
     there = compare(result.model, runs)
     words = [

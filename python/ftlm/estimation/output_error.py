@@ -6,6 +6,7 @@ import math
 from collections.abc import Callable, Mapping, Sequence
 from dataclasses import dataclass, field, replace
 from functools import cached_property
+from typing import Literal
 
 import numpy as np
 from msgspec import UnsetType
@@ -17,17 +18,19 @@ from ftlm.errors import ConvergenceError, DataError, ModelError
 from ftlm.estimation.free_parameters import FreeProblem, describe_collinear_inputs
 from ftlm.estimation.friction import run_friction_multistart
 from ftlm.estimation.objective import Iterate, Objective, RunSampler, propagated_errors
-from ftlm.model.model import FitParameters, ModelData
-from ftlm.order_search.options import Loss
+from ftlm.model.model import FitParameters, Model
 from ftlm.progress import TOTAL_PARTS, ShareTracker
 from ftlm.simulation.discretization import compared_values
 from ftlm.structure.input_nonlinearity import input_name
 from ftlm.structure.order import Order
 from ftlm.structure.structure import Initial, Structure
 from ftlm.utils.formatting import format_bound
+from ftlm.utils.parameters import parameter
 from ftlm.utils.resources import memory_limit, stop_flag
 from ftlm.utils.statistics import NORMAL_95, estimate_noise
 from ftlm.utils.validation import Floats
+
+Loss = Literal["squares", "huber"]
 
 
 @dataclass(frozen=True)
@@ -397,7 +400,7 @@ def parameter_set(joint: JointFit, structure: Structure) -> FitParameters:
     )
 
 
-def parameter_set_of(model: ModelData) -> FitParameters:
+def parameter_set_of(model: Model) -> FitParameters:
     """Return the set of free parameters that a model file stores.
 
     Raises
@@ -410,12 +413,12 @@ def parameter_set_of(model: ModelData) -> FitParameters:
         how = "was not identified" if model.estimate is None else f"is of method {model.estimate.method!r}"
         raise ModelError(
             f"this model {how}, or of a file that does not say what was free in its fit: without intervals and noise "
-            "no experiment can be laid out; identify it with method='output-error'"
+            f"no experiment can be laid out; identify it with {parameter('method', 'output-error')}"
         )
     return known
 
 
-def problem_of(model: ModelData) -> tuple[FreeProblem, list[float]]:
+def problem_of(model: Model) -> tuple[FreeProblem, list[float]]:
     """Return the estimation problem of a model for a run that starts at rest, and its parameter values.
 
     Raises

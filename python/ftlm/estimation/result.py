@@ -19,6 +19,7 @@ from ftlm.structure.order_grid import OrderGrid, restrict_order_grid
 from ftlm.structure.structure import Structure
 from ftlm.utils.files import to_frame
 from ftlm.utils.formatting import format_bound
+from ftlm.utils.parameters import parameter
 from ftlm.utils.statistics import NORMAL_95
 from ftlm.utils.validation import check_threads
 from ftlm.validation.comparison import Comparison, Metrics, filter_state, finite
@@ -53,8 +54,35 @@ class Task:
 
 
 @dataclass(frozen=True)
-class IdentificationRecord:
-    """Data of an identification; the fields are those of :class:`ftlm.Identification`."""
+class Identification:
+    """Result of an identification: model, fit, residuals, settings and verdict.
+
+    Parameters
+    ----------
+    model
+        Identified model.
+    method
+        Estimator of the coefficients.
+    comparison
+        Simulation error and equation error on the estimation runs.
+    searches
+        Order searches that gave the orders: by output, or under ``"stage"`` for a search under the order law; empty if
+        all orders were given.
+    settings
+        Settings of the estimator.
+    warnings
+        Warnings about the model.
+    fit
+        Optimum of the joint output error with its covariance; None for the equation-error methods.
+    residuals
+        Residual tests on the estimation runs; None if these are too short.
+    information
+        Information criteria, with orders counted as parameters; None without residuals.
+    task
+        Runs and structure as given.
+    coefficient_errors
+        Standard errors of coefficients, and of searched orders, for methods without a joint covariance.
+    """
 
     model: Model
     method: str
@@ -137,37 +165,6 @@ class IdentificationRecord:
         """Fit of the simulation in percent, by output."""
         return self.comparison.fit_percent
 
-
-class Identification(IdentificationRecord):
-    """Result of an identification: model, fit, residuals, settings and verdict.
-
-    Parameters
-    ----------
-    model
-        Identified model.
-    method
-        Estimator of the coefficients.
-    comparison
-        Simulation error and equation error on the estimation runs.
-    searches
-        Order searches that gave the orders: by output, or under ``"stage"`` for a search under the order law; empty if
-        all orders were given.
-    settings
-        Settings of the estimator.
-    warnings
-        Warnings about the model.
-    fit
-        Optimum of the joint output error with its covariance; None for the equation-error methods.
-    residuals
-        Residual tests on the estimation runs; None if these are too short.
-    information
-        Information criteria, with orders counted as parameters; None without residuals.
-    task
-        Runs and structure as given.
-    coefficient_errors
-        Standard errors of coefficients, and of searched orders, for methods without a joint covariance.
-    """
-
     def physical(self, **known: float) -> dict[str, PhysicalParameter]:
         """Return the physical parameters of a flexible link; see :func:`ftlm.physical_parameters`.
 
@@ -187,7 +184,9 @@ class Identification(IdentificationRecord):
             A model without coefficient law or intervals, or a name that is no parameter of it.
         """
         if self.fit is None:
-            raise ModelError(f"method {self.method!r} gives no joint covariance; identify by method='output-error'")
+            raise ModelError(
+                f"method {self.method!r} gives no joint covariance; identify by {parameter('method', 'output-error')}"
+            )
         return physical_parameters(self.fit, known)
 
     def profile(

@@ -14,9 +14,10 @@ from msgspec import UNSET
 
 from ftlm.analysis.poles import modes
 from ftlm.errors import FtlmError
-from ftlm.estimation.result import IdentificationRecord
+from ftlm.estimation.result import Identification
 from ftlm.model.model import Estimate, Model, ModelFinding
 from ftlm.utils.formatting import format_bound
+from ftlm.utils.parameters import choose_text, parameter
 from ftlm.utils.statistics import NORMAL_95
 from ftlm.validation.comparison import MAX_FIT_DROP_POINTS, MAX_NORMALIZED_RESIDUAL, Comparison, Metrics
 from ftlm.validation.findings import (
@@ -108,7 +109,7 @@ def verdict_html(judged: Verdict) -> Markup:
     return Markup("<p><strong>{}</strong>: {}.</p>").format(judged.level.capitalize(), judged.sentence)
 
 
-def validation_with_verdict(result: IdentificationRecord, comparison: Comparison) -> Validation:
+def validation_with_verdict(result: Identification, comparison: Comparison) -> Validation:
     """Return a comparison on other runs with the verdict of estimation and validation."""
     own = {f.name: getattr(comparison, f.name) for f in fields(Comparison)}
     return Validation(**own, verdict=verdict(result, comparison))
@@ -118,7 +119,7 @@ def _make_finding(level: str, reason: str, remedy: str) -> ModelFinding:
     return ModelFinding(cast(Literal["do not use", "with care"], level), reason, remedy)
 
 
-def verdict(result: IdentificationRecord, validation: Comparison | None = None) -> Verdict:
+def verdict(result: Identification, validation: Comparison | None = None) -> Verdict:
     """Return the verdict on a result, by the rules of :meth:`ftlm.Identification.verdict`.
 
     Warnings of weight that no rule names count in the order of :data:`ftlm.validation.findings.KINDS`.
@@ -145,7 +146,7 @@ def _combined_verdict(
         found += _validation_losses(before, comparison)
     found += [a for a in own if a.level == LEVEL_WITH_CARE]
     if not tried:
-        found.append(_make_finding(LEVEL_WITH_CARE, NOT_TRIED, "validate(run), or --validation FILE"))
+        found.append(_make_finding(LEVEL_WITH_CARE, NOT_TRIED, choose_text("validate(run)", "--validation FILE")))
     bad = [a for a in found if a.level == LEVEL_DO_NOT_USE] + [a for a in found if a.level == LEVEL_WITH_CARE]
     if not bad:
         return None
@@ -180,7 +181,9 @@ def saved_findings(known: Estimate) -> list[ModelFinding]:
     if unseen:
         found.append(
             _make_finding(
-                LEVEL_DO_NOT_USE, f"the runs do not tell {_join_names(unseen)} apart", _KINDS_BY_NAME["unseen"].remedy
+                LEVEL_DO_NOT_USE,
+                f"the runs do not tell {_join_names(unseen)} apart",
+                _KINDS_BY_NAME["unseen"].format_remedy(),
             )
         )
     before = {n: f for n, f in known.fit.items() if f is not None}
@@ -190,24 +193,28 @@ def saved_findings(known: Estimate) -> list[ModelFinding]:
             "unseen",
         ):
             reason = f"{concern.kind.what}: {_first_clause(concern.warnings[0])}"
-            found.append(_make_finding(concern.kind.level, reason, concern.kind.remedy))
+            found.append(_make_finding(concern.kind.level, reason, concern.kind.format_remedy()))
     if not known.standard_errors:
         found.append(
-            _make_finding(LEVEL_WITH_CARE, f"{known.method} gives no standard errors", "use method='output-error'")
+            _make_finding(
+                LEVEL_WITH_CARE,
+                f"{known.method} gives no standard errors",
+                f"use {parameter('method', 'output-error')}",
+            )
         )
     return found
 
 
-def result_findings(result: IdentificationRecord) -> list[ModelFinding]:
+def result_findings(result: Identification) -> list[ModelFinding]:
     """Return the findings about a result by itself, most serious first within a level."""
     return [*_rules(result)]
 
 
-def _rules(result: IdentificationRecord) -> Iterator[ModelFinding]:
+def _rules(result: Identification) -> Iterator[ModelFinding]:
     kinds = {c.kind.name: c for c in group_warnings(result.warnings)}
 
     def of(kind: WarningKind, reason: str = "", remedy: str = "") -> ModelFinding:
-        return _make_finding(kind.level, reason or kind.what, remedy or kind.remedy)
+        return _make_finding(kind.level, reason or kind.what, remedy or kind.format_remedy())
 
     yield from _free_runs(result)
     errors, joint = result.standard_errors, result.fit
@@ -239,11 +246,11 @@ def _rules(result: IdentificationRecord) -> Iterator[ModelFinding]:
         yield _make_finding(
             LEVEL_WITH_CARE,
             f"{result.method} gives no standard errors, so nothing says how sure its numbers are",
-            "use method='output-error'",
+            f"use {parameter('method', 'output-error')}",
         )
 
 
-def _free_runs(result: IdentificationRecord) -> Iterator[ModelFinding]:
+def _free_runs(result: Identification) -> Iterator[ModelFinding]:
     """Yield findings about simulations: overflow, instability and poor fit."""
     if not all(math.isfinite(f.nr) for f in result.output_error.values()):
         yield _make_finding(LEVEL_DO_NOT_USE, _KINDS_BY_NAME["range"].what, _KINDS_BY_NAME["range"].remedy)
@@ -332,7 +339,7 @@ def _of_noise(warning: str, fits: Mapping[str, float]) -> bool:
     return bool(named) and all(100.0 - fits[o] <= 100.0 * NEGLIGIBLE_RESIDUAL_RATIO for o in named)
 
 
-def _residuals(result: IdentificationRecord) -> Iterator[ModelFinding]:
+def _residuals(result: Identification) -> Iterator[ModelFinding]:
     """Yield findings of residual tests: feedback, dependence on an input, color."""
     if result.residuals is None:
         yield _make_finding(LEVEL_WITH_CARE, "the runs are too short for residual tests", "record a longer run")
@@ -359,7 +366,7 @@ def _residuals(result: IdentificationRecord) -> Iterator[ModelFinding]:
         yield _make_finding(LEVEL_WITH_CARE, words, _KINDS_BY_NAME["residuals"].remedy)
 
 
-def _is_uncertain(result: IdentificationRecord, name: str) -> bool:
+def _is_uncertain(result: Identification, name: str) -> bool:
     """Whether a parameter is poorly determined, by its profile if available."""
     error = result.standard_errors[name]
     numbers = {**result.coefficients, **({} if result.fit is None else result.fit.coefficients)}
@@ -374,13 +381,13 @@ def _is_uncertain(result: IdentificationRecord, name: str) -> bool:
     return error > MAX_COEFFICIENT_ERROR_RATIO * abs(numbers[name])
 
 
-def _is_of_input(result: IdentificationRecord, name: str) -> bool:
+def _is_of_input(result: Identification, name: str) -> bool:
     """Whether a parameter is a delay, a saturation or a dead zone, which may be 0 but must be bounded."""
     structure = result.model.structure
     return name in {f"delay_{s}" for s in structure.delay} | {limit.name for limit in structure.limits}
 
 
-def _format_uncertain(result: IdentificationRecord, name: str) -> str:
+def _format_uncertain(result: Identification, name: str) -> str:
     values = {**result.orders, **result.coefficients, **result.parameter_values}
     return f"{name} = {values[name]:.3g} ± {format_bound(result.standard_errors[name], '.2g')}"
 

@@ -106,7 +106,7 @@ def exchange_holds(
             if not told[place] > best:
                 break
             _, k, at, gap, step, _ = moves[place]
-            after = holds[k].after(moved, at, gap, step, shown=True)
+            after = holds[k].apply_exchange(moved, at, gap, step, shown=True)
             reached = float(told[place]) - _log_limit_excess(after, limits)
             if reached > best:
                 best, then, chosen = reached, after, (k, at, gap, step)

@@ -145,15 +145,15 @@ class DesignedInput:
         return {
             "shape": self.shape,
             "criterion": self.criterion,
-            "chosen": list(self.parameters),
+            "parameters": list(self.parameters),
             "duration": self.run.duration,
             "step": self.step,
             "values": dict(self.values),
             "standard_errors": {k: {n: finite(v) for n, v in e.items()} for k, e in self.errors.items()},
             "gain": finite(self.gain),
             "gains": dict(self.gains),
-            "reached": {
-                r.name: {"largest": r.largest, "limit": finite(r.limit), "binds": r.is_active}
+            "predicted_extremes": {
+                r.name: {"largest": r.largest, "limit": finite(r.limit), "is_active": r.is_active}
                 for r in self.predicted_extremes
             },
             "efficiency": finite(self.efficiency),

@@ -13,11 +13,12 @@ from ftlm.errors import ModelError
 from ftlm.estimation.free_parameters import FreeProblem
 from ftlm.estimation.objective import Iterate, Objective
 from ftlm.estimation.output_error import parameter_set_of, problem_of
-from ftlm.model.model import ModelData
+from ftlm.model.model import Model
 from ftlm.simulation.simulate import simulate
 from ftlm.structure.equation import Term
 from ftlm.structure.order import Order
 from ftlm.utils.linalg import orthonormal, thin_svd
+from ftlm.utils.parameters import setting
 from ftlm.utils.validation import Complex, Floats
 
 #: Relative size below which a direction of the offset responses is rounding error.
@@ -42,14 +43,14 @@ class ModelFit:
         Block pulses per sampling interval.
     """
 
-    model: ModelData
+    model: Model
     problem: FreeProblem
     values: tuple[float, ...]
     noise: Mapping[str, float]
     refinement: int
 
     @classmethod
-    def of(cls, model: ModelData, noise: Mapping[str, float]) -> ModelFit:
+    def of(cls, model: Model, noise: Mapping[str, float]) -> ModelFit:
         """Build from a model that records which of its parameters were free."""
         problem, values = problem_of(model)
         whole = replace(model, structure=replace(model.structure, coupling="simulated", initial="rest"))
@@ -213,7 +214,7 @@ def _offset_responses(laid: ModelFit, step: float, rows: int) -> Floats:
     structure = laid.problem.structure
     drives = {"none": 0, "constant": 1, "ramp": 2}.get(structure.offset)
     if drives is None:
-        raise ModelError(f"offset = {structure.offset!r} of the model is not decided; identify it again")
+        raise ModelError(f"{setting('offset')} {structure.offset!r} of the model is not decided; identify it again")
     if not drives:
         return np.zeros((0, len(laid.outputs) * rows))
     taken = {*structure.signals, *structure.coefficient_names, *structure.order_names}

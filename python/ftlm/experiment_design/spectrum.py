@@ -16,7 +16,7 @@ from ftlm.analysis.frequency_response import (
 )
 from ftlm.experiment_design.problem import Bounds, Criterion
 from ftlm.experiment_design.sensitivity import ModelFit
-from ftlm.model.model import ModelData
+from ftlm.model.model import Model
 from ftlm.utils.validation import Complex, Floats
 
 #: Maximum number of lines of a spectrum. Information changes little between neighboring lines.
@@ -137,7 +137,7 @@ def _response_sensitivities(laid: ModelFit, w: Floats, step: float) -> tuple[Com
     return slopes * held[:, None], gains * held
 
 
-def _output_responses(model: ModelData, w: Floats, coupling: str, drives: Complex, signals: Sequence[str]) -> Complex:
+def _output_responses(model: Model, w: Floats, coupling: str, drives: Complex, signals: Sequence[str]) -> Complex:
     """Output responses for simulated coupling, or for measured coupling with given responses of the other signals."""
     if coupling == "simulated":
         return frequency_response(model, w)

@@ -115,8 +115,24 @@ class Estimate(msgspec.Struct, frozen=True, forbid_unknown_fields=True):
 
 
 @dataclass(frozen=True)
-class ModelData:
-    """Structure with fixed orders and coefficients; base class of :class:`ftlm.Model`."""
+class Model:
+    """Structure with numerical orders and coefficients.
+
+    Parameters
+    ----------
+    structure
+        Structure without free parameters.
+    orders
+        Estimated values of the free orders by name.
+    units
+        SI units of the signals, where known.
+    m
+        Number of block pulses of the identification, the default of comparisons.
+    about
+        Metadata about the origin of the model.
+    estimate
+        Standard errors, covariance and warnings of the identification; None for a model defined by hand.
+    """
 
     structure: Structure
     orders: Mapping[str, float] = field(default_factory=dict)
@@ -158,32 +174,6 @@ class ModelData:
     def outputs(self) -> tuple[str, ...]:
         """Names of the modeled outputs."""
         return self.structure.outputs
-
-
-def check_model(model: object) -> None:
-    """Raise if an object is not a model."""
-    if not isinstance(model, ModelData):
-        raise ModelError(f"model is {type(model).__name__}, not a Model; identify a structure or load a model first")
-
-
-class Model(ModelData):
-    """Structure with numerical orders and coefficients.
-
-    Parameters
-    ----------
-    structure
-        Structure without free parameters.
-    orders
-        Estimated values of the free orders by name.
-    units
-        SI units of the signals, where known.
-    m
-        Number of block pulses of the identification, the default of comparisons.
-    about
-        Metadata about the origin of the model.
-    estimate
-        Standard errors, covariance and warnings of the identification; None for a model defined by hand.
-    """
 
     def simulate(
         self,
@@ -367,25 +357,7 @@ class Model(ModelData):
         return model_html(self)
 
 
-def load_model(path: str | os.PathLike[str]) -> Model:
-    """Read a model written by :meth:`Model.save`.
-
-    Parameters
-    ----------
-    path
-        File to read.
-
-    Returns
-    -------
-    Model
-        Bit-identical model, without data that only identification needs (order grids, laws, references).
-
-    Raises
-    ------
-    DataError
-        A file that does not exist, is no model (with the place), has a later schema, or exceeds 1 MiB.
-    """
-    from ftlm.model.serialization import read_model
-
-    record = read_model(path)
-    return Model(record.structure, record.orders, record.units, record.m, record.about, record.estimate)
+def check_model(model: object) -> None:
+    """Raise if an object is not a model."""
+    if not isinstance(model, Model):
+        raise ModelError(f"model is {type(model).__name__}, not a Model; identify a structure or load a model first")

@@ -11,7 +11,7 @@ import msgspec
 from msgspec import UNSET, UnsetType
 
 from ftlm.errors import DataError, ModelError
-from ftlm.model.model import Estimate, ModelData
+from ftlm.model.model import Estimate, Model
 from ftlm.structure.equation import Equation, Friction, Stribeck, Term
 from ftlm.structure.input_nonlinearity import InputNonlinearity, NonlinearityKind
 from ftlm.structure.order import Order
@@ -177,7 +177,7 @@ class ModelFile(msgspec.Struct, forbid_unknown_fields=True):
     limits: list[LimitFile] | UnsetType = UNSET
 
     @classmethod
-    def of(cls, model: ModelData) -> ModelFile:
+    def of(cls, model: Model) -> ModelFile:
         """Convert a model to its file form."""
         s = model.structure
         # Absent fields are omitted, so that files of older structures do not change.
@@ -204,8 +204,8 @@ class ModelFile(msgspec.Struct, forbid_unknown_fields=True):
             limits,
         )
 
-    def restore_model(self) -> ModelData:
-        """Return the model record.
+    def restore_model(self) -> Model:
+        """Return the model.
 
         Raises
         ------
@@ -231,7 +231,7 @@ class ModelFile(msgspec.Struct, forbid_unknown_fields=True):
             rows = self.estimate.covariance
             if len(rows) != count or any(len(row) != count for row in rows):
                 raise ModelError(f"its covariance is not of {count} by {count} numbers, as its equations need")
-        return ModelData(structure, self.orders, self.units, self.m, self.about, self.estimate)
+        return Model(structure, self.orders, self.units, self.m, self.about, self.estimate)
 
 
 #: Model files have a few kilobytes; the default size limit suffices.
@@ -259,14 +259,30 @@ def schema_of(
     )
 
 
-def write_model(model: ModelData, path: str | os.PathLike[str], *, force: bool) -> Path:
+def write_model(model: Model, path: str | os.PathLike[str], *, force: bool) -> Path:
     """Write a model as JSON, atomically."""
     data = msgspec.json.format(msgspec.json.encode(ModelFile.of(model)), indent=2)
     return write_atomically(path, data + b"\n", force=force)
 
 
-def read_model(path: str | os.PathLike[str]) -> ModelData:
-    """Read a model record; raises as :func:`ftlm.load_model`."""
+def load_model(path: str | os.PathLike[str]) -> Model:
+    """Read a model written by :meth:`Model.save`.
+
+    Parameters
+    ----------
+    path
+        File to read.
+
+    Returns
+    -------
+    Model
+        Bit-identical model, without data that only identification needs (order grids, laws, references).
+
+    Raises
+    ------
+    DataError
+        A file that does not exist, is no model (with the place), has a later schema, or exceeds 1 MiB.
+    """
     read = MODEL_FORMAT.read(path)
     of = schema_of(read.equations, read.limits, read.offset, read.sensor_filter, read.estimate)
     MODEL_FORMAT.check_schema(path, read, of)

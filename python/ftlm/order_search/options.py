@@ -1,144 +1,105 @@
-"""Options of estimators and order searches, validated."""
+"""Settings of an order search and of the coefficients that it ranks by, validated."""
 
 from __future__ import annotations
 
 import math
-from collections.abc import Iterable
-from dataclasses import dataclass
-from typing import Any, Literal
+from dataclasses import dataclass, fields
+from typing import Any, Literal, get_args
 
 from ftlm.errors import ModelError
+from ftlm.utils.parameters import parameter, setting
 from ftlm.utils.resources import memory_limit
-from ftlm.utils.validation import check_threads, real_number, whole_number
+from ftlm.utils.validation import check_choice, real_number, whole_number
 
 Criterion = Literal["output-error", "equation-error"]
 Coefficients = Literal["multi-innovation", "least-squares", "instrumental-variables"]
-Loss = Literal["squares", "huber"]
-Intervals = Literal["auto", "quadratic", "profile"]
-LOSS_CHOICES = ("squares", "huber")
-INTERVAL_CHOICES = ("auto", "quadratic", "profile")
-METHOD_CHOICES = ("output-error", "instrumental-variables", "multi-innovation", "least-squares", "genetic")
-_GRID_SEARCH_METHODS = METHOD_CHOICES[1:4]
-#: Methods of `identify` that use an option; options that are not listed (runs, structure, m, …) apply to all methods.
-METHODS_BY_OPTION: dict[str, tuple[str, ...]] = {
-    "lattice": METHOD_CHOICES[1:],
-    "criterion": _GRID_SEARCH_METHODS,
-    "norm": METHOD_CHOICES[1:],
-    "keep": _GRID_SEARCH_METHODS,
-    "innovation_length": ("multi-innovation",),
-    "prior_covariance": ("multi-innovation",),
-    "rows": ("multi-innovation",),
-    "genetic": ("genetic",),
-    "loss": METHOD_CHOICES[:1],
-    "reference": METHOD_CHOICES[:1],
-    "intervals": METHOD_CHOICES[:1],
-    "start": METHOD_CHOICES[:1],
-    "store": _GRID_SEARCH_METHODS,
-    "executor": _GRID_SEARCH_METHODS,
-}
-#: Options of the order search; grid methods use them only if an order is free.
-SEARCH_OPTIONS = ("lattice", "criterion", "norm", "keep", "store", "executor")
+Norm = Literal["l1", "l2"]
+RowBasis = Literal["haar", "time"]
 #: Innovation lengths of the paper's tables.
 COMPARED_INNOVATION_LENGTHS = (1, 3, 5, 7)
 #: Bound on the refined-instrumental-variables iterations per candidate; most converge earlier.
 MAX_IV_ITERATIONS = 5
+#: Largest number of rows of a table.
+MAX_TOP = 100_000
+#: Settings of multi-innovation alone.
+MULTI_INNOVATION_SETTINGS = ("innovation_length", "prior_covariance", "row_basis")
 
 
-def check_options_used(method: str, given: Iterable[str], *, free: bool = True, argument: str = "method") -> None:
-    """Raise a `ModelError` if options are given that a method does not use.
+@dataclass(frozen=True, kw_only=True)
+class SearchSettings:
+    """Settings that define the result of an order search.
 
     Parameters
     ----------
-    method
-        One of :data:`METHODS`.
-    given
-        Names of the options that were given.
-    free
-        Whether an order is free.
-    argument
-        Name of the method argument in the error message.
+    criterion, norm, coefficients, innovation_length, prior_covariance, row_basis, top, pruning
+        See :func:`ftlm.search_orders`.
+
+    Raises
+    ------
+    ModelError
+        A value out of range, or a setting of multi-innovation with other coefficients.
     """
-    useless = [n for n in given if method not in METHODS_BY_OPTION.get(n, METHOD_CHOICES)]
-    fixed = [
-        n for n in given if not free and method in _GRID_SEARCH_METHODS and n in SEARCH_OPTIONS and n not in useless
-    ]
-    count = len(useless) + len(fixed)
-    others = f", nor {count - 1} other{'s' if count > 2 else ''} given here" if count > 1 else ""
-    if useless:
-        users = " or ".join(f"{argument}={m!r}" for m in METHODS_BY_OPTION[useless[0]])
-        raise ModelError(f"{useless[0]}= is not used by {argument}={method!r}{others}; leave it out, or use {users}")
-    if fixed:
-        raise ModelError(
-            f"{fixed[0]}= is not used{others}: it is for order searches, and every order here is a number; leave it "
-            "out, or free an order"
-        )
 
-
-@dataclass(frozen=True)
-class Settings:
-    """Settings of a coefficient estimator and of the order search that ranks by it, validated."""
-
-    criterion: str = "output-error"
-    norm: str = "l1"
-    coefficients: str = "multi-innovation"
+    criterion: Criterion = "output-error"
+    norm: Norm = "l1"
+    coefficients: Coefficients = "multi-innovation"
     innovation_length: int = 7
     prior_covariance: float = 1.0
-    row_basis: str = "haar"
+    row_basis: RowBasis = "haar"
     top: int = 20
-    threads: int = 1
     pruning: bool = True
 
-    @classmethod
-    def check(
-        cls,
-        criterion: str = "output-error",
-        norm: str = "l1",
-        coefficients: str = "multi-innovation",
-        innovation_length: int = 7,
-        prior_covariance: float = 1.0,
-        row_basis: str = "haar",
-        top: int = 20,
-        threads: int | None = None,
-        pruning: bool = True,
-    ) -> Settings:
-        """Validate the arguments; raise a `ModelError` that names the invalid one."""
-        for name, value, known in (
-            ("criterion", criterion, ("output-error", "equation-error")),
-            ("norm", norm, ("l1", "l2")),
-            ("coefficients", coefficients, ("multi-innovation", "least-squares", "instrumental-variables")),
-            ("rows", row_basis, ("haar", "time")),
-        ):
-            if value not in known:
+    def __post_init__(self) -> None:
+        check_choice("criterion", self.criterion, get_args(Criterion))
+        check_choice("norm", self.norm, get_args(Norm))
+        check_choice("coefficients", self.coefficients, get_args(Coefficients))
+        check_choice("row_basis", self.row_basis, get_args(RowBasis))
+        top, length = whole_number(self.top), whole_number(self.innovation_length)
+        if top is None or not 1 <= top <= MAX_TOP:
+            raise ModelError(
+                f"{setting('top')} {self.top!r} is outside [1, {MAX_TOP}]; keep as many rows as you will read"
+            )
+        if length is None or not 1 <= length < 1 << 62:
+            raise ModelError(
+                f"{setting('innovation_length')} {self.innovation_length!r} is no whole number from 1; the paper's is 7"
+            )
+        covariance = real_number("prior_covariance", self.prior_covariance)
+        if not 0 < covariance < math.inf:
+            raise ModelError(
+                f"{setting('prior_covariance')} {self.prior_covariance!r} is not positive; a large one is a weak prior"
+            )
+        if not isinstance(self.pruning, bool):
+            raise ModelError(f"pruning = {self.pruning!r} is neither True nor False")
+        for name, value in (("top", top), ("innovation_length", length), ("prior_covariance", covariance)):
+            object.__setattr__(self, name, value)
+        if self.coefficients != "multi-innovation":
+            changed = [f.name for f in fields(self) if f.name in MULTI_INNOVATION_SETTINGS and self.differs(f.name)]
+            if changed:
                 raise ModelError(
-                    f"{name} = {value!r} is not known in this version; use {' or '.join(map(repr, known))}"
+                    f"{parameter(changed[0])} is not used by {parameter('coefficients', self.coefficients)}; leave "
+                    f"it out, or use {parameter('coefficients', 'multi-innovation')}"
                 )
-        rows_kept, p = whole_number(top), whole_number(innovation_length)
-        if rows_kept is None or not 1 <= rows_kept <= 100_000:
-            raise ModelError(f"top = {top!r} is outside [1, 100000]; keep as many rows as you will read")
-        if p is None or not 1 <= p < 1 << 62:
-            raise ModelError(f"innovation length p = {innovation_length!r} is no whole number from 1; the paper's is 7")
-        k0 = real_number("prior covariance K0", prior_covariance)
-        if not 0 < k0 < math.inf:
-            raise ModelError(f"prior covariance K0 = {prior_covariance!r} is not positive; a large one is a weak prior")
-        return cls(criterion, norm, coefficients, p, k0, row_basis, rows_kept, check_threads(threads), pruning)
+
+    def differs(self, name: str) -> bool:
+        """Whether a setting differs from its default."""
+        return bool(getattr(self, name) != getattr(type(self), name))
 
     @property
     def needs_haar(self) -> bool:
         """Whether m must be a power of two."""
         return self.coefficients == "multi-innovation" and self.row_basis == "haar"
 
-    def core_arguments(self, memory: int | None = None) -> tuple[str, str, int, float, bool, int, int, bool, int, int]:
+    def core_arguments(
+        self, threads: int, memory: int | None = None
+    ) -> tuple[str, str, int, float, bool, int, int, bool, int, int]:
         """Return the settings as arguments of the core; the default memory limit is that of this machine."""
         p = self.innovation_length if self.coefficients == "multi-innovation" else 0
         steps = MAX_IV_ITERATIONS if self.coefficients == "instrumental-variables" else 0
         ranked = (self.criterion, self.norm, p, self.prior_covariance, self.row_basis == "haar")
         most = memory_limit() if memory is None else memory
-        return *ranked, self.top, self.threads, self.pruning, steps, most
+        return *ranked, self.top, threads, self.pruning, steps, most
 
     def to_dict(self) -> dict[str, Any]:
         """Return the settings that results and reports show."""
-        out: dict[str, Any] = {"criterion": self.criterion, "norm": self.norm, "coefficients": self.coefficients}
-        if self.coefficients == "multi-innovation":
-            out |= {"innovation_length": self.innovation_length, "prior_covariance": self.prior_covariance}
-            out["rows"] = self.row_basis
-        return out
+        own = MULTI_INNOVATION_SETTINGS if self.coefficients == "multi-innovation" else ()
+        return {name: getattr(self, name) for name in ("criterion", "norm", "coefficients", *own)}

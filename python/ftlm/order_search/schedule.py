@@ -32,8 +32,9 @@ from ftlm.order_search.checkpoint import (
     Store,
     Verdicts,
 )
-from ftlm.order_search.options import Settings
+from ftlm.order_search.options import SearchSettings
 from ftlm.simulation.discretization import InitialTuple
+from ftlm.utils.parameters import parameter
 from ftlm.utils.validation import Floats
 
 #: Maximum number of search evaluators that a worker caches.
@@ -51,7 +52,8 @@ class SearchProblem(ABC, Generic[Table]):
     runs: tuple[CoreRecord, ...]
     inputs: list[bool]
     initial: InitialTuple
-    settings: Settings
+    settings: SearchSettings
+    threads: int
 
     @property
     @abstractmethod
@@ -92,7 +94,7 @@ class EquationProblem(SearchProblem["_core._Found"]):
     @property
     def core_arguments(self) -> tuple[Any, ...]:
         """Arguments of the core after the runs."""
-        return self.orders, self.inputs, self.fixed, self.initial, self.settings.core_arguments()
+        return self.orders, self.inputs, self.fixed, self.initial, self.settings.core_arguments(self.threads)
 
     def search(self, progress: ProgressCallback | None) -> _core._Found:
         """Run the whole search in this process."""
@@ -104,7 +106,9 @@ class EquationProblem(SearchProblem["_core._Found"]):
 
     def plan(self, algorithm: int | None = None) -> tuple[int, list[int], int]:
         """Return number of candidates, ends of the batches by this or an earlier algorithm, and algorithm version."""
-        return _core.search_plan(self.orders, self.inputs, self.initial, self.settings.core_arguments(), algorithm)
+        return _core.search_plan(
+            self.orders, self.inputs, self.initial, self.settings.core_arguments(self.threads), algorithm
+        )
 
     @property
     def samples(self) -> int:
@@ -113,7 +117,7 @@ class EquationProblem(SearchProblem["_core._Found"]):
 
     def join(self, parts: list[Part]) -> _core._Found:
         """Join the parts of all rounds."""
-        settings = self.settings.core_arguments()
+        settings = self.settings.core_arguments(self.threads)
         return _core.search_join(self.orders, self.inputs, self.initial, settings, self.samples, parts)
 
 
@@ -129,7 +133,15 @@ class CoupledProblem(SearchProblem["_core._FoundStage"]):
     @property
     def core_arguments(self) -> tuple[Any, ...]:
         """Arguments of the core after the runs."""
-        return self.axes, self.laws, self.inputs, self.fixed, self.scales, self.initial, self.settings.core_arguments()
+        return (
+            self.axes,
+            self.laws,
+            self.inputs,
+            self.fixed,
+            self.scales,
+            self.initial,
+            self.settings.core_arguments(self.threads),
+        )
 
     def search(self, progress: ProgressCallback | None) -> _core._FoundStage:
         """Run the whole search in this process."""
@@ -300,7 +312,7 @@ def _result(future: Future[Any], stretch: CandidateBlock) -> tuple[float, Any] |
 def _executor_error(error: BaseException) -> ConvergenceError:
     return ConvergenceError(
         f"the executor lost its work ({type(error).__name__}: {error}); start a new one and search again: "
-        "with store= nothing that was finished is lost"
+        f"with {parameter('store')} nothing that was finished is lost"
     )
 
 
@@ -324,7 +336,7 @@ class SearchState(ABC, Generic[Done, Table]):
 
     def __init__(self, work: SearchProblem[Table], pace: Throughput) -> None:
         self.work, self.pace = work, pace
-        self.threads = work.settings.threads
+        self.threads = work.threads
         self.done = self.total = 0
 
     @cached_property

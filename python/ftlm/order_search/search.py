@@ -8,8 +8,8 @@ import os
 import time
 from collections.abc import Callable, Iterator, Mapping, Sequence
 from concurrent.futures import Executor
-from dataclasses import dataclass, fields, replace
-from typing import Any, Literal, cast
+from dataclasses import asdict, dataclass, fields, replace
+from typing import Any, cast
 
 import numpy as np
 from msgspec import UNSET
@@ -19,7 +19,7 @@ from ftlm.data.run import Run, as_runs
 from ftlm.errors import DataError, FtlmError, ModelError
 from ftlm.model.model import Model
 from ftlm.order_search.checkpoint import RecordFile, Request, Store, read_store
-from ftlm.order_search.options import Coefficients, Criterion, Settings, check_options_used
+from ftlm.order_search.options import Coefficients, Criterion, Norm, RowBasis, SearchSettings
 from ftlm.order_search.result import SearchResult, SearchRow, StoreStatus
 from ftlm.order_search.schedule import (
     CoreRecord,
@@ -47,8 +47,6 @@ from ftlm.structure.structure import Structure
 from ftlm.svg.heat_map import Landscape
 from ftlm.utils.validation import check_threads
 
-#: Settings that define a search. Threads do not change its result.
-RECORDED_SETTINGS = tuple(f.name for f in fields(Settings) if f.name != "threads")
 Failures = list[tuple[dict[str, float], str]]
 
 
@@ -61,7 +59,8 @@ class Job:
     structure: Structure
     values: Mapping[str, tuple[float, ...]]
     records: list[Record]
-    settings: Settings
+    settings: SearchSettings
+    threads: int
     progress: ProgressCallback | None
 
     @property
@@ -71,22 +70,20 @@ class Job:
 
     def request(self, name: str) -> Request:
         """Return the definition that a checkpoint file stores."""
-        settings = {n: getattr(self.settings, n) for n in RECORDED_SETTINGS}
         records = tuple(RecordFile.of(r) for r in self.records)
         # Hints are not written: they tell a fit where to start and change no search.
         structure = replace(self.structure, hints=UNSET)
         # The records say it, where there is one: what has none is written as it always was.
         object.__setattr__(structure, "offset", UNSET)
-        return Request(name, structure, dict(self.values), settings, records, self.runs, dict(self.units))
+        return Request(name, structure, dict(self.values), asdict(self.settings), records, self.runs, dict(self.units))
 
     @classmethod
     def of(cls, request: Request, threads: int, progress: ProgressCallback | None) -> Job:
         """Restore a job from a checkpoint file; raise ModelError for an invalid request."""
         try:
-            kept: dict[str, Any] = {n: request.settings[n] for n in RECORDED_SETTINGS}
+            kept: dict[str, Any] = {f.name: request.settings[f.name] for f in fields(SearchSettings)}
         except KeyError as error:
             raise ModelError(f"setting {error} is missing") from None
-        settings = Settings.check(**kept | {"threads": threads, "early_stopping": bool(kept["early_stopping"])})
         records = [r.record() for r in request.records]
         structure = replace(request.structure, offset=records[0].offset if records else "none")
         signals = structure.signals
@@ -96,12 +93,14 @@ class Job:
             raise ModelError("its records do not hold the signals of its equation")
         if any(n not in request.values for n in structure.order_names):
             raise ModelError("an order has no values")
-        return cls(request.runs, request.units, structure, request.values, records, settings, progress)
+        return cls(
+            request.runs, request.units, structure, request.values, records, SearchSettings(**kept), threads, progress
+        )
 
-    def _common_arguments(self) -> tuple[tuple[CoreRecord, ...], list[bool], InitialTuple, Settings]:
+    def _common_arguments(self) -> tuple[tuple[CoreRecord, ...], list[bool], InitialTuple, SearchSettings, int]:
         record = self.records[0]
         runs = tuple(r.core() for r in self.records)
-        return runs, list(record.inputs), record.start, self.settings
+        return runs, list(record.inputs), record.start, self.settings, self.threads
 
     def equation_problem(self) -> EquationProblem:
         """Return the search problem of one equation."""
@@ -151,13 +150,22 @@ class Job:
         return spreads
 
 
-def run_job(job: Job, *, store: Store | None = None, number: int = 0, executor: Executor | None = None) -> SearchResult:
-    """Run a search; with a checkpoint file, as search ``number`` of it."""
+def check_executor(executor: object) -> None:
+    """Raise unless an argument is None or an executor of `concurrent.futures`."""
     if executor is not None and not isinstance(executor, Executor):
         raise ModelError(
             f"executor = {executor!r} is no executor of concurrent.futures; pass ProcessPoolExecutor(…) or "
             "Client(…).get_executor()"
         )
+
+
+def threads_per_task(threads: int | None, executor: Executor | None) -> int:
+    """Return the number of threads of one task: with an executor one by default."""
+    return check_threads(1 if threads is None and executor is not None else threads)
+
+
+def run_job(job: Job, *, store: Store | None = None, number: int = 0, executor: Executor | None = None) -> SearchResult:
+    """Run a search; with a checkpoint file, as search ``number`` of it."""
     if job.structure.has_order_law:
         stage = search_coupled(
             job.coupled_problem(), store=store, number=number, executor=executor, progress=job.progress
@@ -228,10 +236,10 @@ def search_orders(
     *,
     criterion: Criterion = "output-error",
     coefficients: Coefficients = "multi-innovation",
-    norm: Literal["l1", "l2"] = "l1",
-    innovation_length: int | None = None,
-    prior_covariance: float | None = None,
-    row_basis: Literal["haar", "time"] | None = None,
+    norm: Norm = "l1",
+    innovation_length: int = 7,
+    prior_covariance: float = 1.0,
+    row_basis: RowBasis = "haar",
     m: int | None = None,
     top: int = 20,
     threads: int | None = None,
@@ -265,8 +273,7 @@ def search_orders(
         ``"l1"`` (paper (45)) or ``"l2"`` (paper (46)).
     innovation_length, prior_covariance, row_basis
         p and K0 of paper (43)-(44), and whether rows come in Haar coordinates (``"haar"``) or in the order of time
-        (``"time"``); by default 7, 1 and ``"haar"``. Of ``"multi-innovation"`` alone; with other coefficients they are
-        refused.
+        (``"time"``). Of ``"multi-innovation"`` alone; with other coefficients a change of them is refused.
     m
         Block pulses a run; default 2 048, or what the runs carry.
     top
@@ -311,14 +318,20 @@ def search_orders(
     their partial sum exceeds the threshold. Candidates are generated by index, so memory does not grow with their
     number.
     """
-    if executor is not None and threads is None:
-        threads = 1
-    checked = as_runs(runs)
-    weighted = {"innovation_length": innovation_length, "prior_covariance": prior_covariance, "rows": row_basis}
-    words: dict[str, Any] = {n: value for n, value in weighted.items() if value is not None}
-    settings = Settings.check(criterion, norm, coefficients, top=top, threads=threads, pruning=pruning, **words)
-    check_options_used(coefficients, words, argument="coefficients")
-    job = make_job(checked, equation, order_grid, settings, m=m, progress=progress)
+    settings = SearchSettings(
+        criterion=criterion,
+        norm=norm,
+        coefficients=coefficients,
+        innovation_length=innovation_length,
+        prior_covariance=prior_covariance,
+        row_basis=row_basis,
+        top=top,
+        pruning=pruning,
+    )
+    check_executor(executor)
+    job = make_job(
+        runs, equation, order_grid, settings, m=m, threads=threads_per_task(threads, executor), progress=progress
+    )
     if store is None:
         return run_job(job, executor=executor)
     with Store(store, [job.request(job.name)]) as kept:
@@ -328,19 +341,15 @@ def search_orders(
 def make_job(
     runs: Run | Sequence[Run],
     equation: Structure,
-    order_grid: OrderGrid | None = None,
-    settings: Settings | None = None,
+    order_grid: OrderGrid | None,
+    settings: SearchSettings,
     *,
     m: int | None = None,
+    threads: int | None = None,
     progress: Callable[[int, int], None] | None = None,
-    **words: Any,
 ) -> Job:
-    """Check what :func:`search_orders` is given, and make it what a search works on.
-
-    Settings come checked, or in the words of :meth:`.Settings.check`.
-    """
-    checked = as_runs(runs)
-    settings = settings or Settings.check(**words)
+    """Return an order search with checked arguments and records; see :func:`search_orders`."""
+    checked, workers = as_runs(runs), check_threads(threads)
     if not isinstance(equation, Structure):
         raise ModelError(f"equation is {type(equation).__name__}, not a structure; use ftlm.equation or flexible_link")
     if not equation.order_names:
@@ -358,7 +367,8 @@ def make_job(
         check_zero_order_hold(run, equation, known)
     records = prepare(checked, equation, m, power_of_two=settings.needs_haar)
     units = {n: u for n, u in checked[0].units.items() if n in equation.signals}
-    return Job(tuple(r.name for r in checked), units, equation, values, records, settings, _core_callback(progress))
+    names = tuple(r.name for r in checked)
+    return Job(names, units, equation, values, records, settings, workers, _core_callback(progress))
 
 
 def resume_search(
@@ -414,8 +424,8 @@ def resume_job(
     executor: Executor | None = None,
 ) -> SearchResult:
     """Go on with one search of a store."""
-    threads = 1 if executor is not None and threads is None else threads
-    job = replace(job_of(store, number, threads), progress=_core_callback(progress))
+    check_executor(executor)
+    job = replace(job_of(store, number, threads_per_task(threads, executor)), progress=_core_callback(progress))
     with _usable(store.path, store.contents.requests[number]):
         return run_job(job, store=store, number=number, executor=executor)
 

@@ -6,7 +6,7 @@ from collections.abc import Mapping, Sequence
 
 import numpy as np
 
-from ftlm.data.run import Run, RunData
+from ftlm.data.run import Run
 from ftlm.errors import DataError
 from ftlm.svg.bar_chart import bar_chart, histogram
 from ftlm.svg.figure import MAX_LINE_POINTS, SMALL_WIDTH_PX, Figure, Figures
@@ -259,7 +259,7 @@ def _residual_caption(test: CorrelationTest, drawn: Floats, signal: str) -> str:
     return f"{bars} The residual {word} white noise: {judged} (99 %)."
 
 
-def picture(run: RunData, *signals: str) -> Figures:
+def picture(run: Run, *signals: str) -> Figures:
     """Charts of a run; see :meth:`ftlm.Run.plot`."""
     unknown = [name for name in signals if name not in run]
     if unknown:

@@ -12,7 +12,7 @@ from numpy.typing import ArrayLike
 from ftlm.analysis.frequency_response import frequency_response, response_deviation, response_inputs, transfer_functions
 from ftlm.analysis.poles import modes
 from ftlm.analysis.time_response import Response, response
-from ftlm.model.model import ModelData, check_model
+from ftlm.model.model import Model, check_model
 from ftlm.simulation.discretization import COULOMB_PREFIX
 from ftlm.svg.complex_plane import plane_chart
 from ftlm.svg.figure import SMALL_WIDTH_PX, Figure
@@ -25,7 +25,7 @@ from ftlm.utils.validation import Complex, Floats
 DECIBELS_PER_NEPER = 20.0 / math.log(10.0)
 
 
-def response_frequencies(model: ModelData, step: float | None = None, duration: float | None = None) -> Floats:
+def response_frequencies(model: Model, step: float | None = None, duration: float | None = None) -> Floats:
     """Default frequencies [rad/s] of a response: from one period per record to half the sampling rate."""
     if step is not None and duration is not None:
         return np.geomspace(2 * math.pi / duration, math.pi / step, 240)
@@ -37,7 +37,7 @@ def response_frequencies(model: ModelData, step: float | None = None, duration: 
     return np.geomspace(middle / 100, middle * 100, 240)
 
 
-def bode_charts(model: ModelData, w: ArrayLike | None = None) -> list[Figure]:
+def bode_charts(model: Model, w: ArrayLike | None = None) -> list[Figure]:
     """Return gain and phase charts for every pair of output and external input, with 95 % bands if known.
 
     Parameters
@@ -79,7 +79,7 @@ def bode_figures(omega: Floats, curves: Sequence[BodeCurve]) -> list[Figure]:
     return figures
 
 
-def pole_points(model: ModelData) -> tuple[float, Complex]:
+def pole_points(model: Model) -> tuple[float, Complex]:
     """Order q of the plane s^q and the poles in it with their conjugates; empty for a model with friction."""
     q = plane_order(model)
     found = () if model.structure.has_friction else modes(model)
@@ -93,7 +93,7 @@ def pole_points(model: ModelData) -> tuple[float, Complex]:
     return q, np.array(points, dtype=np.complex128)
 
 
-def pole_charts(model: ModelData) -> list[Figure]:
+def pole_charts(model: Model) -> list[Figure]:
     """Return the pole chart in the plane of s^q, q the highest order over the next integer, with the unstable sector.
 
     Empty for a model with friction or without poles.
@@ -126,7 +126,7 @@ def pole_charts(model: ModelData) -> list[Figure]:
     ]
 
 
-def plane_order(model: ModelData) -> float:
+def plane_order(model: Model) -> float:
     """Order q of the pole plane s^q: 1 for integer orders, else between 0.5 and 1."""
     orders = [e.order.constant for e in model.equations]
     orders += [t.order.constant for e in model.equations for t in e.terms]
@@ -147,7 +147,7 @@ class BodeCurve:
     phase_spread: Floats | None
 
 
-def bode_curves(model: ModelData, omega: Floats) -> list[BodeCurve]:
+def bode_curves(model: Model, omega: Floats) -> list[BodeCurve]:
     """Return the curves of all connected pairs of input and output; Coulomb friction is omitted."""
     response = frequency_response(model, omega)
     spread = None
@@ -199,7 +199,7 @@ class Bode:
         return "".join(f._repr_html_() for f in self.figures())
 
 
-def bode(model: ModelData, w: ArrayLike | None = None) -> Bode:
+def bode(model: Model, w: ArrayLike | None = None) -> Bode:
     """Return the frequency response of a model with charts; see :meth:`ftlm.Model.bode`."""
     check_model(model)
     omega = response_frequencies(model) if w is None else np.asarray(w, dtype=np.float64)
@@ -279,7 +279,7 @@ class Answer(Response):
         return "".join(f._repr_html_() for f in self.figures())
 
 
-def answer(model: ModelData, time: ArrayLike | None, kind: str) -> Answer:
+def answer(model: Model, time: ArrayLike | None, kind: str) -> Answer:
     """Return a step or impulse response of a model with charts; see :meth:`ftlm.Model.step`."""
     found = response(model, time, kind=kind)
     return Answer(**vars(found), units=dict(model.units))

@@ -19,7 +19,7 @@ from ftlm.estimation.cost_surface import output_error_landscape
 from ftlm.estimation.linear import multi_innovation_trace, trace_chart
 from ftlm.estimation.model_checks import validate
 from ftlm.estimation.output_error import JointFit
-from ftlm.estimation.result import IdentificationRecord, Task
+from ftlm.estimation.result import Identification, Task
 from ftlm.estimation.verdict import Verdict, saved_verdict, verdict, verdict_html
 from ftlm.model.model import Model
 from ftlm.order_search.options import COMPARED_INNOVATION_LENGTHS
@@ -170,7 +170,7 @@ FRICTION_STABILITY_NOTE = "The body rests while friction holds it, so that no po
 
 
 def identification_page(
-    result: IdentificationRecord,
+    result: Identification,
     path: str | os.PathLike[str],
     *,
     validation: Run | Sequence[Run] | None = None,
@@ -348,7 +348,7 @@ def frequency_section(model: Model, steps: Sequence[tuple[float, float]]) -> Sec
     return Section("Frequency response", words, figures=bode_charts(model, omega)[:SMALL_CHARTS], small=True)
 
 
-def _search_sections(result: IdentificationRecord) -> list[Section]:
+def _search_sections(result: Identification) -> list[Section]:
     """Return the convergence of the recursion and the order search with its score maps."""
     sections = []
     traces = _traces(result)
@@ -387,7 +387,7 @@ def _maps(task: Task, searches: Mapping[str, SearchResult]) -> list[Figure]:
     return maps
 
 
-def _traces(result: IdentificationRecord) -> list[Figure]:
+def _traces(result: Identification) -> list[Figure]:
     """Return the recursion at the orders found, for the paper's p and the one used.
 
     Empty if the first run does not start at rest.
@@ -398,7 +398,7 @@ def _traces(result: IdentificationRecord) -> list[Figure]:
         return []
     run, used = result.task.runs[0], result.settings
     every = max(1, int(used["m"]) // TRACE_POINTS)
-    options = {n: used[n] for n in ("prior_covariance", "rows", "m")}
+    options = {n: used[n] for n in ("prior_covariance", "row_basis", "m")}
     figures = []
     for solved in result.model.equations:
         single = result.task.structure.equation(solved.output)
@@ -426,7 +426,7 @@ def lead_of(compared: Sequence[tuple[str, Comparison]]) -> str:
     return " ".join(sentences)
 
 
-def estimates_table(result: IdentificationRecord | None, truth: Mapping[str, float] | None = None) -> Table:
+def estimates_table(result: Identification | None, truth: Mapping[str, float] | None = None) -> Table:
     """Return orders and coefficients of a joint fit with intervals, and true values if known."""
     rows: list[list[Cell]] = []
     if result is not None and result.fit is not None:
@@ -441,7 +441,7 @@ def estimates_table(result: IdentificationRecord | None, truth: Mapping[str, flo
     return Table("Output error: orders and coefficients, with intervals", columns, rows, groups=groups)
 
 
-def grouped_warnings(results: Mapping[str, IdentificationRecord | None]) -> list[str]:
+def grouped_warnings(results: Mapping[str, Identification | None]) -> list[str]:
     """Return warnings of several results by label, merging those that differ only in numbers."""
     groups: dict[str, tuple[str, list[str]]] = {}
     for label, result in results.items():
@@ -463,7 +463,7 @@ def starts_table(joint: JointFit, *, rows: int = 10, title: str = "Automatic sta
     return Table(title, ("rank", "start from", "cost per residual"), cells, note=note)
 
 
-def settings_table(result: IdentificationRecord, *, title: str = "What the result depends on") -> Table:
+def settings_table(result: Identification, *, title: str = "What the result depends on") -> Table:
     """Return a table of the settings of a result: estimator, criterion, M, p, K0, initial terms and runs."""
     structure, comparison = result.model.structure, result.comparison
     rows: list[list[Cell]] = [
@@ -491,7 +491,7 @@ def settings_table(result: IdentificationRecord, *, title: str = "What the resul
 _INDEPENDENCE_PHRASES = {"yes": "independent of", "no": "not independent of", "undecided": "perhaps independent of"}
 
 
-def identification_html(result: IdentificationRecord) -> str:
+def identification_html(result: Identification) -> str:
     """Return warnings, equations, parameters with intervals, both errors and residual tests as HTML."""
     model = result.model
     parts = [verdict_html(verdict(result))]

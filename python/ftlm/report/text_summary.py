@@ -12,13 +12,14 @@ from markupsafe import Markup
 
 from ftlm.analysis.poles import Mode, SteadyState, modes, steady_states
 from ftlm.errors import FtlmError
-from ftlm.estimation.result import IdentificationRecord
+from ftlm.estimation.result import Identification
 from ftlm.estimation.verdict import verdict
 from ftlm.model.model import Model
 from ftlm.report.typesetting import ORDER_DECIMALS, units_of
 from ftlm.structure.equation import Equation, format_equation
 from ftlm.structure.order import Order
 from ftlm.utils.formatting import Cell, Exact, format_bound, symbol, with_error, wrap_text
+from ftlm.utils.parameters import choose_text
 from ftlm.utils.statistics import NORMAL_95
 from ftlm.validation.comparison import Comparison, describe_offsets
 from ftlm.validation.findings import MAX_SUMMARY_WARNINGS, group_warnings, hidden_warnings_text
@@ -27,7 +28,7 @@ from ftlm.validation.findings import MAX_SUMMARY_WARNINGS, group_warnings, hidde
 MOST_MODES = 6
 
 
-def summary(result: IdentificationRecord, validation: Comparison | None = None) -> str:
+def summary(result: Identification, validation: Comparison | None = None) -> str:
     """Return the summary of a result as text."""
     judged = verdict(result, validation)
     lines = [*wrap_text(str(judged)), ""]
@@ -66,7 +67,7 @@ def _offset(output: str, comparison: Comparison | None) -> str | None:
     return "".join(f" {'-' if v < 0 else '+'} {abs(v):.4g}{what}" for v, what in written)
 
 
-def parameter_lines(result: IdentificationRecord) -> list[str]:
+def parameter_lines(result: Identification) -> list[str]:
     """Return orders and coefficients with standard errors, units and nominal values, one line each."""
     errors, units, stated = result.standard_errors, units_of(result.model), result.model.structure.reference
     values = {**result.orders, **result.parameter_values, **result.coefficients}
@@ -136,7 +137,7 @@ def describe_order(state: SteadyState) -> str:
     return f"; order {with_error(state.order, error)}" + ("" if told else f", which may be {whole:g}: {meaning}")
 
 
-def fit_lines(result: IdentificationRecord, validation: Comparison | None) -> list[str]:
+def fit_lines(result: Identification, validation: Comparison | None) -> list[str]:
     """Return lines on the simulation fit on estimation and validation data, and on the equation error."""
     width = max(len(o) for o in result.output_error) + 2
     lines = [f"{'fit of the free run, %':<24}{'estimation':>12}{'validation':>12}{'RMSE':>12}"]
@@ -149,7 +150,7 @@ def fit_lines(result: IdentificationRecord, validation: Comparison | None) -> li
     return lines
 
 
-def _residuals(result: IdentificationRecord) -> list[str]:
+def _residuals(result: Identification) -> list[str]:
     if result.residuals is None:
         return ["residuals: the runs are too short for tests"]
     white = ", ".join(f"{o} {'yes' if w else 'no'}" for o, w in result.residuals.white.items())
@@ -157,7 +158,7 @@ def _residuals(result: IdentificationRecord) -> list[str]:
     return [f"residuals white: {white}; independent of the inputs: {free} (99 %)"]
 
 
-def _starts(result: IdentificationRecord) -> list[str]:
+def _starts(result: Identification) -> list[str]:
     """Return lines on offsets outside the equations, and on runs with nonzero initial conditions."""
     comparison = result.comparison
     shown = {o for o in result.output_error if _offset(o, comparison) is not None}
@@ -173,7 +174,7 @@ def _starts(result: IdentificationRecord) -> list[str]:
     return lines
 
 
-def finding_lines(warnings: Sequence[str], how: str = "print(result.details())") -> list[str]:
+def finding_lines(warnings: Sequence[str], how: str | None = None) -> list[str]:
     """Return up to three groups of warnings with remedies, most serious first."""
     found = group_warnings(warnings)
     lines = []
@@ -182,7 +183,11 @@ def finding_lines(warnings: Sequence[str], how: str = "print(result.details())")
         if concern.remedy and concern.remedy not in concern.warnings[0]:
             lines += wrap_text(concern.remedy, "  -> ")
     more = hidden_warnings_text(found)
-    return [*lines, f"  ({more}: {how})"] if more else lines
+    return (
+        [*lines, f"  ({more}: {how or choose_text('print(result.details())', '--verbose shows all')})"]
+        if more
+        else lines
+    )
 
 
 ROW_BASIS_TEXTS = {"haar": "Haar coordinates", "time": "order of time"}
@@ -200,7 +205,7 @@ def settings_text(settings: Mapping[str, Any]) -> str:
         words += f", seeds {seeds}, {sum(settings['evaluations'].values())} evaluations in all"
     if "innovation_length" in settings:
         words += f", p = {settings['innovation_length']}, K0 = {settings['prior_covariance']:g}"
-        words += f", {settings['rows']} rows"
+        words += f", {settings['row_basis']} rows"
     if "loss" in settings:
         words += f", loss: {settings['loss']} ({robust_loss_text(settings)})"
     words += f", initial terms: {settings['initial']}"
@@ -226,7 +231,7 @@ def settings_rows(settings: Mapping[str, Any], *, searched: bool) -> list[list[C
         rows += [
             ["innovation length, p", int(settings["innovation_length"])],
             [Markup("prior covariance, K<sub>0</sub>"), Exact(settings["prior_covariance"])],
-            ["rows of the recursion", ROW_BASIS_TEXTS.get(settings["rows"], settings["rows"])],
+            ["rows of the recursion", ROW_BASIS_TEXTS.get(settings["row_basis"], settings["row_basis"])],
         ]
     if "refinement" in settings:
         rows += [

@@ -11,7 +11,7 @@ from msgspec import UNSET
 
 from ftlm.data.units import coefficient_unit
 from ftlm.estimation.output_error import JointFit
-from ftlm.model.model import ModelData
+from ftlm.model.model import Model
 from ftlm.structure.equation import Equation
 from ftlm.structure.input_nonlinearity import (
     INPUT_EFFECT_ABBREVIATIONS,
@@ -88,9 +88,7 @@ def equation_html(
     return Markup('<span class="equation">{}</span>').format(Markup(" ").join(parts))
 
 
-def equations_html(
-    model: ModelData, offsets: Sequence[Mapping[str, Mapping[str, float]]] | None = None
-) -> list[Markup]:
+def equations_html(model: Model, offsets: Sequence[Mapping[str, Mapping[str, float]]] | None = None) -> list[Markup]:
     """Equations of a model as MathML; offsets as numbers if there is one run, since each run has its own."""
     structure = model.structure
     own = offsets[0] if offsets is not None and len(offsets) == 1 else {}
@@ -100,7 +98,7 @@ def equations_html(
     ]
 
 
-def units_of(model: ModelData) -> dict[str, str]:
+def units_of(model: Model) -> dict[str, str]:
     """Unit of every named coefficient, friction, delay and limit whose unit is known."""
     out = {}
     for item in model.equations:
@@ -180,9 +178,7 @@ def derivative_html(order: Order, signal: str) -> Markup:
     return Markup("D<sup>{}</sup> {}").format(text, symbol_html(signal))
 
 
-def parameter_table(
-    model: ModelData, joint: JointFit | None = None, *, title: str = "Orders and coefficients"
-) -> Table:
+def parameter_table(model: Model, joint: JointFit | None = None, *, title: str = "Orders and coefficients") -> Table:
     """Return a table of orders and coefficients with their terms, standard errors and reference values.
 
     Parameters
@@ -275,7 +271,7 @@ def unit_html(unit: str) -> Markup:
     return Markup("").join(raised)
 
 
-def model_html(model: ModelData) -> str:
+def model_html(model: Model) -> str:
     """Return the equations and parameters of a model as HTML."""
     lines = Markup("").join(Markup("<p>{}</p>").format(e) for e in equations_html(model))
     known = model.orders or model.coefficients

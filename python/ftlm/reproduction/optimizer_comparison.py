@@ -12,7 +12,7 @@ import numpy as np
 from ftlm import _core
 from ftlm.arm.flexible_link import flexible_link, integer_order, link_model
 from ftlm.data.run import Run
-from ftlm.estimation.genetic import Genetic, GeneticRun, differential_evolution_search, genetic_search
+from ftlm.estimation.genetic import GeneticAlgorithm, GeneticRun, differential_evolution_search, genetic_search
 from ftlm.estimation.identify import identify
 from ftlm.estimation.linear import MultiInnovationTrace, multi_innovation_trace
 from ftlm.estimation.result import Identification
@@ -39,7 +39,7 @@ CONTEST_STEP = 0.1
 class OptimizerComparison:
     """Results on one equation: multi-innovation with p = 7 by K0, genetic algorithm, differential evolution."""
 
-    settings: Genetic
+    settings: GeneticAlgorithm
     candidates: int
     order_grid: dict[float, SearchResult]
     genetic: GeneticRun
@@ -60,7 +60,7 @@ def compare_optimizers(
     run: Run,
     single: Structure,
     order_grid: OrderGrid,
-    asked: Genetic | None = None,
+    asked: GeneticAlgorithm | None = None,
     *,
     seeds: Sequence[int] | None = None,
     threads: int | None = None,
@@ -105,11 +105,12 @@ def compare_optimizers(
         for prior in PRIOR_COVARIANCES
     }
     count = searches[PRIOR_COVARIANCES[0]].candidates
-    settings = asked or Genetic(seeds=tuple(seeds or seeds_for(count)))
-    settings = replace(settings, evaluations=settings.evaluations or max(count, 2 * settings.population))
+    settings = asked or GeneticAlgorithm(seeds=tuple(seeds or seeds_for(count)))
+    budget = settings.evaluations or max(count, 2 * settings.population)
+    settings = replace(settings, order_grid=order_grid, evaluations=budget)
     records = prepare([run], blind, None, power_of_two=True)
     rivals = [
-        search(records, blind, order_grid, settings, threads=threads, progress=progress)
+        search(records, blind, settings, threads=threads, progress=progress)
         for search in (genetic_search, differential_evolution_search)
     ]
     return OptimizerComparison(settings, count, searches, *rivals)
@@ -402,7 +403,7 @@ def simulated_panel(
     noise: float,
     threads: int | None,
     *,
-    genetic: Genetic | None = None,
+    genetic: GeneticAlgorithm | None = None,
     order_grid: OrderGrid | None = None,
     begin: Callable[[str], None] = lambda _: None,
     progress: Callable[[int, int], None] | None = None,

@@ -12,7 +12,7 @@ from pathlib import Path
 import numpy as np
 from markupsafe import Markup
 
-from ftlm.estimation.result import IdentificationRecord
+from ftlm.estimation.result import Identification
 from ftlm.model.model import Model
 from ftlm.order_search.result import search_summary
 from ftlm.plot.comparison_charts import comparison_charts, pulse_times
@@ -55,7 +55,7 @@ PAPER_REFERENCE = (
 def stage_section(
     heading: str,
     joint: Model,
-    results: Mapping[str, IdentificationRecord | None],
+    results: Mapping[str, Identification | None],
     shown: Sequence[Table],
     charts: Sequence[Figure],
     *notes: str,

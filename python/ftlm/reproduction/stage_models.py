@@ -16,9 +16,10 @@ from ftlm.errors import ConvergenceError, ModelError
 from ftlm.estimation.cost_surface import output_error_landscape
 from ftlm.estimation.estimators import estimate_output_error
 from ftlm.estimation.free_parameters import FreeProblem
-from ftlm.estimation.genetic import Genetic, GeneticRun
+from ftlm.estimation.genetic import GeneticAlgorithm, GeneticRun
 from ftlm.estimation.identify import assess_fit, identify
 from ftlm.estimation.linear import MultiInnovationTrace, multi_innovation_trace
+from ftlm.estimation.methods import EstimationMethod, InstrumentalVariables, OutputError, method_with_options
 from ftlm.estimation.result import Identification, Task
 from ftlm.model.model import Model
 from ftlm.order_search.result import SearchResult
@@ -232,7 +233,7 @@ class StageWork:
         if isinstance(self.progress, WorkerProgress):
             self.progress.begin(seconds_of(step, self.preset.order_grid.increment, self.preset.rivals_increment))
 
-    def compute_stage(self, genetic: Genetic | None) -> Stage:
+    def compute_stage(self, genetic: GeneticAlgorithm | None) -> Stage:
         """Compute all results of section 5 for a stage."""
         exact = self.manual("integer, exact")
         candidates = {"integer, Euler": self.euler_candidate("integer, Euler", exact), "integer, exact": exact}
@@ -298,9 +299,11 @@ class StageWork:
             alone = {run.name: compare_means(coupled, run).output_error for run in runs}
         return Candidate(label, model, estimation, validation, alone, result)
 
-    def identify_candidate(self, label: str, run: Run, structure: Structure, **options: Any) -> Candidate:
+    def identify_candidate(
+        self, label: str, run: Run, structure: Structure, method: str | EstimationMethod = "output-error"
+    ) -> Candidate:
         """Identify a candidate by one of the methods."""
-        result = identify(run, structure, threads=self.threads, progress=self.progress, **options)
+        result = identify(run, structure, method=method, threads=self.threads, progress=self.progress)
         return self.candidate(label, result.model, result)
 
     def manual(self, label: str) -> Candidate:
@@ -349,10 +352,11 @@ class StageWork:
             if self.preset.common_pulses:
                 found[label] = self.search_candidate(label, self.preset.order_grid, **options)
                 continue
-            method = {"method": options["coefficients"], **{n: v for n, v in options.items() if n != "coefficients"}}
-            found[label] = self.identify_candidate(
-                label, self.on, self.measured, lattice=self.preset.order_grid, keep=self.preset.top, **method
+            own = {n: v for n, v in options.items() if n != "coefficients"}
+            method = method_with_options(
+                options["coefficients"], {"order_grid": self.preset.order_grid, "top": self.preset.top, **own}
             )
+            found[label] = self.identify_candidate(label, self.on, self.measured, method)
         return found
 
     def search_candidate(self, label: str, order_grid: OrderGrid, **options: Any) -> Candidate:
@@ -405,9 +409,7 @@ class StageWork:
             "instrumental variables",
             self.on,
             self.measured,
-            method="instrumental-variables",
-            lattice=OrderGrid(increment=step, orders=axes),
-            keep=self.preset.top,
+            InstrumentalVariables(order_grid=OrderGrid(increment=step, orders=axes), top=self.preset.top),
         )
 
     def joint(
@@ -434,10 +436,10 @@ class StageWork:
         begin = self.published_values(near)
         if not self.simulated:
             try:
-                return self.identify_candidate(label, run, structure, intervals="quadratic", start=begin)
+                return self.identify_candidate(label, run, structure, OutputError(intervals="quadratic", start=begin))
             except ModelError:
                 # Out of the bounds that (22)-(25) have.
-                return self.identify_candidate(label, run, structure, intervals="quadratic")
+                return self.identify_candidate(label, run, structure, OutputError(intervals="quadratic"))
         fit = estimate_output_error(
             Task((run,), structure),
             None,
@@ -485,7 +487,7 @@ class StageWork:
             self.on, single, innovation_length=p, prior_covariance=prior, every=self.preset.trace_every
         )
 
-    def rivals(self, genetic: Genetic | None) -> dict[str, Rival]:
+    def rivals(self, genetic: GeneticAlgorithm | None) -> dict[str, Rival]:
         """Compare the optimizers on each equation at equal budgets."""
         lattice = rivals_order_grid(self.preset.order_grid.increment, self.preset.rivals_increment)
         found = {}

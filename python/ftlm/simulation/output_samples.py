@@ -13,7 +13,7 @@ from ftlm import _core
 from ftlm.data.run import Run
 from ftlm.data.sampling import drop_missing
 from ftlm.errors import FtlmError, ModelError
-from ftlm.model.model import ModelData
+from ftlm.model.model import Model
 from ftlm.simulation.discretization import (
     Record,
     SampleTimes,
@@ -48,9 +48,7 @@ MAX_EVALUATIONS = 60
 COST_TOLERANCE = 1e-12
 
 
-def motion_with_friction(
-    model: ModelData, rec: Record, powers: Sequence[Sequence[tuple[float, float]]]
-) -> _core._Motion:
+def motion_with_friction(model: Model, rec: Record, powers: Sequence[Sequence[tuple[float, float]]]) -> _core._Motion:
     """Simulate equations with friction, for initial terms by equation as (exponent, coefficient).
 
     Impulses (-1, -2, ...) represent the initial state of the sensor filter of these outputs.
@@ -73,7 +71,7 @@ def friction_parameters(item: Equation) -> tuple[float, float, float]:
 
 
 def fit_initial_terms_with_friction(
-    model: ModelData, run: Run, rec: Record, every: int, near: list[float] | None = None
+    model: Model, run: Run, rec: Record, every: int, near: list[float] | None = None
 ) -> dict[str, Any]:
     """Fit initial terms and offsets of a simulation with friction, ``every`` pulses per sampling interval.
 
@@ -135,7 +133,7 @@ def fixed_equation(item: Equation, signals: Sequence[str]) -> tuple[int, tuple[f
     return output, (alpha, []), numbers
 
 
-def check_uniform_samples(run: Run, model: ModelData) -> None:
+def check_uniform_samples(run: Run, model: Model) -> None:
     """Raise ModelError for nonuniform samples."""
     if has_nonuniform_samples(run, model.structure):
         output = model.outputs[model.structure.friction_equations[0]]
@@ -202,17 +200,17 @@ def initial_exponents(item: Equation, initial: Initial, offset: Offset, states: 
     return sorted(found | {e for e in left if e == 0.0 or all(abs(e - o) > OFFSET_POWER_TOLERANCE for o in found)})
 
 
-def friction_initial_terms(model: ModelData, found: Mapping[str, Any]) -> dict[str, dict[float, float]]:
+def friction_initial_terms(model: Model, found: Mapping[str, Any]) -> dict[str, dict[float, float]]:
     """Return initial terms by output and exponent from a single-run fit with friction."""
     return {o: dict(terms) for o, terms in zip(model.outputs, found["powers"][0], strict=True)}
 
 
-def nonuniform_sample_times(model: ModelData, run: Run) -> Floats | None:
+def nonuniform_sample_times(model: Model, run: Run) -> Floats | None:
     """Return the times of the compared samples of a run [s] if they are nonuniform, else None."""
     return compared_times(run, model.structure) if has_nonuniform_samples(run, model.structure) else None
 
 
-def with_initial_conditions(model: ModelData, run: Run) -> ModelData:
+def with_initial_conditions(model: Model, run: Run) -> Model:
     """Return the model with initial conditions resolved on a run: Caputo's unless the samples require a history."""
     start = resolve_initial_conditions(run, model.structure)
     long = replace(model, structure=replace(model.structure, initial=start))
@@ -235,7 +233,7 @@ def with_initial_conditions(model: ModelData, run: Run) -> ModelData:
 
 
 def simulate_samples(
-    model: ModelData, run: Run, every: int, initial: Terms | None, times: Floats | None = None
+    model: Model, run: Run, every: int, initial: Terms | None, times: Floats | None = None
 ) -> tuple[Floats, dict[str, dict[float, float]]]:
     """Return samples (outputs, N) on ``every`` pulses per sampling interval, and initial terms; may be not finite.
 
@@ -261,7 +259,7 @@ def simulate_samples(
     return fit_initial_terms(model, measured_samples(model, run, every, rec), driven, names, columns)
 
 
-def initial_names(model: ModelData, initial: Initial) -> list[tuple[str, float]]:
+def initial_names(model: Model, initial: Initial) -> list[tuple[str, float]]:
     """Return output and power of every initial term and offset for given initial conditions."""
     structure = model.structure
     states = structure.filter_states(initial)
@@ -274,14 +272,14 @@ def initial_names(model: ModelData, initial: Initial) -> list[tuple[str, float]]
     ]
 
 
-def unit_samples(model: ModelData, run: Run, every: int, names: Sequence[tuple[str, float]]) -> list[Floats]:
+def unit_samples(model: Model, run: Run, every: int, names: Sequence[tuple[str, float]]) -> list[Floats]:
     """Return samples of all outputs for unit initial terms, by output and power, without inputs."""
     rec = record(run, model.structure, (run.length - 1) * every, filtered=model.structure.all_filtered)
     return _columns(model, rec, every, names, _free_and_units(model, rec, names)[1], None)
 
 
 def _columns(
-    model: ModelData,
+    model: Model,
     rec: Record,
     every: int,
     names: Sequence[tuple[str, float]],
@@ -297,7 +295,7 @@ def _columns(
     ]
 
 
-def measured_samples(model: ModelData, run: Run, every: int, rec: Record | None = None) -> Floats:
+def measured_samples(model: Model, run: Run, every: int, rec: Record | None = None) -> Floats:
     """Return the samples to compare with, shape (outputs, N): as measured, or filtered if the equation is.
 
     NaN at missing samples of an output.
@@ -310,7 +308,7 @@ def measured_samples(model: ModelData, run: Run, every: int, rec: Record | None 
 
 
 def fit_initial_terms(
-    model: ModelData, measured: Floats, driven: Floats, names: Sequence[tuple[str, float]], columns: Sequence[Floats]
+    model: Model, measured: Floats, driven: Floats, names: Sequence[tuple[str, float]], columns: Sequence[Floats]
 ) -> tuple[Floats, dict[str, dict[float, float]]]:
     """Fit initial terms to measured samples by least squares; return the simulation with them, and the terms."""
     deviation = np.nanstd(measured, axis=1, keepdims=True)
@@ -336,7 +334,7 @@ def fit_initial_terms(
     return total, terms
 
 
-def _responses(model: ModelData, rec: Record, terms: Terms) -> Floats:
+def _responses(model: Model, rec: Record, terms: Terms) -> Floats:
     """Return pulse means of the outputs before the sensor filter: coupled, or each with the measured others as inputs.
 
     Impulses (-1, -2, ...) represent the initial state of the sensor filter.
@@ -351,7 +349,7 @@ def _responses(model: ModelData, rec: Record, terms: Terms) -> Floats:
     return np.concatenate([_core.respond(core, [e], inputs, [p]) for e, p in zip(equations, powers, strict=True)])
 
 
-def _free_and_units(model: ModelData, rec: Record, names: Sequence[tuple[str, float]]) -> tuple[Floats, list[Floats]]:
+def _free_and_units(model: Model, rec: Record, names: Sequence[tuple[str, float]]) -> tuple[Floats, list[Floats]]:
     """Return pulse means of all outputs before the sensor filter: from rest, and for a unit of each initial term.
 
     A unit (output, power) acts without inputs.
@@ -377,7 +375,7 @@ def _free_and_units(model: ModelData, rec: Record, names: Sequence[tuple[str, fl
 
 
 def _samples_from_pulses(
-    model: ModelData, run: Run | None, rec: Record, every: int, means: Floats, terms: Terms, at: SampleTimes | None
+    model: Model, run: Run | None, rec: Record, every: int, means: Floats, terms: Terms, at: SampleTimes | None
 ) -> Floats:
     """Return samples from pulse means: integrals from the left, direct feedthrough with its value at the sample.
 
@@ -445,7 +443,7 @@ def _samples_from_pulses(
         return np.concatenate([(gain * start + held)[:, None], later], axis=1) + gain[:, None] * now
 
 
-def _early_response(model: ModelData, run: Run, rec: Record, every: int) -> Floats:
+def _early_response(model: Model, run: Run, rec: Record, every: int) -> Floats:
     """Early part of the mean of the pulses on either side of each inner sample, shape (outputs, N - 2).
 
     It is half of the response of the first pulse after a jump or a corner of the inputs, of which only the direct gain
@@ -496,7 +494,7 @@ def _interpolate_smooth(rest: Floats, at: SampleTimes) -> Floats:
     return _core.read_at(np.ascontiguousarray(rest), at.pulse_positions)
 
 
-def _kink_correction(model: ModelData, run: Run | None, at: SampleTimes, terms: Terms) -> Floats:
+def _kink_correction(model: Model, run: Run | None, at: SampleTimes, terms: Terms) -> Floats:
     """Kink correction at the sample times: slope discontinuities of input jumps and of initial terms.
 
     It includes the direct path of a jump and one pass through the output's own terms, as in the joint fit.
@@ -607,7 +605,7 @@ def _start_residuals(structure: Structure, run: Run) -> StartResiduals | None:
     """Residuals of simulations from rest and with a history; None if they are not finite."""
     ends, terms = [], 0
     for start in ("rest", history(run, structure)):
-        model = ModelData(replace(structure, initial=start))
+        model = Model(replace(structure, initial=start))
         try:
             samples, found = simulate_samples(model, run, FIRST_REFINEMENT, None, nonuniform_sample_times(model, run))
         except FtlmError:
@@ -619,7 +617,7 @@ def _start_residuals(structure: Structure, run: Run) -> StartResiduals | None:
     return StartResiduals(ends[0], ends[1], terms, np.nanstd([run[o] for o in structure.outputs], axis=1))
 
 
-def runs_in_motion(model: ModelData, runs: Sequence[Run]) -> list[str]:
+def runs_in_motion(model: Model, runs: Sequence[Run]) -> list[str]:
     """Return names of the runs that start near zero but had nonzero initial conditions."""
     structure = model.structure
     if structure.initial != "auto" or structure.has_friction or not has_memory(structure):

@@ -10,7 +10,7 @@ import numpy as np
 from ftlm import _core
 from ftlm.data.run import Run
 from ftlm.errors import ConvergenceError, DataError, ModelError
-from ftlm.model.model import ModelData, check_model
+from ftlm.model.model import Model, check_model
 from ftlm.simulation.discretization import (
     MAX_M,
     Record,
@@ -21,10 +21,11 @@ from ftlm.simulation.discretization import (
 )
 from ftlm.simulation.step_refinement import simulate_refined
 from ftlm.structure.structure import check_initial
+from ftlm.utils.parameters import parameter, setting
 from ftlm.utils.validation import Floats, real_number
 
 
-def comparison_records(runs: Sequence[Run], model: ModelData, m: int) -> list[Record]:
+def comparison_records(runs: Sequence[Run], model: Model, m: int) -> list[Record]:
     """Return the records with which simulations are compared: measured outputs, filtered like the simulated ones.
 
     Simulated outputs pass the sensor filter if they were measured through it. If a filtered signal is an input of a
@@ -33,7 +34,7 @@ def comparison_records(runs: Sequence[Run], model: ModelData, m: int) -> list[Re
     return records(runs, model.structure, m, filtered=model.structure.all_filtered)
 
 
-def respond(model: ModelData, rec: Record) -> tuple[dict[str, Floats], dict[str, dict[float, float]]]:
+def respond(model: Model, rec: Record) -> tuple[dict[str, Floats], dict[str, dict[float, float]]]:
     """Return pulse means of the outputs on one of the :func:`comparison_records`, and initial terms by exponent.
 
     The initial terms minimize the distance to the measured outputs.
@@ -68,7 +69,7 @@ def respond(model: ModelData, rec: Record) -> tuple[dict[str, Floats], dict[str,
 
 
 def simulate(
-    model: ModelData,
+    model: Model,
     run: Run,
     *,
     tolerance: float = 1e-6,
@@ -122,7 +123,7 @@ def simulate(
             raise ModelError(f"initial terms of {name!r}, which is no output of the model: {', '.join(model.outputs)}")
         check_initial([e for e in terms if not (model.structure.has_filter_transient(name) and e in impulses)])
     if not real_number("tolerance", tolerance) > 0:
-        raise ModelError(f"tolerance = {tolerance} is not positive; the default is 1e-6")
+        raise ModelError(f"{setting('tolerance')} {tolerance} is not positive; the default is 1e-6")
     own = run.length - 1
     max_m = min(max_m, MAX_M)
     if own > max_m:
@@ -152,13 +153,13 @@ def simulate(
     )
 
 
-def _units(model: ModelData, run: Run) -> dict[str, str]:
+def _units(model: Model, run: Run) -> dict[str, str]:
     """Units of inputs and simulated outputs, from the run or the model."""
     inputs = {n: run.units[n] or model.units.get(n, "") for n in run.inputs}
     return inputs | {n: model.units.get(n, "") or run.units.get(n, "") for n in model.outputs}
 
 
-def _with_missing_outputs(run: Run, model: ModelData) -> Run:
+def _with_missing_outputs(run: Run, model: Model) -> Run:
     """Return the run with zeros for missing outputs; simulated outputs are never read."""
     missing = [o for o in model.outputs if o not in run]
     if not missing:
@@ -168,12 +169,12 @@ def _with_missing_outputs(run: Run, model: ModelData) -> Run:
     if lacking is not None and model.structure.coupling != "simulated":
         raise DataError(
             f"run {run.name!r} has no signal {lacking!r}, which the equation of {read[lacking]} reads as measured; "
-            "give it, or use coupling='simulated'"
+            f"give it, or use {parameter('coupling', 'simulated')}"
         )
     return run.with_outputs({n: np.zeros(run.length) for n in missing})
 
 
-def explicit_euler(model: ModelData, run: Run, *, step: Literal["record"] = "record") -> dict[str, Floats]:
+def explicit_euler(model: Model, run: Run, *, step: Literal["record"] = "record") -> dict[str, Floats]:
     """Simulate an integer-order model by explicit Euler at the step of the run, as in the paper's baseline.
 
     Parameters
@@ -197,7 +198,9 @@ def explicit_euler(model: ModelData, run: Run, *, step: Literal["record"] = "rec
         A fractional order.
     """
     if step != "record":
-        raise ModelError(f"step = {step!r} is not known; Euler steps at the record's own step: resample the run")
+        raise ModelError(
+            f"{setting('step')} {step!r} is not known; Euler steps at the record's own step: resample the run"
+        )
     signals = model.structure.signals
     run = apply_input_nonlinearity(run, model.structure)
     rows = [run[s] if s not in model.outputs else np.zeros(run.length) for s in signals]

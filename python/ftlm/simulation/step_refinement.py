@@ -13,7 +13,7 @@ from ftlm import _core
 from ftlm.data.run import Run
 from ftlm.data.sampling import ZERO_ORDER_HOLD, interpolate_gaps
 from ftlm.errors import ModelError
-from ftlm.model.model import ModelData
+from ftlm.model.model import Model
 from ftlm.simulation.discretization import MAX_M, apply_input_nonlinearity, has_nonuniform_samples, record
 from ftlm.simulation.initial_conditions import resolve_initial_conditions
 from ftlm.simulation.output_samples import (
@@ -240,7 +240,7 @@ class SampleResponses:
         Output and power of the initial terms.
     """
 
-    model: ModelData
+    model: Model
     run: Run
     inputs: Mapping[str, Floats]
     first_samples: Mapping[str, float]
@@ -252,7 +252,7 @@ class SampleResponses:
         return len(self.model.outputs)
 
     @classmethod
-    def of(cls, model: ModelData, run: Run, names: Sequence[tuple[str, float]]) -> SampleResponses | None:
+    def of(cls, model: Model, run: Run, names: Sequence[tuple[str, float]]) -> SampleResponses | None:
         """Build for a run; None if superposition does not apply."""
         structure = model.structure
         outputs, coupled = model.outputs, structure.coupling == "simulated"
@@ -339,7 +339,7 @@ class SampleResponses:
 
 
 def simulate_long(
-    model: ModelData, run: Run, initial: Terms | None, *, tolerance: float, max_m: int
+    model: Model, run: Run, initial: Terms | None, *, tolerance: float, max_m: int
 ) -> OutputSamples | None:
     """Simulate a long run as :func:`refined` does; None if superposition does not apply.
 
@@ -432,7 +432,7 @@ def _decays(rows: Floats) -> bool:
 
 
 def simulate_refined(
-    model: ModelData,
+    model: Model,
     run: Run,
     initial: Terms | None,
     *,
@@ -491,7 +491,7 @@ def _with_values(terms: Terms, values: Floats) -> dict[str, dict[float, float]]:
 
 
 def _simulate_grid(
-    model: ModelData, run: Run, every: int, initial: Terms | None, times: Floats | None, *, last: bool = False
+    model: Model, run: Run, every: int, initial: Terms | None, times: Floats | None, *, last: bool = False
 ) -> tuple[Floats, dict[str, dict[float, float]]]:
     """Simulate on one grid; NaN if the equations are singular there, unless it is the last grid."""
     try:

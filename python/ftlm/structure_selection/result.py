@@ -139,10 +139,10 @@ class Selection(ReportMixin):
             {
                 "rank": k + 1,
                 "structure": t.name,
-                "numbers": t.parameters,
-                "seen": t.estimation_fit,
-                "unseen": t.validation_fit,
-                "least": t.worst_fold,
+                "parameters": t.parameters,
+                "estimation_fit": t.estimation_fit,
+                "validation_fit": t.validation_fit,
+                "worst_fold": t.worst_fold,
                 "score": t.score,
                 "bic": math.nan if t.bic is None else t.bic,
                 "chosen": k == self.chosen,
@@ -162,15 +162,15 @@ class Selection(ReportMixin):
             "candidates": [
                 {
                     "structure": t.name,
-                    "numbers": t.parameters,
+                    "parameters": t.parameters,
                     "estimation": dict(t.estimation),
                     "validation": {n: dict(v) for n, v in t.validation.items()},
                     "score": finite(t.score),
                     "bic": None if t.bic is None else finite(t.bic),
                     "values": dict(t.values),
                     "standard_errors": {n: finite(e) for n, e in t.errors.items()},
-                    "idle": list(t.insignificant),
-                    "grows": t.unstable,
+                    "insignificant": list(t.insignificant),
+                    "unstable": t.unstable,
                     "failed": t.failed,
                 }
                 for t in self.trials

@@ -13,7 +13,6 @@ from ftlm.data.run import Run
 from ftlm.errors import ConvergenceError, ModelError
 from ftlm.estimation.free_parameters import FreeProblem
 from ftlm.estimation.identify import identify
-from ftlm.order_search.options import Settings
 from ftlm.simulation.discretization import prepare
 from ftlm.structure.parser import equation
 from ftlm.structure.structure import Structure
@@ -28,6 +27,8 @@ from ftlm.structure_selection.stepwise import (
     evaluate_list,
     select_stepwise,
 )
+from ftlm.utils.parameters import parameter
+from ftlm.utils.validation import check_threads
 
 #: Integer values of the highest order of the candidates.
 AUTOMATIC_ORDERS = (1, 2, 3, 4)
@@ -50,12 +51,14 @@ def automatic_structures(runs: Sequence[Run], output: str | None = None) -> list
     if output is None:
         if len(outputs) != 1:
             raise ModelError(
-                f"the runs have the outputs {', '.join(outputs)}; structure='auto' is of one: use run.select([…]), or "
-                "name it in a structure in words"
+                f"the runs have the outputs {', '.join(outputs)}; {parameter('structure', 'auto')} is of one: use "
+                "run.select([…]), or name it in a structure in words"
             )
         output = outputs[0]
     if not first.inputs:
-        raise ModelError("the runs have no input, and structure='auto' needs one; name inputs when loading")
+        raise ModelError(
+            f"the runs have no input, and {parameter('structure', 'auto')} needs one; name inputs when loading"
+        )
     made = []
     for order in AUTOMATIC_ORDERS:
         own = [f"a{k} D^mu{k} {output}" for k in range(order - 1, 0, -1)] + [f"a0 {output}"]
@@ -153,8 +156,7 @@ def select(
     of the own coefficients, and selection starts from the best. For a list of more than 200 candidates a
     ``UserWarning`` estimates the remaining time after the first ones.
     """
-    # Checked here as identify checks it: threads is a whole number, at least 1.
-    workers = Settings.check(coefficients="least-squares", threads=threads).threads
+    workers = check_threads(threads)
     several = [runs] if isinstance(runs, Run) else list(runs)
     folds = Folds.of(runs, validation if validation is not None else "runs" if len(several) > 1 else "blocks")
     if not isinstance(candidates, (str, Structure, Sequence, Mapping)):

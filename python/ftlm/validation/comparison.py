@@ -15,7 +15,7 @@ from ftlm import _core
 from ftlm.data.run import Run, Runs, as_runs
 from ftlm.data.sampling import drop_missing
 from ftlm.errors import DataError
-from ftlm.model.model import ModelData, check_model
+from ftlm.model.model import Model, check_model
 from ftlm.simulation.discretization import (
     Record,
     check_m,
@@ -32,6 +32,7 @@ from ftlm.structure.structure import Structure, offset_exponents
 from ftlm.svg.html_page import Table
 from ftlm.utils.files import to_frame
 from ftlm.utils.formatting import Cell, Exact, symbol_html
+from ftlm.utils.parameters import parameter
 from ftlm.utils.validation import Floats, as_floats
 
 
@@ -240,7 +241,7 @@ MISSING_SAMPLES_REASON = "not every sample of it was read, and the straight line
 HIDDEN_OFFSET_NOTE = "not told apart from what the run did before its start; begin the run at rest to learn it"
 
 
-def compare(model: ModelData, runs: Run | Sequence[Run], *, m: int | None = None) -> Comparison:
+def compare(model: Model, runs: Run | Sequence[Run], *, m: int | None = None) -> Comparison:
     """Return equation error and output error of a model on measured runs.
 
     The output error compares each sample y[k] with the simulation (free run: only inputs and initial conditions are
@@ -273,7 +274,7 @@ def compare(model: ModelData, runs: Run | Sequence[Run], *, m: int | None = None
     return compare_samples(model, several, simulate_runs(model, several), m=m)
 
 
-def simulate_runs(model: ModelData, runs: Sequence[Run]) -> list[OutputSamples]:
+def simulate_runs(model: Model, runs: Sequence[Run]) -> list[OutputSamples]:
     """Simulate each run, with initial terms fitted to it, on a grid refined until converged."""
     return [
         simulate_refined(model, run, None, tolerance=REFINEMENT_TOLERANCE, max_m=max(MAX_PULSES, 4 * run.length))
@@ -281,7 +282,7 @@ def simulate_runs(model: ModelData, runs: Sequence[Run]) -> list[OutputSamples]:
     ]
 
 
-def compare_samples(model: ModelData, runs: Runs, free: Sequence[OutputSamples], *, m: int) -> Comparison:
+def compare_samples(model: Model, runs: Runs, free: Sequence[OutputSamples], *, m: int) -> Comparison:
     """Compare simulations sample by sample, and the equation error on m pulses, with these runs."""
     full = records(runs, model.structure, m)
     parts = []
@@ -300,7 +301,8 @@ def compare_samples(model: ModelData, runs: Runs, free: Sequence[OutputSamples],
     if moving := runs_in_motion(model, runs):
         warnings.append(
             f"{', '.join(moving)} starts at zero and is simulated from rest, but what that leaves over dies away like "
-            "motion from before the start; give the model's structure initial='history' to have that estimated"
+            f"motion from before the start; give the model's structure {parameter('initial', 'history')} to have "
+            "that estimated"
         )
     return replace(found, warnings=tuple(warnings))
 
@@ -310,7 +312,7 @@ def _is_unconverged(sampled: OutputSamples) -> bool:
     return bool(np.all(np.isfinite(sampled.outputs)) and np.any(sampled.change > VISIBLE_STEP_CHANGE))
 
 
-def compare_means(model: ModelData, runs: Run | Sequence[Run], *, m: int | None = None) -> Comparison:
+def compare_means(model: Model, runs: Run | Sequence[Run], *, m: int | None = None) -> Comparison:
     """Return both errors on the pulse means of m block pulses, as in the paper's tables.
 
     Means average neighboring samples. They understate noise, and overstate errors if a period has few pulses.
@@ -326,7 +328,7 @@ def compare_means(model: ModelData, runs: Run | Sequence[Run], *, m: int | None 
     return _pooled_comparison(model, several, parts, m, middles, sampled=False)
 
 
-def _check_arguments(model: ModelData, runs: Run | Sequence[Run], m: int | None) -> tuple[Runs, int]:
+def _check_arguments(model: Model, runs: Run | Sequence[Run], m: int | None) -> tuple[Runs, int]:
     """Return runs that have all signals of the model, and the number of pulses."""
     check_model(model)
     several = as_runs(runs)
@@ -343,7 +345,7 @@ def describe_missing_equation_errors(why: Mapping[str, str]) -> list[str]:
     return [f"{name} has no equation error: {reason}" for name, reason in why.items()]
 
 
-def offset_values(model: ModelData, initial: Mapping[str, Mapping[float, float]]) -> dict[str, dict[str, float]]:
+def offset_values(model: Model, initial: Mapping[str, Mapping[float, float]]) -> dict[str, dict[str, float]]:
     """Return offsets of the equations from the powers of t that they integrate to: c t^alpha / Gamma(alpha + 1).
 
     Empty for an equation whose run has an initial history: its powers of t make a constant unidentifiable.
@@ -392,7 +394,7 @@ class _RunErrors:
 
 
 def _run_errors(
-    model: ModelData,
+    model: Model,
     full: Record,
     simulated: dict[str, Floats],
     measured: dict[str, Floats],
@@ -415,7 +417,7 @@ def _run_errors(
 
 
 def _pooled_comparison(
-    model: ModelData, runs: Sequence[Run], parts: Sequence[_RunErrors], m: int, times: list[Floats], *, sampled: bool
+    model: Model, runs: Sequence[Run], parts: Sequence[_RunErrors], m: int, times: list[Floats], *, sampled: bool
 ) -> Comparison:
     """Pool the errors of all runs into a comparison."""
     equation_error, output_error = _pooled_errors(parts)

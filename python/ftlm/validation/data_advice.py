@@ -14,10 +14,11 @@ import numpy as np
 from numpy.typing import NDArray
 
 from ftlm import _core
-from ftlm.data.run import RunData
+from ftlm.data.run import Run
 from ftlm.data.sampling import drop_missing
 from ftlm.structure.structure import Structure
 from ftlm.utils.linalg import minimum_norm_solution, orthonormal
+from ftlm.utils.parameters import parameter
 from ftlm.utils.statistics import estimate_noise, is_rest
 from ftlm.utils.validation import Floats
 
@@ -125,12 +126,12 @@ class Advice:
         return f"<p>Advice on {html.escape(self.run)}:</p><ul>{items or '<li>nothing stands out</li>'}</ul>"
 
 
-def advise(run: RunData, structure: Structure | None = None) -> Advice:
+def advise(run: Run, structure: Structure | None = None) -> Advice:
     """Check a run for faults and poor excitation; see :meth:`ftlm.Run.advice`."""
     return Advice(run.name, tuple(_findings(run, structure)))
 
 
-def _findings(run: RunData, structure: Structure | None) -> Iterator[Finding]:
+def _findings(run: Run, structure: Structure | None) -> Iterator[Finding]:
     run = run.with_interpolated_gaps()
     moving = [n for n in run.signals if np.ptp(run[n]) > 0]
     for name in run.signals:
@@ -162,7 +163,7 @@ def _findings(run: RunData, structure: Structure | None) -> Iterator[Finding]:
         yield from _offset(run, name)
 
 
-def _with_unit(run: RunData, name: str, value: float) -> str:
+def _with_unit(run: Run, name: str, value: float) -> str:
     unit = run.units.get(name, "")
     return f"{value:.4g} {unit}".strip() if unit not in ("", "1") else f"{value:.4g}"
 
@@ -178,7 +179,7 @@ def _true_intervals(flags: NDArray[np.bool_]) -> tuple[NDArray[np.intp], NDArray
     return starts, np.flatnonzero(edges == -1) - starts
 
 
-def _duplicate_channels(run: RunData, names: list[str]) -> Iterator[Finding]:
+def _duplicate_channels(run: Run, names: list[str]) -> Iterator[Finding]:
     for one, other in itertools.combinations(names, 2):
         if np.array_equal(run[one], run[other]):
             yield Finding(
@@ -186,7 +187,7 @@ def _duplicate_channels(run: RunData, names: list[str]) -> Iterator[Finding]:
             )
 
 
-def _constant(run: RunData, name: str) -> Finding:
+def _constant(run: Run, name: str) -> Finding:
     level = _with_unit(run, name, float(run[name][0]))
     if name in run.inputs:
         return Finding(
@@ -202,7 +203,7 @@ def _constant(run: RunData, name: str) -> Finding:
     )
 
 
-def find_dead_channel(run: RunData, name: str) -> Iterator[Finding]:
+def find_dead_channel(run: Run, name: str) -> Iterator[Finding]:
     """Report the longest interval over which an output is exactly constant although it varies elsewhere."""
     y = run[name]
     still = np.diff(y) == 0
@@ -224,7 +225,11 @@ def find_dead_channel(run: RunData, name: str) -> Iterator[Finding]:
     if resting and not inputs_moved:
         return
     begin, end = first * run.step, (first + rows) * run.step
-    after = f"use window({end:.4g}, None)" if first < run.length // 20 else "check the sensor, or slice it away"
+    after = (
+        f"use {parameter('window', (float(f'{end:.4g}'), None))}"
+        if first < run.length // 20
+        else "check the sensor, or cut it away"
+    )
     yield Finding(
         "dead",
         name,
@@ -255,7 +260,7 @@ def _entered_steeply(y: Floats, first: int, rows: int) -> bool:
     return bool(at_extreme and rows < y.size and min(before, after) > max(4 * _quantum(y), 0.2 * typical))
 
 
-def _saturation(run: RunData, name: str) -> Iterator[Finding]:
+def _saturation(run: Run, name: str) -> Iterator[Finding]:
     y = run[name]
     levels = np.unique(y)
     if name in run.inputs and _few_levels(y):
@@ -283,7 +288,7 @@ def _saturation(run: RunData, name: str) -> Iterator[Finding]:
             )
 
 
-def _spikes(run: RunData, name: str) -> Iterator[Finding]:
+def _spikes(run: Run, name: str) -> Iterator[Finding]:
     y = run[name]
     if y.size < 5:
         return
@@ -313,7 +318,7 @@ def _spikes(run: RunData, name: str) -> Iterator[Finding]:
     )
 
 
-def _wraps(run: RunData, name: str) -> Iterator[Finding]:
+def _wraps(run: Run, name: str) -> Iterator[Finding]:
     y = run[name]
     steps = np.diff(y)
     reach, typical = float(np.ptp(y)), float(np.median(np.abs(steps)))
@@ -353,7 +358,7 @@ def spectral_lines(u: Floats) -> tuple[int, int]:
     return int(np.sum(np.maximum(1, np.rint(lengths / LINE_BINS)))), int(np.argmax(size))
 
 
-def _excitation(run: RunData, inputs: list[str]) -> Iterator[Finding]:
+def _excitation(run: Run, inputs: list[str]) -> Iterator[Finding]:
     for name in inputs:
         lines, at = spectral_lines(run[name])
         if lines < 2 and at > 2:
@@ -377,7 +382,7 @@ def _excitation(run: RunData, inputs: list[str]) -> Iterator[Finding]:
                 )
 
 
-def check_excitation(run: RunData, structure: Structure) -> Iterator[Finding]:
+def check_excitation(run: Run, structure: Structure) -> Iterator[Finding]:
     """Compare the number of spectral lines of the inputs with the free parameters of each equation.
 
     In steady state one spectral line identifies two parameters of each output it excites, and a constant level one.
@@ -408,7 +413,7 @@ def check_excitation(run: RunData, structure: Structure) -> Iterator[Finding]:
             )
 
 
-def _insufficient_duration(run: RunData, outputs: list[str]) -> Iterator[Finding]:
+def _insufficient_duration(run: Run, outputs: list[str]) -> Iterator[Finding]:
     if run.length < MIN_USEFUL_SAMPLES:
         yield Finding(
             "short",
@@ -435,7 +440,7 @@ def _insufficient_duration(run: RunData, outputs: list[str]) -> Iterator[Finding
             )
 
 
-def _offset(run: RunData, name: str) -> Iterator[Finding]:
+def _offset(run: Run, name: str) -> Iterator[Finding]:
     if not is_rest(run[name]):
         yield Finding(
             "offset",
@@ -445,7 +450,7 @@ def _offset(run: RunData, name: str) -> Iterator[Finding]:
         )
 
 
-def _drift(run: RunData, inputs: list[str], outputs: list[str]) -> Iterator[Finding]:
+def _drift(run: Run, inputs: list[str], outputs: list[str]) -> Iterator[Finding]:
     """Test each output for a linear trend that first-order lags and integrals of the inputs do not explain."""
     m = min(DRIFT_PULSES, run.length - 1)
     if m < 4 * DRIFT_BLOCKS:
@@ -490,7 +495,7 @@ def _lag_matrix(x: Floats, order: int) -> Floats:
     return np.stack([x[order - k : x.size - k] for k in range(1, order + 1)])
 
 
-def _feedback(run: RunData, inputs: list[str], outputs: list[str]) -> Iterable[Finding]:
+def _feedback(run: Run, inputs: list[str], outputs: list[str]) -> Iterable[Finding]:
     """Test for feedback: correlation of output innovations with later input innovations."""
     rows = min(run.length, MAX_FEEDBACK_SAMPLES)
     if rows < 20 * FEEDBACK_ORDER:
@@ -626,7 +631,7 @@ class Inspection:
         return "\n".join(lines + [f"warning: {w}" for w in self.warnings])
 
 
-def inspect_run(run: RunData) -> Inspection:
+def inspect_run(run: Run) -> Inspection:
     """Compute ranges, noise, quantization and rest of every signal of a run.
 
     Parameters
@@ -649,7 +654,7 @@ def inspect_run(run: RunData) -> Inspection:
     return Inspection(run.name, run.length, run.step, run.duration, signals, list(dict.fromkeys(warnings)))
 
 
-def _figures(run: RunData, name: str) -> SignalFigures:
+def _figures(run: Run, name: str) -> SignalFigures:
     all_rows = run[name]
     x = drop_missing(all_rows)
     low, high, noise = float(x.min()), float(x.max()), estimate_noise(all_rows)

@@ -16,12 +16,13 @@ from ftlm import _core
 from ftlm.data.run import Run, Runs, as_runs
 from ftlm.data.sampling import interpolate_gaps
 from ftlm.errors import DataError, ModelError
-from ftlm.model.model import ModelData, check_model
+from ftlm.model.model import Model, check_model
 from ftlm.simulation.discretization import compared_values
 from ftlm.simulation.output_samples import OutputSamples, measured_samples
 from ftlm.svg.html_page import Table
 from ftlm.utils.formatting import Cell, symbol_html
 from ftlm.utils.linalg import blockwise_triangular_factor, dot, orthonormal, projections, triangular_factor
+from ftlm.utils.parameters import parameter, setting
 from ftlm.utils.statistics import (
     NORMAL_99,
     SIGNIFICANCE_LEVEL,
@@ -77,7 +78,7 @@ class FeedbackTest:
     def to_dict(self) -> dict[str, Any]:
         """For JSON."""
         shown = {"statistic": finite(self.statistic), "limit": finite(self.limit)}
-        return {**shown, "found": self.has_feedback, "instant": self.instant, "decided": self.conclusive}
+        return {**shown, "has_feedback": self.has_feedback, "instant": self.instant, "conclusive": self.conclusive}
 
 
 def past_regressors(
@@ -284,7 +285,7 @@ class CorrelationTest:
             "values": list(map(finite, self.values.tolist())),
             **{n: finite(getattr(self, n)) for n in ("band", "statistic", "limit")},
             "passed": self.passed,
-            "decided": self.conclusive,
+            "conclusive": self.conclusive,
         }
 
 
@@ -415,7 +416,7 @@ class Residuals:
         """For JSON."""
         return {
             "passed": self.passed,
-            "decided": self.conclusive,
+            "conclusive": self.conclusive,
             "runs": list(self.runs),
             "refinement": self.refinement,
             "outputs": {name: output.to_dict() for name, output in self.outputs.items()},
@@ -445,7 +446,7 @@ class Residuals:
 DEFAULT_LAGS = 25
 
 
-def resid(model: ModelData, runs: Run | Sequence[Run], *, lags: int = DEFAULT_LAGS) -> Residuals:
+def resid(model: Model, runs: Run | Sequence[Run], *, lags: int = DEFAULT_LAGS) -> Residuals:
     """Test whether the residuals of a simulation are white, and independent of the inputs.
 
     Residuals are measured minus simulated samples, with initial terms and offsets fitted to each run, on a grid refined
@@ -491,7 +492,7 @@ def resid(model: ModelData, runs: Run | Sequence[Run], *, lags: int = DEFAULT_LA
     several = as_runs(runs)
     count = whole_number(lags)
     if count is None or count < 1:
-        raise ModelError(f"lags = {lags!r} is no number of lags; give a whole number, at least 1")
+        raise ModelError(f"{setting('lags')} {lags!r} is no number of lags; give a whole number, at least 1")
     check_run_lengths(several, count)
     for run in several:
         run.require_outputs([o for o in model.outputs if o in run])
@@ -508,7 +509,7 @@ def check_run_lengths(runs: Runs, lags: int) -> None:
             )
 
 
-def run_residual_tests(model: ModelData, runs: Runs, free: Sequence[OutputSamples], *, lags: int) -> Residuals:
+def run_residual_tests(model: Model, runs: Runs, free: Sequence[OutputSamples], *, lags: int) -> Residuals:
     """Run both tests on the residuals of simulations at the inner samples of these runs."""
     check_run_lengths(runs, lags)
     residuals: dict[str, list[Floats]] = {o: [] for o in model.outputs}
@@ -642,7 +643,8 @@ def describe_feedback(name: str, signal: str, output: OutputResiduals) -> str:
         return f"{found}; with white residuals output error has no bias from it, equation-error methods have"
     return (
         f"{found}, and residuals are not white: the noise that comes back with {signal} biases estimates, which their "
-        "intervals do not know; record what drives the loop and name it with reference=, or open the loop"
+        f"intervals do not know; record what drives the loop and name it with {parameter('reference')}, or open the "
+        "loop"
     )
 
 

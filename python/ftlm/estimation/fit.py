@@ -1,0 +1,86 @@
+"""Result of one estimator, before validation."""
+
+from __future__ import annotations
+
+from collections.abc import Callable, Mapping
+from dataclasses import dataclass, field
+from typing import Any
+
+from ftlm.errors import ModelError
+from ftlm.estimation.output_error import JointFit
+from ftlm.estimation.result import Task
+from ftlm.model.model import Model
+from ftlm.order_search.result import SearchResult
+from ftlm.structure.structure import History, Initial, Structure
+from ftlm.utils.parameters import parameter
+
+ProgressCallback = Callable[[int, int], None] | None
+
+
+@dataclass(frozen=True)
+class Fit:
+    """Result of one estimator, before validation.
+
+    Parameters
+    ----------
+    task
+        Task as the estimator used it.
+    method
+        Name of the estimator.
+    model
+        Estimated model.
+    parameters
+        Number of free parameters.
+    settings
+        Settings that the result depends on, besides the task.
+    warnings
+        Warnings of the estimator itself.
+    searches, errors, joint, covariance
+        Order searches, standard errors of coefficients at the orders found, the joint fit, and the covariance of the
+        model parameters, if the estimator gives them.
+    at_optimum
+        Whether the parameters minimize a criterion of the residuals, as the offset test assumes.
+    """
+
+    task: Task
+    method: str
+    model: Model
+    parameters: int
+    settings: dict[str, Any]
+    warnings: list[str]
+    searches: dict[str, SearchResult] = field(default_factory=dict)
+    errors: Mapping[str, float] = field(default_factory=dict)
+    joint: JointFit | None = None
+    covariance: tuple[tuple[float, ...], ...] | None = None
+    at_optimum: bool = True
+
+
+def make_model(
+    task: Task, method: str, structure: Structure, orders: Mapping[str, float], m: int, **about: Any
+) -> Model:
+    """Return the structure of the task as a model with all parameters fixed."""
+    units = {n: u for n, u in task.runs[0].units.items() if n in structure.signals}
+    told = {"method": method, "runs": ", ".join(r.name for r in task.runs), **about}
+    return Model(structure, orders=orders, units=units, m=m, about=told)
+
+
+def check_no_friction(structure: Structure, method: str) -> None:
+    """Raise ModelError for a structure with friction, which only output error estimates."""
+    if structure.has_friction:
+        output = structure.outputs[structure.friction_equations[0]]
+        raise ModelError(
+            f"the equation of {output} has friction, which {parameter('method', method)} does not know; use "
+            f"{parameter('method', 'output-error')}"
+        )
+
+
+def initial_terms_text(initial: Initial) -> str:
+    """Return decided initial terms as text for the settings."""
+    if isinstance(initial, History):
+        return f"history, {len(initial)} powers of t up to {initial[-1]:g}"
+    return initial if isinstance(initial, str) else f"t^{list(initial)}"
+
+
+def offset_setting(structure: Structure) -> dict[str, str]:
+    """Return the offset as a setting; empty without an offset."""
+    return {} if structure.offset == "none" else {"offset": structure.offset}

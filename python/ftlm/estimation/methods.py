@@ -1,0 +1,278 @@
+"""Methods of estimation as objects: a method, its options, and its fit."""
+
+from __future__ import annotations
+
+import os
+from collections.abc import Mapping, Sequence
+from concurrent.futures import Executor
+from dataclasses import dataclass, fields
+from typing import Any, ClassVar, Protocol, cast, get_args
+
+from ftlm.data.run import Run
+from ftlm.errors import ModelError
+from ftlm.estimation.closed_loop import instrument_runs, mark_reference_fit
+from ftlm.estimation.confidence_intervals import Intervals
+from ftlm.estimation.estimators import estimate_order_search, estimate_output_error
+from ftlm.estimation.fit import Fit, ProgressCallback, check_no_friction
+from ftlm.estimation.genetic import GeneticAlgorithm
+from ftlm.estimation.output_error import Loss
+from ftlm.estimation.result import Identification, Task
+from ftlm.model.model import Model
+from ftlm.order_search.options import Coefficients, Criterion, Norm, RowBasis, SearchSettings
+from ftlm.order_search.search import check_executor, threads_per_task
+from ftlm.structure.order_grid import OrderGrid, check_order_grid, check_order_grid_names
+from ftlm.structure.structure import Structure
+from ftlm.utils.parameters import parameter
+from ftlm.utils.validation import check_choice, check_threads
+
+
+class EstimationMethod(Protocol):
+    """Method of estimation: a name and a fit. Any object that has both can be passed to :func:`ftlm.identify`."""
+
+    name: ClassVar[str]
+
+    def fit(
+        self,
+        runs: Sequence[Run],
+        structure: Structure,
+        *,
+        m: int | None,
+        threads: int | None,
+        progress: ProgressCallback,
+    ) -> Fit:
+        """Fit a structure whose offset is decided to checked runs; the other arguments are those of `identify`."""
+
+
+@dataclass(frozen=True, kw_only=True)
+class OutputError:
+    """Output error: orders and coefficients of all equations together, maximum likelihood for white noise.
+
+    Orders are continuous, initialization is automatic, and parameters have confidence intervals.
+
+    Parameters
+    ----------
+    loss
+        ``"squares"``, or ``"huber"``, which counts residuals beyond 1.345 of the usual ones by their size, so that
+        outliers decide nothing; without any it has 95 % of the precision. Figures stay those of all samples.
+    intervals
+        ``"quadratic"``: estimate ± 1.96 standard errors, true where the cost is a parabola. ``"profile"``: by profile
+        likelihood for every parameter, some ten to a hundred free runs each. ``"auto"``: by profile likelihood for the
+        parameters for which two free runs each say that the quadratic picture is off by over a tenth. See
+        :meth:`ftlm.Identification.profile`.
+    start
+        Initial guess besides the automatic ones, so that the fit never ends with a larger cost than one gets from
+        there: an identification or a model of the same outputs, simpler or not, or values of free parameters by name.
+        What it lacks starts at the coefficient 0; an order that is free now and was a number there starts at that
+        number.
+    reference
+        Name of a signal of the runs that drives a closed loop from outside, such as its set point. It is the
+        instrument: residuals are made orthogonal to what the part of every input that follows the reference does,
+        which noise that the loop feeds back is no part of.
+
+    Raises
+    ------
+    ModelError
+        A loss or intervals that are not known, a start or a reference of another type, or profile likelihood together
+        with a reference.
+    """
+
+    name: ClassVar[str] = "output-error"
+    loss: Loss = "squares"
+    intervals: Intervals = "auto"
+    start: Identification | Model | Mapping[str, float] | None = None
+    reference: str | None = None
+
+    def __post_init__(self) -> None:
+        check_choice("loss", self.loss, get_args(Loss))
+        check_choice("intervals", self.intervals, get_args(Intervals))
+        if not (self.start is None or isinstance(self.start, (Identification, Model, Mapping))):
+            raise ModelError(
+                f"start is {type(self.start).__name__}; give an identification, a model, or values by name"
+            )
+        if not (self.reference is None or isinstance(self.reference, str)):
+            raise ModelError(f"reference is {type(self.reference).__name__}, not the name of a signal of the runs")
+        if self.intervals == "profile" and self.reference is not None:
+            raise ModelError(
+                f"{parameter('intervals', 'profile')} needs a cost that has its minimum at the estimate, and "
+                f"{parameter('reference')} has none; use {parameter('intervals', 'quadratic')}, or leave it out"
+            )
+
+    def fit(
+        self,
+        runs: Sequence[Run],
+        structure: Structure,
+        *,
+        m: int | None = None,
+        threads: int | None = None,
+        progress: ProgressCallback = None,
+    ) -> Fit:
+        """Fit a structure to checked runs; see :func:`ftlm.identify`."""
+        if self.reference is not None and structure.has_friction:
+            raise ModelError(
+                f"the equation of {structure.outputs[structure.friction_equations[0]]} has friction, which the "
+                f"instrument {parameter('reference', self.reference)} does not know; leave one of the two out"
+            )
+        workers, answers, weak = check_threads(threads), None, list[str]()
+        if self.reference is not None:
+            answers, weak = instrument_runs(runs, structure, self.reference)
+        begin = self.start.model if isinstance(self.start, Identification) else self.start
+        more = self.start.parameter_values if isinstance(self.start, Identification) else {}
+        task = Task(tuple(runs), structure)
+        fit = estimate_output_error(task, m, workers, progress, answers, self.loss, self.intervals, begin, more)
+        return fit if self.reference is None else mark_reference_fit(fit, self.reference, weak)
+
+
+@dataclass(frozen=True, kw_only=True)
+class OrderSearchMethod:
+    """Options of the order search of an equation-error method; without a free order they must be the defaults.
+
+    Parameters
+    ----------
+    order_grid, criterion, norm, top, store, executor
+        See :func:`ftlm.search_orders`.
+    """
+
+    name: ClassVar[str]
+    order_grid: OrderGrid | None = None
+    criterion: Criterion = SearchSettings.criterion
+    norm: Norm = SearchSettings.norm
+    top: int = SearchSettings.top
+    store: str | os.PathLike[str] | None = None
+    executor: Executor | None = None
+
+    def __post_init__(self) -> None:
+        check_order_grid(self.order_grid)
+        check_executor(self.executor)
+        if not (self.store is None or isinstance(self.store, (str, os.PathLike))):
+            raise ModelError(f"store is {type(self.store).__name__}; give the path of a file")
+        self.settings()
+
+    def settings(self) -> SearchSettings:
+        """Return the settings of the order search and of the coefficients."""
+        names = {f.name for f in fields(self)} & {f.name for f in fields(SearchSettings)}
+        return SearchSettings(
+            coefficients=cast("Coefficients", self.name), **{name: getattr(self, name) for name in names}
+        )
+
+    def fit(
+        self,
+        runs: Sequence[Run],
+        structure: Structure,
+        *,
+        m: int | None = None,
+        threads: int | None = None,
+        progress: ProgressCallback = None,
+    ) -> Fit:
+        """Search the orders, then estimate the coefficients at them; see :func:`ftlm.identify`."""
+        check_no_friction(structure, self.name)
+        check_order_grid_names(self.order_grid, structure)
+        changed = [f.name for f in fields(OrderSearchMethod) if getattr(self, f.name) != f.default]
+        if changed and not structure.order_names:
+            raise ModelError(
+                f"{changed[0]}= is not used: it is for order searches, and every order here is a number; leave it "
+                "out, or free an order"
+            )
+        task, workers = Task(tuple(runs), structure, self.order_grid), threads_per_task(threads, self.executor)
+        return estimate_order_search(task, self.settings(), m, workers, progress, self.store, self.executor)
+
+
+@dataclass(frozen=True, kw_only=True)
+class LeastSquares(OrderSearchMethod):
+    """Least squares of the equation error: orders from the order grid, coefficients at the best of them.
+
+    It is the limit of multi-innovation for a weak prior. Noise on the outputs biases it.
+
+    Parameters
+    ----------
+    order_grid, criterion, norm, top, store, executor
+        Options of the order search; see :func:`ftlm.search_orders`. Without a free order they must be the defaults.
+
+    Raises
+    ------
+    ModelError
+        A value that :func:`ftlm.search_orders` refuses.
+    """
+
+    name: ClassVar[str] = "least-squares"
+
+
+@dataclass(frozen=True, kw_only=True)
+class InstrumentalVariables(OrderSearchMethod):
+    """Refined instrumental variables: orders from the order grid, coefficients without the bias of noise.
+
+    Parameters
+    ----------
+    order_grid, criterion, norm, top, store, executor
+        Options of the order search; see :func:`ftlm.search_orders`. Without a free order they must be the defaults.
+
+    Raises
+    ------
+    ModelError
+        A value that :func:`ftlm.search_orders` refuses.
+    """
+
+    name: ClassVar[str] = "instrumental-variables"
+
+
+@dataclass(frozen=True, kw_only=True)
+class MultiInnovation(OrderSearchMethod):
+    """Multi-innovation of the paper, (44) in closed form: orders from the order grid, coefficients with a prior.
+
+    Parameters
+    ----------
+    order_grid, criterion, norm, top, store, executor
+        Options of the order search; see :func:`ftlm.search_orders`. Without a free order they must be the defaults.
+    innovation_length
+        p of paper (43)-(44): a weight of the data against the prior, nothing else.
+    prior_covariance
+        K0 of paper (43)-(44); a large one is a weak prior.
+    row_basis
+        Coordinates of paper (42): ``"haar"``, for which m is a power of two, or ``"time"``.
+
+    Raises
+    ------
+    ModelError
+        A value that :func:`ftlm.search_orders` refuses.
+    """
+
+    name: ClassVar[str] = "multi-innovation"
+    innovation_length: int = SearchSettings.innovation_length
+    prior_covariance: float = SearchSettings.prior_covariance
+    row_basis: RowBasis = SearchSettings.row_basis
+
+
+#: Methods by the name that stands for their defaults.
+METHODS: dict[str, type[Any]] = {
+    method.name: method
+    for method in (OutputError, InstrumentalVariables, MultiInnovation, LeastSquares, GeneticAlgorithm)
+}
+
+
+def resolve_method(method: str | EstimationMethod) -> EstimationMethod:
+    """Return a method of estimation from its name, or itself; raise ModelError for anything else."""
+    if isinstance(method, str):
+        check_choice("method", method, METHODS)
+        made: EstimationMethod = METHODS[method]()
+        return made
+    if isinstance(method, type):
+        raise ModelError(f"method is the class {method.__name__}; pass an object, method={method.__name__}()")
+    if not (isinstance(getattr(method, "name", None), str) and callable(getattr(method, "fit", None))):
+        known = " or ".join(map(repr, METHODS))
+        raise ModelError(f"method is {type(method).__name__}; use {known}, or an object such as ftlm.OutputError()")
+    return method
+
+
+def method_with_options(name: str, options: Mapping[str, Any]) -> EstimationMethod:
+    """Return the method of a name with options by name; raise ModelError for an option that it does not have."""
+    check_choice("method", name, METHODS)
+    names = {method: [f.name for f in fields(kind)] for method, kind in METHODS.items()}
+    foreign = [option for option in options if option not in names[name]]
+    if foreign:
+        users = " or ".join(parameter("method", method) for method, known in names.items() if foreign[0] in known)
+        count = len(foreign) - 1
+        others = f", nor {count} other{'s' if count > 1 else ''} given here" if count else ""
+        raise ModelError(
+            f"{parameter(foreign[0])} is not used by {parameter('method', name)}{others}; leave it out, or use {users}"
+        )
+    made: EstimationMethod = METHODS[name](**options)
+    return made
