@@ -199,8 +199,16 @@ BAD = [
     (("identify", "square.csv", "--structure", "D^alpha y = = u"), 2, "character"),
     (("identify", "square.csv", "--structure", "D^1.5 z = a0 z + b0 u"), 3, "z"),
     (("identify", "square.csv", *SEARCH, "--method", "magic"), 2, "magic"),
-    (("identify", "square.csv", *SEARCH, "--innovation-length", "0", "--method", "multi-innovation"), 2, "--innovation-length 0"),
-    (("identify", "square.csv", *SEARCH, "--prior-covariance", "-1", "--method", "multi-innovation"), 2, "--prior-covariance -1"),
+    (
+        ("identify", "square.csv", *SEARCH, "--innovation-length", "0", "--method", "multi-innovation"),
+        2,
+        "--innovation-length 0",
+    ),
+    (
+        ("identify", "square.csv", *SEARCH, "--prior-covariance", "-1", "--method", "multi-innovation"),
+        2,
+        "--prior-covariance -1",
+    ),
     (("identify", "square.csv", *SEARCH, "--m", "4096"), 2, "4096"),
     (("identify", "square.csv", *SEARCH, "--m", "1000", "--method", "multi-innovation"), 2, "power of two"),
     (("identify", "square.csv", *SEARCH, "--threads", "0"), 2, "threads"),

@@ -391,22 +391,32 @@ def functions_behind():
     design = (ftlm.control.fractional_pid, ftlm.control.lqg, ftlm.control.inverse_dynamics)
     estimation = (*reading, *structure)
     return {
-        "open": reading, "inspect": reading, "doctor": (),
+        "open": reading,
+        "inspect": reading,
+        "doctor": (),
         "record": (run, Streaming, ftlm.equation),
         "identify": (*estimation, ftlm.identify, ftlm.order_grid, *METHODS.values()),
         "search": (*estimation, ftlm.identify, ftlm.search_orders, ftlm.order_grid),
         "certify": (*estimation, ftlm.identify, ftlm.certify_orders, ftlm.order_grid),
-        "resume": (ftlm.resume_search,), "status": (),
+        "resume": (ftlm.resume_search,),
+        "status": (),
         "identify-frequency": (ftlm.load_frequency, ftlm.Layout, ftlm.identify_frequency),
         "select": (*estimation, ftlm.select, ftlm.identify),
         "consistency": (*estimation, ftlm.consistency, ftlm.identify, ftlm.OutputError),
-        "compare": (*reading, ftlm.compare), "resid": (*reading, ftlm.resid), "simulate": (*reading, ftlm.simulate),
-        "report": reading, "plot": reading, "export": (export_text,),
-        "control": design, "input-shaper": (ftlm.control.input_shaper, ftlm.control.fractional_pid),
+        "compare": (*reading, ftlm.compare),
+        "resid": (*reading, ftlm.resid),
+        "simulate": (*reading, ftlm.simulate),
+        "report": reading,
+        "plot": reading,
+        "export": (export_text,),
+        "control": design,
+        "input-shaper": (ftlm.control.input_shaper, ftlm.control.fractional_pid),
         "design-input": (*reading, ftlm.design_input),
-        "demo": (run_demo,), "reproduce": (*reading, ftlm.reproduce, ftlm.GeneticAlgorithm),
-        "orders": (*reading, orders_on_unseen_runs), "app": (serve,),
-    }  # fmt: skip
+        "demo": (run_demo,),
+        "reproduce": (*reading, ftlm.reproduce, ftlm.GeneticAlgorithm),
+        "orders": (*reading, orders_on_unseen_runs),
+        "app": (serve,),
+    }
 
 
 def test_every_flag_is_the_name_of_an_argument():
