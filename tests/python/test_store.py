@@ -144,7 +144,7 @@ def test_rounds_do_not_depend_on_how_they_are_cut_up(run):
 def test_several_equations_are_kept_in_one_store_by_the_command_line(tmp_path, clean_a, monkeypatch):
     from typer.testing import CliRunner
 
-    from ftlm.cli import main as app
+    from ftlm.cli.main import app
 
     data, path = tmp_path / "a.csv", str(tmp_path / "s.ftlm")
     clean_a.to_csv(data)
@@ -663,7 +663,7 @@ def test_a_store_where_nothing_is_searched_is_refused(stage_run, tmp_path):
 def test_the_command_identify_goes_on_with_its_store(tmp_path, clean_a):
     from typer.testing import CliRunner
 
-    from ftlm.cli import main as app
+    from ftlm.cli.main import app
 
     data, path = tmp_path / "a.csv", tmp_path / "s.ftlm"
     clean_a.to_csv(data)
