@@ -160,7 +160,7 @@ def test_several_equations_are_kept_in_one_store_by_the_command_line(tmp_path, c
     assert "100.0 %" in CliRunner().invoke(app, ["status", path]).stdout
     other = CliRunner().invoke(app, [*call, "--store", path, "--top", "5"])
     assert other.exit_code == 3
-    assert "other settings: keep = 5" in other.stderr
+    assert "other settings: top = 5" in other.stderr
     # Under the order law both are one search.
     law = ["search", str(data), *common, "--laws", "orders"]
     plain = CliRunner().invoke(app, law)

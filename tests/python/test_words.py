@@ -4,6 +4,7 @@ from __future__ import annotations
 
 import ast
 import inspect
+import itertools
 import json
 import re
 from pathlib import Path
@@ -16,7 +17,7 @@ from typer.testing import CliRunner
 import ftlm
 from ftlm.cli.main import app
 from ftlm.data.units import TIME_UNITS
-from ftlm.estimation.methods import METHODS
+from ftlm.estimation.methods import METHODS_BY_NAME
 from ftlm.report.typesetting import equation_html
 from ftlm.structure.equation import format_equation
 from ftlm.utils.parameters import (
@@ -228,6 +229,16 @@ def literals():
             and isinstance(node.body[0], ast.Expr)
         }
         for node in ast.walk(tree):
+            if isinstance(node, ast.JoinedStr):
+                # A name that is put in, and what it is followed by.
+                pairs = itertools.pairwise(node.values)
+                yield from (
+                    (f"{path.relative_to(PACKAGE)}:{node.lineno}", f"window{after.value}")
+                    for name, after in pairs
+                    if isinstance(name, ast.FormattedValue)
+                    and isinstance(after, ast.Constant)
+                    and after.value[:2] == "= "
+                )
             if isinstance(node, ast.Constant) and isinstance(node.value, str) and id(node) not in docstrings:
                 yield f"{path.relative_to(PACKAGE)}:{node.lineno}", node.value
 
@@ -395,7 +406,7 @@ def functions_behind():
         "inspect": reading,
         "doctor": (),
         "record": (run, Streaming, ftlm.equation),
-        "identify": (*estimation, ftlm.identify, ftlm.order_grid, *METHODS.values()),
+        "identify": (*estimation, ftlm.identify, ftlm.order_grid, *METHODS_BY_NAME.values()),
         "search": (*estimation, ftlm.identify, ftlm.search_orders, ftlm.order_grid),
         "certify": (*estimation, ftlm.identify, ftlm.certify_orders, ftlm.order_grid),
         "resume": (ftlm.resume_search,),

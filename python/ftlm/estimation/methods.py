@@ -169,8 +169,8 @@ class OrderSearchMethod:
         changed = [f.name for f in fields(OrderSearchMethod) if getattr(self, f.name) != f.default]
         if changed and not structure.order_names:
             raise ModelError(
-                f"{changed[0]}= is not used: it is for order searches, and every order here is a number; leave it "
-                "out, or free an order"
+                f"{parameter(changed[0])} is not used: it is for order searches, and every order here is a number; "
+                "leave it out, or free an order"
             )
         task, workers = Task(tuple(runs), structure, self.order_grid), threads_per_task(threads, self.executor)
         return estimate_order_search(task, self.settings(), m, workers, progress, self.store, self.executor)
