@@ -224,7 +224,7 @@ def test_what_cannot_be_meant_is_refused_in_words(same):
     structure = ftlm.equation("D^alpha y = a0 y + b0 u")
     for runs, options, words in (
         (run, {"segments": np.complex64(2)}, "segments = np.complex64"),
-        (run, {"method": np.array(["output-error", "x"])}, "method = array"),
+        (run, {"method": np.array(["output-error", "x"])}, "method is ndarray"),
         (run, {"method": "x" * 10**6}, "method = 'x{59}… is not known"),
     ):
         with pytest.raises(ftlm.FtlmError, match=words):
