@@ -487,7 +487,7 @@ def scripted(page, key, content, folder):
 def test_a_model_is_that_of_the_same_lines_of_python(used, content, tmp_path):
     (key,) = used.desk.models
     printed = scripted(used, key, content, tmp_path)
-    assert printed.splitlines()[0].startswith(used.desk.models[key].preview["verdict"]["level"].upper())
+    assert printed.splitlines()[0].startswith(used.desk.models[key].told["verdict"]["level"].upper())
     model = ftlm.load_model(tmp_path / "lag-model.json")
     assert model.coefficients["a0"] == pytest.approx(-2, abs=0.1)
 

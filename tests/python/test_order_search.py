@@ -70,14 +70,14 @@ class Record:
         return np.stack(means, axis=1) if means else np.zeros((self.m, 0))
 
 
-def evaluate(records, o, criterion, norm, coefficients, rows, exponents=(), p=7, k0=1.0):
+def evaluate(records, o, criterion, norm, coefficients, row_basis, exponents=(), p=7, k0=1.0):
     """Score and coefficients of one candidate."""
     blocks, targets, weights = [], [], []
     for i, r in enumerate(records):
         others = [np.zeros((r.m, len(exponents))) for _ in records]
         others[i] = r.powers(exponents)
         q = np.hstack([r.regressors(o), *others])
-        phi = oracles.haar_matrix(r.m) if rows == "haar" else np.eye(r.m)
+        phi = oracles.haar_matrix(r.m) if row_basis == "haar" else np.eye(r.m)
         blocks.append(phi @ q)
         targets.append(phi @ r.y)
         weights.append([min(p, r.m - k) for k in range(r.m)])
@@ -133,7 +133,7 @@ def test_table_is_that_of_enumeration(run, criterion, norm, coefficients, rows):
     weighted = {"row_basis": rows} if coefficients == "multi-innovation" else {}
     found = search(run, top=10, **options, **weighted)
     assert len(found.table) == 10
-    assert_is_table(found, enumerate_all([Record(run)], rows=rows, **options))
+    assert_is_table(found, enumerate_all([Record(run)], row_basis=rows, **options))
 
 
 @pytest.mark.parametrize(("p", "k0"), [(1, 0.01), (3, 100.0), (200, 1e6)])
@@ -687,11 +687,11 @@ def test_settings_that_mean_nothing_are_refused(run, options, message):
         (lambda: values(ftlm.order_grid(beta=(2, 1))), "order beta: interval 2:1 is empty"),
         (
             lambda: values(ftlm.order_grid(gama=1)),
-            "lattice order 'gama' is no free order; free are alpha, beta, mu, nu",
+            "order 'gama' of order_grid= is no free order; free are alpha, beta, mu, nu",
         ),
         (
             lambda: values(ftlm.order_grid(beta=1), "D^1.5 y = a y"),
-            "lattice order 'beta' is no free order; free are none",
+            "order 'beta' of order_grid= is no free order; free are none",
         ),
         (lambda: values(ftlm.OrderGrid(increment=1e-7)), "has 9.5e+06 values, more than 1000000"),
     ],
@@ -729,7 +729,7 @@ def test_nothing_or_too_much_to_search_is_refused(run, text, order_grid, message
 def test_what_is_no_structure_no_lattice_and_no_run_is_refused(run):
     with pytest.raises(ftlm.ModelError, match="equation is str, not a structure; use"):
         ftlm.search_orders(run, EQUATION)
-    with pytest.raises(ftlm.ModelError, match="lattice is dict, not a Lattice"):
+    with pytest.raises(ftlm.ModelError, match="order_grid is dict, not an OrderGrid"):
         ftlm.search_orders(run, ftlm.equation(EQUATION), GRID)
     with pytest.raises(ftlm.DataError, match="no run is given"):
         ftlm.search_orders([], ftlm.equation(EQUATION))

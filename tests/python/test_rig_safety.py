@@ -344,7 +344,7 @@ def child(kind, tmp_path):
 
 def until_expired(page):
     until = time.monotonic() + 30
-    while not page.expired or page.volts != (0.0, 0.0):
+    while not page.has_expired or page.volts != (0.0, 0.0):
         assert time.monotonic() < until
         time.sleep(0.01)
 
