@@ -94,9 +94,7 @@ def test_profile_likelihood_has_no_reference():
 
 def test_what_is_no_method_is_refused(noisy):
     structure = ftlm.equation(FIXED)
-    with pytest.raises(
-        ftlm.ModelError, match=r"^method is the class OutputError; pass an object, method=OutputError\(\)"
-    ):
+    with pytest.raises(ftlm.ModelError, match="^method is the class OutputError; pass an object, method=Output"):
         ftlm.identify(noisy, structure, method=ftlm.OutputError)
     with pytest.raises(ftlm.ModelError) as refused:
         ftlm.identify(noisy, structure, method="magic")
