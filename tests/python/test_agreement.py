@@ -202,7 +202,7 @@ def test_words_where_nothing_can_be_compared():
         with pytest.raises(ftlm.DataError, match=f"motor has 300 rows, too few to be cut into {parts} parts"):
             ftlm.consistency(run, SECOND, parts=parts)
     with pytest.raises(ftlm.ModelError, match="store= is of one identification"):
-        ftlm.consistency(run, SECOND, method=ftlm.OutputError(store="a.ftlm"))
+        ftlm.consistency(run, SECOND, method=ftlm.LeastSquares(store="a.ftlm"))
     with pytest.raises(ftlm.ModelError, match="method 'least-squares' gives no standard errors of D"):
         ftlm.consistency(run, SECOND, method="least-squares", threads=1)
     with pytest.raises(ftlm.DataError, match=r"motor 0 to 3 s: .*'z'"):
@@ -224,7 +224,7 @@ def test_what_cannot_be_meant_is_refused_in_words(same):
     structure = ftlm.equation("D^alpha y = a0 y + b0 u")
     for runs, options, words in (
         (run, {"parts": np.complex64(2)}, "parts = np.complex64"),
-        (run, {"method": np.array(["output-error", "x"])}, "method = array"),
+        (run, {"method": np.array(["output-error", "x"])}, "method is ndarray; use"),
         (run, {"method": "x" * 10**6}, "method = 'x{59}… is not known"),
     ):
         with pytest.raises(ftlm.FtlmError, match=words):
